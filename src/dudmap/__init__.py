@@ -1,0 +1,53 @@
+"""Dense RGB-D SLAM for places where things move: trajectory and static mesh on a CPU."""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+__version__ = "0.1.0"
+
+_HOMES = {
+    "Camera": "camera",
+    "Config": "config",
+    "DudmapError": "errors",
+    "Frame": "frame",
+    "FrameResult": "slam",
+    "Mesh": "mesh",
+    "Slam": "slam",
+    "Trajectory": "trajectory",
+    "TsdfVolume": "volume",
+    "open_sequence": "sequences",
+}
+
+__all__ = [
+    "Camera",
+    "Config",
+    "DudmapError",
+    "Frame",
+    "FrameResult",
+    "Mesh",
+    "Slam",
+    "Trajectory",
+    "TsdfVolume",
+    "__version__",
+    "open_sequence",
+]
+
+if TYPE_CHECKING:
+    from dudmap.camera import Camera
+    from dudmap.config import Config
+    from dudmap.errors import DudmapError
+    from dudmap.frame import Frame
+    from dudmap.mesh import Mesh
+    from dudmap.sequences import open_sequence
+    from dudmap.slam import FrameResult, Slam
+    from dudmap.trajectory import Trajectory
+    from dudmap.volume import TsdfVolume
+
+
+def __getattr__(name: str) -> object:
+    """Import a public name when it is first used, so that importing dudmap loads neither numba nor cv2."""
+    if name not in __all__ or name not in _HOMES:
+        raise AttributeError(f"module 'dudmap' has no attribute {name!r}")
+    value = getattr(import_module(f"dudmap.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value

@@ -1,0 +1,96 @@
+"""Pinhole camera with optional lens distortion."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Intrinsics of a pinhole camera; x right, y down, z forward; pixel centres at whole numbers (thesis eq. 4.1).
+
+    Attributes:
+        fx, fy: Focal lengths in pixels.
+        cx, cy: Principal point in pixels.
+        width, height: Image size in pixels.
+        depth_scale: Units of the depth image per metre (5000 for TUM files, 1000 for millimetres).
+        distortion: Coefficients k1, k2, p1, p2[, k3] of the Brown-Conrady model (thesis eq. 3.88), empty for none.
+    """
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    width: int
+    height: int
+    depth_scale: float = 5000.0
+    distortion: tuple[float, ...] = ()
+
+    def __post_init__(self) -> None:
+        numbers = (self.fx, self.fy, self.cx, self.cy, self.depth_scale, *self.distortion)
+        if not np.all(np.isfinite(numbers)) or min(self.fx, self.fy, self.depth_scale) <= 0:
+            raise DatasetError(
+                f"camera has fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}, depth_scale={self.depth_scale}; "
+                "focal lengths and depth scale must be positive finite numbers"
+            )
+        if self.width < 16 or self.height < 16:
+            raise DatasetError(f"camera image is {self.width}x{self.height}; at least 16x16 pixels are needed")
+        if len(self.distortion) not in (0, 4, 5):
+            raise DatasetError(
+                f"camera has {len(self.distortion)} distortion coefficients; expected none, 4 (k1 k2 p1 p2) or 5 (k3)"
+            )
+
+    @property
+    def K(self) -> NDArray[np.float64]:
+        """Intrinsic matrix (3, 3)."""
+        return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """Image shape (height, width) as NumPy has it."""
+        return self.height, self.width
+
+    def scaled(self, level: int) -> "Camera":
+        """Camera of the image after ``level`` halvings by 2x2 blocks (a pixel's centre is its blocks' centre)."""
+        factor = 1.0 / (1 << level)
+        return replace(
+            self,
+            fx=self.fx * factor,
+            fy=self.fy * factor,
+            cx=(self.cx + 0.5) * factor - 0.5,
+            cy=(self.cy + 0.5) * factor - 0.5,
+            width=self.width >> level,
+            height=self.height >> level,
+        )
+
+    def resized(self, width: int, height: int) -> "Camera":
+        """Camera of the same view in an image of another size."""
+        sx, sy = width / self.width, height / self.height
+        return replace(
+            self,
+            fx=self.fx * sx,
+            fy=self.fy * sy,
+            cx=(self.cx + 0.5) * sx - 0.5,
+            cy=(self.cy + 0.5) * sy - 0.5,
+            width=width,
+            height=height,
+        )
+
+    def backproject(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); no reading gives the origin."""
+        u = (np.arange(depth.shape[1], dtype=np.float32) - np.float32(self.cx)) / np.float32(self.fx)
+        v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
+        z = depth.astype(np.float32)
+        return np.stack([z * u[None, :], z * v[:, None], z], axis=-1)
+
+    def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Pixel coordinates (..., 2) of points (..., 3) in the camera frame; points with z <= 0 give NaN (eq. 4.4)."""
+        points = np.asarray(points, dtype=np.float64)
+        z = np.where(points[..., 2] > 0, points[..., 2], np.nan)
+        return np.stack(
+            [points[..., 0] / z * self.fx + self.cx, points[..., 1] / z * self.fy + self.cy],
+            axis=-1,
+        )

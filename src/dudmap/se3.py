@@ -1,0 +1,120 @@
+"""Rigid motions as 4x4 float64 matrices.
+
+``T_a_b`` maps points of frame b into frame a: ``p_a = T_a_b @ p_b``. A twist is ``xi = (v, omega)``, translation
+first, in metres and radians; updates are applied on the left, ``exp(xi) @ T``.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+Matrix = NDArray[np.float64]
+
+
+def hat(omega: Matrix) -> Matrix:
+    """Skew-symmetric matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
+    x, y, z = omega
+    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+
+
+def exp(xi: Matrix) -> Matrix:
+    """Matrix exponential of a twist (6,): the rigid motion (4, 4) reached after unit time (thesis eq. 4.30).
+
+    Satisfies ``exp(log(T)) == T`` and ``exp(0) == identity``.
+    """
+    xi = np.asarray(xi, dtype=np.float64)
+    v, omega = xi[:3], xi[3:]
+    theta_squared = float(omega @ omega)
+    W = hat(omega)
+    if theta_squared < 1e-8:  # Taylor series: the closed forms are 0/0 here
+        a, b, c = 1 - theta_squared / 6, 0.5 - theta_squared / 24, 1 / 6 - theta_squared / 120
+    else:
+        theta = np.sqrt(theta_squared)
+        a = np.sin(theta) / theta
+        b = (1 - np.cos(theta)) / theta_squared
+        c = (1 - a) / theta_squared
+    WW = W @ W
+    T = np.eye(4)
+    T[:3, :3] += a * W + b * WW
+    T[:3, 3] = v + b * (W @ v) + c * (WW @ v)
+    return T
+
+
+def log(T: Matrix) -> Matrix:
+    """Twist (6,) whose exponential is ``T`` (4, 4); the rotation angle lies in [0, pi]."""
+    omega = log_rotation(T[:3, :3])
+    theta_squared = float(omega @ omega)
+    W = hat(omega)
+    if theta_squared < 1e-8:
+        c = 1 / 12 + theta_squared / 720
+    else:
+        theta = np.sqrt(theta_squared)
+        c = (1 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta_squared
+    V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
+    return np.concatenate([V_inverse @ T[:3, 3], omega])
+
+
+def log_rotation(R: Matrix) -> Matrix:
+    """Rotation vector (3,) of a rotation matrix (3, 3), exact up to and at half a turn."""
+    x, y, z, w = rotation_to_quat_xyzw(R)
+    vector = np.array([x, y, z])
+    sine = float(np.linalg.norm(vector))
+    if sine < 1e-12:
+        return 2.0 * vector
+    return vector * (2.0 * np.arctan2(sine, w) / sine)
+
+
+def inverse(T: Matrix) -> Matrix:
+    """Inverse of rigid motions (..., 4, 4): ``inverse(T) @ T == identity``."""
+    R_t = np.swapaxes(T[..., :3, :3], -1, -2)
+    out = np.zeros_like(T)
+    out[..., :3, :3] = R_t
+    out[..., :3, 3] = -(R_t @ T[..., :3, 3:])[..., 0]
+    out[..., 3, 3] = 1.0
+    return out
+
+
+def rotation_angle(T: Matrix) -> float:
+    """Angle in radians, in [0, pi], of the rotation of ``T`` (4, 4) or (3, 3)."""
+    return float(np.linalg.norm(log_rotation(T[:3, :3])))
+
+
+def interpolate(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:
+    """Motion on the screw from ``T_a`` (share 0) to ``T_b`` (share 1)."""
+    return T_a @ exp(share * log(inverse(T_a) @ T_b))
+
+
+def rotation_to_quat_xyzw(R: Matrix) -> Matrix:
+    """Unit quaternion (4,) in the order x, y, z, w with w >= 0 (Shepperd 1978: divide by the largest component)."""
+    trace = R[0, 0] + R[1, 1] + R[2, 2]
+    candidates = np.array([R[0, 0], R[1, 1], R[2, 2], trace])
+    k = int(np.argmax(candidates))
+    q = np.empty(4)
+    if k == 3:
+        q[3] = 1 + trace
+        q[0], q[1], q[2] = R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1]
+    else:
+        i, j, m = k, (k + 1) % 3, (k + 2) % 3
+        q[i] = 1 + 2 * R[i, i] - trace
+        q[j] = R[j, i] + R[i, j]
+        q[m] = R[m, i] + R[i, m]
+        q[3] = R[m, j] - R[j, m]
+    q /= np.linalg.norm(q)
+    return -q if q[3] < 0 else q
+
+
+def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
+    """Rotation matrix (3, 3) of a quaternion (4,) in the order x, y, z, w; it need not be normalised."""
+    x, y, z, w = np.asarray(quat_xyzw, dtype=np.float64) / np.linalg.norm(quat_xyzw)
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
+
+
+def nearest_rotation(R: Matrix) -> Matrix:
+    """Rotation closest to ``R`` (3, 3) in the Frobenius norm: removes the drift of repeated products."""
+    U, _, V_t = np.linalg.svd(R)
+    return U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
