@@ -1,0 +1,193 @@
+"""Camera pose from the signed distances and intensities of the map (thesis section 4.4, algorithm 2)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.kernels import registration
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.volume import TsdfVolume
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """Normal equations of one linearisation: ``H step = -b``.
+
+    Attributes:
+        H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
+        b: (6,) float64, gradient of the cost.
+        cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
+        num_inliers: Readings on the map.
+        num_readings: Readings.
+        weight: Sum of the static weights of the readings on the map.
+        chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
+        residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
+    """
+
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    cost: float
+    num_inliers: int
+    num_readings: int
+    weight: float
+    chi_square: float
+    residuals: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingResult:
+    """Outcome of one registration.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        converged: Whether all checks passed.
+        reason: The failed check, empty if none.
+        inlier_share: Share of the readings that fall on the map.
+        residual: Root mean square distance residual, metres at one metre depth.
+        condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
+        iterations: Linearisations over all levels.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    converged: bool
+    reason: str
+    inlier_share: float
+    residual: float
+    condition: float
+    iterations: int
+
+
+class Tracker:
+    """Direct registration of a frame against the map by Levenberg-Marquardt, coarse to fine."""
+
+    def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
+        self.config = config
+        self.sensor = sensor
+
+    def align(
+        self,
+        volume: TsdfVolume,
+        levels: list[Level],
+        T_init: NDArray[np.float64],
+        static_weights: list[NDArray[np.float32]] | None = None,
+    ) -> TrackingResult:
+        """Pose that minimises the distances and intensity differences of a frame to the map (eq. 4.32).
+
+        Args:
+            volume: The map.
+            levels: Image pyramid, coarse to fine, one entry per level of the configuration.
+            T_init: (4, 4) first guess of T_world_camera.
+            static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
+        """
+        volume.look_at(T_init)
+        T, iterations, system = T_init, 0, None
+        for index, level in enumerate(levels):
+            if self.config.iterations[index] == 0:
+                continue
+            weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
+            T, system, used = self._optimize(volume, level, T, weights, self.config.iterations[index])
+            iterations += used
+        assert system is not None
+        return self._judge(T, system, iterations)
+
+    def _optimize(
+        self, volume: TsdfVolume, level: Level, T: NDArray[np.float64], weights: NDArray[np.float32], limit: int
+    ) -> tuple[NDArray[np.float64], LinearSystem, int]:
+        """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
+        damping = self.config.damping
+        system = self.linearize(volume, level, T, weights)
+        used = 1
+        for _ in range(limit):
+            diagonal = np.diag(system.H)
+            if not diagonal.max() > 0:
+                break
+            damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+            step = -np.linalg.solve(damped, system.b)
+            T_trial = moved(T, step)
+            trial = self.linearize(volume, level, T_trial, weights)
+            used += 1
+            if trial.cost < system.cost:
+                T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
+                if np.linalg.norm(step) < self.config.stop:
+                    break
+            else:
+                damping *= 5
+                if np.linalg.norm(step) < self.config.stop:
+                    break
+        return T, system, used
+
+    def linearize(
+        self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64], weights: NDArray[np.float32]
+    ) -> LinearSystem:
+        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose."""
+        camera, config, sensor = level.camera, self.config, self.sensor
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
+        parameters = np.array(
+            [
+                volume.voxel_size, volume.sdf_unit, config.huber, config.tukey if config.robust == "tukey" else 0,
+                config.color_weight, config.color_huber, sensor.sigma_base, sensor.sigma_scale,
+                sensor.sigma_base + sensor.sigma_scale, config.noise_weighting, volume.truncation,
+                volume.config.truncation_noise,
+            ],
+            dtype=np.float32,
+        )  # fmt: skip
+        window, shape, geometry = volume.window
+        height = level.depth.shape[0]
+        ranges = bands(height, max(8, -(-height // 8)))
+        sums = np.zeros((len(ranges), registration.NUM_SUMS))
+        residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
+        T = volume.lattice(T_world_camera)
+        run_bands(
+            lambda start, stop, out: registration.linearize(
+                start, stop, level.depth, level.intensity, weights, intrinsics, T, window, shape, geometry,
+                parameters, residuals, out,
+            ),
+            ranges, list(sums),
+        )  # fmt: skip
+        total = sums.sum(axis=0)
+        H = np.zeros((6, 6))
+        H[np.triu_indices(6)] = total[:21]
+        H = H + np.triu(H, 1).T
+        return LinearSystem(
+            H, total[21:27], float(total[27]), int(total[28]), int(total[29]), float(total[30]), float(total[31]),
+            residuals,
+        )  # fmt: skip
+
+    def _judge(self, T: NDArray[np.float64], system: LinearSystem, iterations: int) -> TrackingResult:
+        """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
+        config = self.config
+        share = system.num_inliers / max(system.num_readings, 1)
+        residual = float(np.sqrt(system.chi_square / max(system.weight, 1e-9)))
+        scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
+        eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
+        condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
+        if share < config.min_inliers or system.weight < 100:
+            reason = f"only {share:.0%} of the readings fall on the map"
+        elif residual > config.max_residual * (self.sensor.sigma_base + self.sensor.sigma_scale):
+            reason = f"readings lie {1000 * residual:.1f} mm off the map"
+        elif condition < config.min_condition:
+            reason = "the view does not constrain all directions of motion"
+        else:
+            reason = ""
+        return TrackingResult(T, not reason, reason, share, residual, condition, iterations)
+
+
+def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose after a twist (v, omega) about the camera's centre, world axes."""
+    out = se3.exp(np.concatenate([np.zeros(3), step[3:]])) @ T_world_camera
+    out[:3, 3] = T_world_camera[:3, 3] + step[:3]
+    out[:3, :3] = se3.nearest_rotation(out[:3, :3])
+    return out

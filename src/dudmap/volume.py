@@ -1,0 +1,521 @@
+"""Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.errors import MapError
+from dudmap.frame import Frame
+from dudmap.kernels import hashing, integration
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.mesh import Mesh
+
+BLOCK = 8
+"""Voxels along the edge of a block."""
+FORMAT = "dudmap map 1"
+NOTHING, SURFACE, FREE = 0, 1, 2
+"""What the map says of a point: unknown, near a surface, in confirmed free space."""
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """The map seen from a pose: the thesis' artificial camera view.
+
+    Attributes:
+        depth: (H, W) float32, metres, 0 where no surface is hit.
+        color: (H, W, 3) uint8.
+        normals: (H, W, 3) float32, world frame, 0 where no surface is hit.
+    """
+
+    depth: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    normals: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class MapSample:
+    """What the map says at the points of a depth image.
+
+    Attributes:
+        distance: (h, w) float32 signed distance in metres, NaN where the map has none.
+        difference: (h, w) float32 map minus image intensity (0..1), NaN likewise.
+        place: (h, w) uint8: NOTHING, SURFACE or FREE.
+    """
+
+    distance: NDArray[np.float32]
+    difference: NDArray[np.float32]
+    place: NDArray[np.uint8]
+
+
+class TsdfVolume:
+    """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
+
+    An entry is a block that something is known of; an entry near a surface owns a slot of 512 voxels. The window is a
+    dense array of slots around the view, so that the inner loops find a voxel with one load; the hash table stays the
+    authoritative index and fills the window when the view leaves it.
+
+    Args:
+        camera: Camera of the frames that will be integrated.
+        config: Voxel size, truncation, weights.
+        sensor: Noise of the depth readings.
+        depth_max: Farthest reading that will be integrated, metres.
+
+    Raises:
+        MapError: The voxels are too small for a window that covers ``depth_max``.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: VolumeConfig | None = None,
+        sensor: SensorConfig | None = None,
+        depth_max: float = 6.0,
+    ) -> None:
+        self.camera = camera
+        self.config = config or VolumeConfig()
+        self.sensor = sensor or SensorConfig()
+        self.depth_max = depth_max
+        self.voxel_size = self.config.voxel_size
+        self.block_size = BLOCK * self.voxel_size
+        self.truncation = self.config.truncation_voxels * self.voxel_size
+        self.truncation_behind = self.config.truncation_behind_voxels * self.voxel_size
+        self._limit = max(0.3, self.truncation, self.truncation_behind)
+        self.sdf_unit = self._limit / 32767
+        half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
+                         max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
+        self._reach = depth_max * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
+        cells = int(np.ceil(2 * (self._reach + self._limit) / self.block_size)) + 8
+        if cells > 288:
+            longest = depth_max * 280 / cells
+            raise MapError(
+                f"voxels of {self.voxel_size} m with readings up to {depth_max} m need too large a window; "
+                f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
+            )
+        size = 16 * int(np.ceil(cells / 16))
+        self._shape = np.array([size, size, size], dtype=np.int64)
+        self._window = np.full(size**3, -1, dtype=np.int32)
+        self._stamps = np.zeros(size**3, dtype=np.int32)
+        self._origin: NDArray[np.int64] | None = None
+        self._table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
+        self._coords = np.empty((1 << 12, 3), dtype=np.int32)
+        self._slot_of = np.full(1 << 12, -1, dtype=np.int32)
+        self._free_count = np.zeros(1 << 12, dtype=np.uint8)
+        self._num_entries = 0
+        self._geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
+        self._colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
+        self._entry_of = np.full(1 << 10, -1, dtype=np.int32)
+        self._slot_coords = np.zeros((1 << 10, 3), dtype=np.int32)
+        self._num_slots = 0
+        self._unused: list[int] = []
+        self._near = np.empty(0, dtype=np.int32)  # slots inside the window
+        self._frame_number = 0
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has been integrated yet."""
+        return self.num_blocks == 0
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks that own voxels."""
+        return self._num_slots - len(self._unused)
+
+    @property
+    def num_free_blocks(self) -> int:
+        """Blocks known to be free space; they own no voxels."""
+        n = self._num_entries
+        return int(np.count_nonzero((self._free_count[:n] >= self.config.free_after) & (self._slot_of[:n] < 0)))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the map: voxels of the blocks in use and the index of all entries, without spare capacity."""
+        voxels = self._num_slots * (2 * BLOCK**3 * 4 + 4 + 12)
+        return voxels + self._num_entries * (12 + 4 + 1) + self._table.nbytes
+
+    @property
+    def active_slots(self) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        return np.flatnonzero(self._entry_of[: self._num_slots] >= 0).astype(np.int32)
+
+    def noise_band(self) -> NDArray[np.float32]:
+        """Band parameters (6,) of the kernels: truncation in front, behind, noise factor, sigma(z), block edge."""
+        return np.array(
+            [
+                self.truncation,
+                self.truncation_behind,
+                self.config.truncation_noise,
+                self.sensor.sigma_base,
+                self.sensor.sigma_scale,
+                self.block_size,
+            ],
+            dtype=np.float32,
+        )
+
+    def lattice(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to window lattice (3, 4): voxel units, origin at the window's first voxel."""
+        assert self._origin is not None
+        T = T_world_camera[:3] / self.voxel_size
+        T[:, 3] -= self._origin * BLOCK
+        return T.astype(np.float32)
+
+    @property
+    def window(self) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
+        """Flat window of slots, its shape in blocks, and the flat packed voxels, as the kernels take them."""
+        return self._window, self._shape, self._geometry.reshape(-1)
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def integrate(
+        self,
+        frame: Frame,
+        T_world_camera: NDArray[np.float64],
+        static_mask: NDArray[np.bool_] | None = None,
+        weights: NDArray[np.uint8] | None = None,
+    ) -> None:
+        """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
+
+        Args:
+            frame: Depth (m) and colour of the volume's camera.
+            T_world_camera: (4, 4).
+            static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
+            weights: (H, W) uint8 weight of each reading; None weighs all alike.
+
+        Raises:
+            MapError: The images do not have the camera's size.
+        """
+        if frame.depth.shape != self.camera.shape or frame.color.shape[:2] != self.camera.shape:
+            raise MapError(
+                f"the volume's camera is {self.camera.width}x{self.camera.height}, but depth is "
+                f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour {frame.color.shape[1]}x{frame.color.shape[0]}"
+            )
+        depth = frame.depth.astype(np.float32)
+        depth[~((depth > 0) & (depth <= self.depth_max))] = 0
+        if static_mask is not None:
+            depth[~static_mask] = 0
+        self._frame_number += 1
+        self.look_at(T_world_camera)
+        self._allocate(depth, T_world_camera)
+        T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
+        tiles = self._tiles(depth)
+        self._fuse(depth, frame.color, weights, T_camera_world, tiles)
+        if self.config.carving:
+            self._observe_free(T_camera_world, tiles)
+
+    def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
+        """Move the window so that it covers what a camera at this pose can see."""
+        middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
+        origin = np.floor(middle / self.block_size).astype(np.int64) - self._shape // 2
+        if self._origin is not None and np.abs(origin - self._origin).max() <= 3:
+            return
+        self._origin = origin
+        self._window.fill(-1)
+        self._stamps.fill(0)
+        hashing.fill_window(
+            self._window.reshape(tuple(self._shape)), origin, self._coords, self._slot_of, self._num_entries
+        )
+        self._near = np.sort(self._window[self._window >= 0])
+
+    def _intrinsics(self) -> NDArray[np.float32]:
+        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy], dtype=np.float32)
+
+    def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
+        """Give voxels to the blocks that the truncation band of this depth image touches."""
+        T = self.lattice(T_world_camera) / np.float32(BLOCK)
+        ranges = bands(depth.shape[0] // 2, 30)
+        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
+        counts = run_bands(
+            lambda start, stop, out: integration.mark_blocks(
+                2 * start, 2 * stop, 2, depth, self._intrinsics(), T, self._shape,
+                self._window, self._frame_number, self._stamps, self.noise_band(), out,
+            ),
+            ranges, found,
+        )  # fmt: skip
+        cells = np.unique(np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)]))
+        if len(cells):
+            self._add_voxels(cells)
+
+    def _add_voxels(self, cells: NDArray[np.int32]) -> None:
+        entries = self._entries_of(cells)
+        slots = self._take_slots(len(entries))
+        self._entry_of[slots] = entries
+        self._slot_coords[slots] = self._coords[entries]
+        self._slot_of[entries] = slots
+        self._window[cells] = slots
+        self._near = np.concatenate([self._near, slots])
+
+    def _entries_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Entries of window cells, made where there is none yet."""
+        assert self._origin is not None
+        coords = np.stack(np.unravel_index(cells, tuple(self._shape)), axis=1) + self._origin
+        needed = self._num_entries + len(cells)
+        if needed > len(self._coords):
+            capacity = max(needed, 2 * len(self._coords))
+            self._coords = _grown(self._coords, capacity, 0)
+            self._slot_of = _grown(self._slot_of, capacity, -1)
+            self._free_count = _grown(self._free_count, capacity, 0)
+        if 2 * needed > len(self._table):
+            self._table = np.full(4 * len(self._table), hashing.EMPTY, dtype=np.int32)
+            hashing.rebuild(self._table, self._coords, self._num_entries)
+        entries, self._num_entries = hashing.insert_all(
+            self._table, self._coords, self._num_entries, coords.astype(np.int32)
+        )
+        return entries
+
+    def _take_slots(self, count: int) -> NDArray[np.int32]:
+        reused = [self._unused.pop() for _ in range(min(count, len(self._unused)))]
+        fresh = count - len(reused)
+        needed = self._num_slots + fresh
+        if needed > len(self._geometry):
+            capacity = max(needed, len(self._geometry) * 3 // 2)
+            self._geometry = _grown(self._geometry, capacity, 0)
+            self._colors = _grown(self._colors, capacity, 0)
+            self._entry_of = _grown(self._entry_of, capacity, -1)
+            self._slot_coords = _grown(self._slot_coords, capacity, 0)
+        slots = np.array(reused + list(range(self._num_slots, needed)), dtype=np.int32)
+        self._num_slots = needed
+        return slots
+
+    def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
+        shape = tuple(-(-n // integration.TILE) for n in depth.shape)
+        tiles = tuple(np.empty(shape, dtype=np.float32) for _ in range(3))
+        integration.tile_ranges(depth, *tiles)
+        return tiles
+
+    def _fuse(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_camera_world: NDArray[np.float32],
+        tiles: Sequence[NDArray[np.float32]],
+    ) -> None:
+        nearest, farthest, _ = tiles
+        size = np.array(depth.shape, dtype=np.int64)
+        visible = np.empty(len(self._near), dtype=np.int32)
+        count = integration.visible_slots(
+            self._near, self._slot_coords, T_camera_world, self._intrinsics(), size, np.float32(self.block_size),
+            nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
+        )  # fmt: skip
+        visible = visible[:count]
+        voxel = np.array(
+            [
+                self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
+                self.sensor.sigma_base, self.sensor.sigma_scale, self.config.max_weight,
+                self.config.carve_rate if self.config.carving else 1, self._limit,
+            ],
+            dtype=np.float32,
+        )  # fmt: skip
+        images = (
+            np.append(depth.reshape(-1), np.float32(0)),
+            np.append(nearest_reading(depth).reshape(-1), np.float32(0)),
+            np.append(packed(color).reshape(-1), np.int32(0)),
+            np.append(np.ones(depth.size, np.uint8) if weights is None else weights.reshape(-1), np.uint8(0)),
+        )
+        state = np.empty((count, 2), dtype=np.int32)
+        run_bands(
+            lambda start, stop: integration.integrate(
+                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, *images,
+                self._geometry.reshape(-1), self._colors.reshape(-1), voxel, state,
+            ),
+            bands(count, 256),
+        )  # fmt: skip
+        if self.config.carving:
+            self._release(visible[(state[:, 0] == 0) & (state[:, 1] == BLOCK**3)])
+
+    def _release(self, slots: NDArray[np.int32]) -> None:
+        """Take the voxels from blocks that hold no surface any more; they become known free space."""
+        if len(slots) == 0:
+            return
+        assert self._origin is not None
+        entries = self._entry_of[slots]
+        self._slot_of[entries] = -1
+        self._free_count[entries] = np.maximum(self._free_count[entries], self.config.free_after)
+        self._entry_of[slots] = -1
+        self._geometry[slots] = 0
+        self._colors[slots] = 0
+        cells = np.ravel_multi_index(tuple((self._coords[entries] - self._origin).T), tuple(self._shape))
+        self._window[cells] = -2 - entries
+        self._unused.extend(int(slot) for slot in slots[::-1])
+        self._near = self._near[self._entry_of[self._near] >= 0]
+
+    def _observe_free(self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]]) -> None:
+        """Count one more observation of emptiness for blocks without voxels in front of the depth image.
+
+        Each call visits every second plane of the window, so that the cost is spread over two frames.
+        """
+        assert self._origin is not None
+        nearest, _, valid = tiles
+        size = np.array(self.camera.shape, dtype=np.int64)
+        parity = self._frame_number % 2
+        ranges = bands(int(self._shape[0]) // 2, 8)
+        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
+        counts = run_bands(
+            lambda start, stop, out: integration.observe_free(
+                2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
+                self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
+                np.float32(self.depth_max), out,
+            ),
+            ranges, found,
+        )  # fmt: skip
+        cells = np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)])
+        if len(cells) == 0:
+            return
+        entries = self._entries_of(cells) if np.any(self._window[cells] == -1) else -2 - self._window[cells]
+        self._window[cells] = -2 - entries
+        counts_now = self._free_count[entries]
+        self._free_count[entries] = np.where(counts_now < 255, counts_now + 1, counts_now)
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def sample(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        camera: Camera,
+        T_world_camera: NDArray[np.float64],
+    ) -> MapSample:
+        """What the map says at the points of a depth image (h, w) of ``camera`` at a pose inside the window."""
+        shape = depth.shape
+        out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+        window, cells, geometry = self.window
+        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
+        integration.sample_map(
+            depth, intensity, intrinsics, self.lattice(T_world_camera), window, cells, geometry,
+            np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
+        )  # fmt: skip
+        return MapSample(*out)
+
+    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> View:
+        """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
+        camera = camera or self.camera
+        self.look_at(T_world_camera)
+        assert self._origin is not None
+        depth, color, normals = raycasting.raycast(
+            self._window.reshape(tuple(self._shape)), self._origin.astype(np.int32), self._geometry, self._colors,
+            self.voxel_size, self.sdf_unit, T_world_camera, camera, 0.05, self.depth_max, self.config.min_weight,
+        )  # fmt: skip
+        return View(depth, color, normals)
+
+    def extract_mesh(self, min_weight: int | None = None) -> Mesh:
+        """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
+
+        Raises:
+            MapError: The map is empty.
+        """
+        if self.is_empty:
+            raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        slots = self.active_slots
+        vertices, faces, colors, normals = meshing.extract(
+            self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
+            self.sdf_unit, self.config.min_weight if min_weight is None else min_weight,
+        )  # fmt: skip
+        return Mesh(vertices, faces, colors, normals)
+
+    def _neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
+        out = np.empty((len(slots), 8), dtype=np.int32)
+        for column in range(8):
+            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
+            entries = hashing.find_all(self._table, self._coords, self._slot_coords[slots] + offset)
+            out[:, column] = np.where(entries >= 0, self._slot_of[entries], -1)
+        return out
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write the map as NumPy archive; ``load`` gives an equal volume.
+
+        Raises:
+            MapError: The file cannot be written.
+        """
+        n, slots = self._num_entries, self.active_slots
+        try:
+            with Path(path).open("wb") as file:
+                np.savez_compressed(
+                    file,
+                    format=FORMAT,
+                    camera=np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy]),
+                    image=np.array([self.camera.width, self.camera.height]),
+                    config=self.config.model_dump_json(),
+                    sensor=self.sensor.model_dump_json(),
+                    depth_max=self.depth_max,
+                    coords=self._coords[:n],
+                    free_count=self._free_count[:n],
+                    entries=self._entry_of[slots],
+                    geometry=self._geometry[slots],
+                    colors=self._colors[slots],
+                )
+        except OSError as error:
+            raise MapError(f"cannot write the map to {path}: {error}") from error
+
+    @classmethod
+    def load(cls, path: str | Path) -> "TsdfVolume":
+        """Read a map that ``save`` wrote.
+
+        Raises:
+            MapError: The file is missing, damaged or not a map of this version.
+        """
+        import zipfile
+
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                if str(data["format"]) != FORMAT:
+                    raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
+                fx, fy, cx, cy = (float(value) for value in data["camera"])
+                width, height = (int(value) for value in data["image"])
+                volume = cls(
+                    Camera(fx, fy, cx, cy, width, height),
+                    VolumeConfig.model_validate_json(str(data["config"])),
+                    SensorConfig.model_validate_json(str(data["sensor"])),
+                    float(data["depth_max"]),
+                )
+                volume._restore(data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+            raise MapError(f"{path} is not a readable map file: {error}") from error
+        return volume
+
+    def _restore(
+        self,
+        coords: NDArray[np.int32],
+        free_count: NDArray[np.uint8],
+        entries: NDArray[np.int32],
+        geometry: NDArray[np.int32],
+        colors: NDArray[np.int32],
+    ) -> None:
+        n, m = len(coords), len(entries)
+        self._table = np.full(max(1 << 14, 1 << int(np.ceil(np.log2(2 * n + 1)))), hashing.EMPTY, dtype=np.int32)
+        self._coords, self._free_count, self._num_entries = coords.copy(), free_count.copy(), n
+        hashing.rebuild(self._table, self._coords, n)
+        self._geometry, self._colors, self._num_slots = geometry.copy(), colors.copy(), m
+        self._entry_of, self._slot_coords = entries.copy(), coords[entries]
+        self._slot_of = np.full(n, -1, dtype=np.int32)
+        self._slot_of[entries] = np.arange(m, dtype=np.int32)
+        self._origin = None
+
+
+def nearest_reading(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Nearest reading (H, W) in the 3x3 neighbourhood of each pixel that has one; 0 elsewhere."""
+    import cv2
+
+    far = np.where(depth > 0, depth, np.float32(np.inf))
+    return np.where(depth > 0, cv2.erode(far, np.ones((3, 3), np.uint8)), np.float32(0)).astype(np.float32)
+
+
+def packed(color: NDArray[np.uint8]) -> NDArray[np.int32]:
+    """Colours (H, W, 3) as (H, W) int32 with ten bits per channel."""
+    c = color.astype(np.int32)
+    return (c[..., 0] << 22) | (c[..., 1] << 12) | (c[..., 2] << 2)
+
+
+def _grown(array: NDArray, capacity: int, value: int) -> NDArray:
+    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
+    shape = (capacity, *array.shape[1:])
+    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
+    out[: len(array)] = array
+    return out
