@@ -68,9 +68,9 @@ class SimilarityConfig(Part):
     """Width of the image the features are found in, pixels."""
     max_features: int = Field(500, ge=50)
     """Most features a frame may have."""
-    max_translation: float = Field(0.02, ge=0)
+    max_translation: float = Field(0.005, ge=0)
     """A camera that moved more than this since the last fused frame is not tested, metres; 0 tests all frames."""
-    max_rotation_deg: float = Field(1.0, ge=0)
+    max_rotation_deg: float = Field(0.3, ge=0)
     """A camera that turned more than this since the last fused frame is not tested, degrees."""
 
 
@@ -118,8 +118,8 @@ class TrackerConfig(Part):
     """Weight each distance residual by the sensor's noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 4)
     """Most iterations per level, coarse to fine; 0 leaves the level out."""
-    strides: tuple[int, ...] = (8, 4, 2)
-    """Sub-sampling per level, powers of two, coarse to fine."""
+    widths: tuple[int, ...] = (80, 160, 320)
+    """Image width per level, coarse to fine, pixels; the nearest halving of the camera's image is taken."""
     stop: float = Field(1e-4, gt=0)
     """A level ends when the step's norm falls below this."""
     second_pass: bool = True
@@ -139,10 +139,10 @@ class TrackerConfig(Part):
 
     @model_validator(mode="after")
     def _levels(self) -> "TrackerConfig":
-        if len(self.iterations) != len(self.strides) or not self.strides:
-            raise ValueError("iterations and strides need one entry per level each")
-        if any(stride < 1 or stride & (stride - 1) for stride in self.strides):
-            raise ValueError(f"strides must be powers of two, found {self.strides}")
+        if len(self.iterations) != len(self.widths) or not self.widths:
+            raise ValueError("iterations and widths need one entry per level each")
+        if min(self.widths) < 16 or list(self.widths) != sorted(set(self.widths)):
+            raise ValueError(f"widths must grow and be at least 16, found {self.widths}")
         if sum(self.iterations) <= 0 or min(self.iterations) < 0:
             raise ValueError("iterations must hold at least one positive number and none below 0")
         return self
@@ -157,8 +157,8 @@ class DynamicsConfig(Part):
     """Points that appear in space the map knows to be free are dynamic (EM only)."""
     regions: bool = True
     """Decide per depth-connected region, not per pixel (EM only)."""
-    stride: int = Field(4, ge=1, le=8)
-    """Sub-sampling of the label image, pixels."""
+    width: int = Field(160, ge=40, le=1280)
+    """Width of the label image, pixels; the nearest halving of the camera's image is taken."""
     noise_threshold: float = Field(0.03, gt=0)
     """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
     noise_sigmas: float = Field(3.0, ge=0)

@@ -1,0 +1,180 @@
+"""Which pixels move: mixture of residual densities, known free space, regions (thesis section 4.6, algorithm 3)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import DynamicsConfig, SensorConfig
+from dudmap.kernels import labeling
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.tracker import Level
+from dudmap.volume import FREE, SURFACE, MapSample, TsdfVolume
+
+BINS = 128
+LARGEST = 16.0
+"""Normalised residuals are counted in BINS bins from 0 to LARGEST standard deviations."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56): static and dynamic."""
+
+    prior: tuple[float, float]
+    sigma: tuple[float, float]
+
+    def log_odds(self, residual: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Log odds static : dynamic of normalised residuals >= 0."""
+        (p_static, p_dynamic), (s, d) = self.prior, self.sigma
+        r2 = np.square(residual, dtype=np.float32)
+        return (np.log(p_static / p_dynamic * d / s) + r2 * np.float32(0.5 / d**2 - 0.5 / s**2)).astype(np.float32)
+
+    def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Densities (2, ...) of both components, priors included."""
+        r = np.asarray(residual, dtype=np.float64)
+        return np.stack(
+            [p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2) for p, s in zip(self.prior, self.sigma, strict=True)]
+        )
+
+
+def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = 30) -> Mixture:
+    """Expectation maximisation on a histogram of normalised residuals (eq. 4.52-4.56; Dempster et al. 1977).
+
+    The static density is kept at one to two standard deviations of the sensor and the dynamic one at no less than
+    three times the static one, so that the names of the components cannot swap.
+    """
+    counts = histogram.astype(np.float64)
+    total = counts.sum()
+    if total == 0:
+        return Mixture((0.9, 0.1), (1.0, 6.0))
+    centers = (edges[:-1] + edges[1:]) / 2
+    prior, sigma = np.array([0.9, 0.1]), np.array([1.0, 6.0])
+    for _ in range(iterations):
+        density = prior[:, None] / sigma[:, None] * np.exp(-0.5 * (centers / sigma[:, None]) ** 2)
+        responsibility = density / np.maximum(density.sum(axis=0), 1e-300)  # E-step
+        mass = responsibility @ counts  # M-step
+        new_prior = np.clip(mass / total, 0.02, 0.98)
+        new_prior /= new_prior.sum()
+        new_sigma = np.sqrt((responsibility * centers**2) @ counts / np.maximum(mass, 1e-9))
+        new_sigma[0] = np.clip(new_sigma[0], 0.5, 2.0)
+        new_sigma[1] = np.clip(new_sigma[1], 3 * new_sigma[0], LARGEST)
+        done = np.abs(new_prior - prior).max() < 1e-4 and np.abs(new_sigma - sigma).max() < 1e-3
+        prior, sigma = new_prior, new_sigma
+        if done:
+            break
+    return Mixture((float(prior[0]), float(prior[1])), (float(sigma[0]), float(sigma[1])))
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Outcome for one frame, at the resolution of the label level.
+
+    Attributes:
+        static_probability: (h, w) float32 in [0, 1]; the weight of the second registration.
+        dynamic: (h, w) bool.
+        mixture: The fitted densities, None for methods that fit none.
+        histogram: (BINS,) normalised residuals.
+        sample: What the map says at the points.
+    """
+
+    static_probability: NDArray[np.float32]
+    dynamic: NDArray[np.bool_]
+    mixture: Mixture | None
+    histogram: NDArray[np.int64]
+    sample: MapSample
+
+
+class DynamicDetector:
+    """Labels the pixels of a registered frame as static or moving, from how badly they fit the map."""
+
+    def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
+        self.config = config
+        self.sensor = sensor
+
+    def detect(self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> Labels:
+        """Labels of a frame that has been registered to ``volume`` at a pose."""
+        sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
+        sigma = self._sigma(level.depth, volume)
+        tolerance = 3 * self._sigma(level.depth, volume) + np.float32(0.02) * level.depth
+        residual = np.abs(sample.distance) / sigma
+        counted = residual[sample.place == SURFACE]
+        histogram, edges = np.histogram(np.minimum(counted, LARGEST - 1e-3), bins=BINS, range=(0, LARGEST))
+        if self.config.method == "threshold":
+            dynamic = self._threshold_and_flood(volume, level, sample)
+            return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
+        mixture = fit_mixture(histogram, edges)
+        evidence = np.zeros(level.depth.shape, dtype=np.float32)
+        near = sample.place == SURFACE
+        evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
+        noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
+        evidence[near & (np.abs(sample.distance) < noise)] += 3  # eq. 4.57: below the noise nothing is called motion
+        evidence[near & (sample.distance < 0)] = np.maximum(evidence[near & (sample.distance < 0)], 0)
+        if self.config.free_space:
+            evidence[sample.place == FREE] = -6
+        probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
+        dynamic = (probability < 0.5) & (level.depth > 0)
+        if self.config.regions:
+            dynamic = self._regions(dynamic, evidence, level, tolerance)
+        probability = np.where(dynamic, np.float32(0), probability)
+        return Labels(probability.astype(np.float32), dynamic, mixture, histogram, sample)
+
+    def _sigma(self, depth: NDArray[np.float32], volume: TsdfVolume) -> NDArray[np.float32]:
+        """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
+        sensor = self.sensor.sigma_base + self.sensor.sigma_scale * depth**2
+        return np.hypot(sensor, 0.4 * volume.voxel_size).astype(np.float32)
+
+    def _regions(
+        self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Grow each moving spot over the surface it belongs to, up to what fits the map or a depth edge."""
+        labels = np.empty(seeds.shape, dtype=np.int32)
+        count = labeling.grow(seeds, evidence < 2, level.depth, tolerance, labels)
+        areas = np.bincount(labels.reshape(-1), minlength=count + 1)
+        seeded = np.bincount(labels[seeds], minlength=count + 1)
+        smallest = 0.0008 * seeds.size
+        whole = (areas >= smallest) & (seeded >= 0.25 * areas)
+        some = (areas >= smallest) & ~whole
+        whole[0] = some[0] = False
+        return whole[labels] | (some[labels] & seeds)
+
+    def _threshold_and_flood(self, volume: TsdfVolume, level: Level, sample: MapSample) -> NDArray[np.bool_]:
+        """The simple rule: far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019)."""
+        import cv2
+
+        marked = (np.abs(np.nan_to_num(sample.distance)) > volume.truncation / np.sqrt(2)) | (sample.place == FREE)
+        scale = level.camera.width / 640
+        core = cv2.erode(marked.astype(np.uint8), _ellipse(15 * scale)) > 0
+        labels = np.empty(marked.shape, dtype=np.int32)
+        everywhere = np.ones_like(marked)
+        tolerance = np.float32(0.007 / scale) * level.depth
+        labeling.grow(core & (level.depth > 0), everywhere, level.depth, tolerance, labels)
+        return cv2.dilate((labels > 0).astype(np.uint8), _ellipse(10 * scale)) > 0
+
+
+def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Moving pixels (H, W) bool at full size; holes in the depth inside a moving region belong to it."""
+    import cv2
+
+    stride = depth.shape[1] // level.depth.shape[1]
+    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, _ellipse(2))
+    low[(level.depth > 0) & ~labels.dynamic] = 0
+    out = np.empty(depth.shape, dtype=np.uint8)
+    run_bands(
+        lambda start, stop: labeling.upsample(start, stop, low, level.depth, depth, stride, out),
+        bands(depth.shape[0], 60),
+    )
+    return out > 0
+
+
+def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """Mask (H, W) widened by some pixels."""
+    import cv2
+
+    return cv2.dilate(mask.astype(np.uint8), _ellipse(pixels)) > 0 if pixels else mask
+
+
+def _ellipse(radius: float) -> NDArray[np.uint8]:
+    import cv2
+
+    side = 2 * max(round(radius), 1) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)

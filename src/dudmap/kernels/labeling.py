@@ -1,0 +1,118 @@
+"""Loops over label images: neighbourhood consistency, growing over depth, transfer to full resolution."""
+
+import numpy as np
+
+from dudmap.kernels.threads import kernel
+
+
+@kernel
+def grow(seeds, open_pixels, depth, tolerance, labels):
+    """Regions that grow from seeds over open pixels without crossing a depth edge.
+
+    Args:
+        seeds: (h, w) bool.
+        open_pixels: (h, w) bool, pixels a region may take.
+        depth: (h, w) float32, 0 = none.
+        tolerance: (h, w) float32, largest depth step to a neighbour, metres.
+        labels: (h, w) int32 out, 0 = none, else the region's number from 1.
+
+    Returns:
+        Number of regions.
+    """
+    h, w = depth.shape
+    stack = np.empty(h * w, np.int32)
+    labels[:] = 0
+    count = 0
+    for v0 in range(h):
+        for u0 in range(w):
+            if not seeds[v0, u0] or labels[v0, u0] != 0:
+                continue
+            count += 1
+            labels[v0, u0] = count
+            stack[0] = v0 * w + u0
+            top = 1
+            while top > 0:
+                top -= 1
+                v, u = stack[top] // w, stack[top] % w
+                z = depth[v, u]
+                for k in range(4):
+                    vn = v + (1 if k == 0 else -1 if k == 1 else 0)
+                    un = u + (1 if k == 2 else -1 if k == 3 else 0)
+                    if vn < 0 or un < 0 or vn >= h or un >= w or labels[vn, un] != 0:
+                        continue
+                    if not (open_pixels[vn, un] or seeds[vn, un]) or depth[vn, un] <= 0:
+                        continue
+                    if abs(depth[vn, un] - z) <= tolerance[v, u]:
+                        labels[vn, un] = count
+                        stack[top] = vn * w + un
+                        top += 1
+    return count
+
+
+@kernel
+def smooth(evidence, depth, tolerance, coupling, iterations):
+    """Static probabilities with neighbourhood consistency: mean field over 8-neighbourhoods (cliques of algorithm 3).
+
+    Args:
+        evidence: (h, w) float32 log odds static : dynamic of each pixel alone; 0 = nothing known.
+        depth: (h, w) float32.
+        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        coupling: Log odds that all neighbours together can add.
+        iterations: Sweeps.
+
+    Returns:
+        (h, w) float32 static probability.
+    """
+    h, w = depth.shape
+    probability = np.empty((h, w), np.float32)
+    new = np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            probability[v, u] = np.float32(1) / (np.float32(1) + np.exp(-evidence[v, u]))
+    for _ in range(iterations):
+        for v in range(h):
+            for u in range(w):
+                z, total, count = depth[v, u], np.float32(0), np.float32(0)
+                if z > 0:
+                    for dv in range(-1, 2):
+                        for du in range(-1, 2):
+                            vn, un = v + dv, u + du
+                            if (dv == 0 and du == 0) or vn < 0 or un < 0 or vn >= h or un >= w:
+                                continue
+                            if depth[vn, un] > 0 and abs(depth[vn, un] - z) <= tolerance[v, u]:
+                                total += np.float32(2) * probability[vn, un] - np.float32(1)
+                                count += np.float32(1)
+                field = coupling * total / np.float32(8)
+                new[v, u] = np.float32(1) / (np.float32(1) + np.exp(-evidence[v, u] - field))
+        probability, new = new, probability
+    return probability
+
+
+@kernel
+def upsample(row_start, row_stop, low, low_depth, depth, stride, out):
+    """Label of each full-size pixel: that of the nearby low-size pixel whose depth is most alike.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        low: (h, w) uint8.
+        low_depth: (h, w) float32.
+        depth: (H, W) float32.
+        stride: Full-size pixels per low-size pixel.
+        out: (H, W) uint8 out.
+    """
+    h, w = low.shape
+    for v in range(row_start, row_stop):
+        for u in range(depth.shape[1]):
+            # the 2x2 low-size pixels whose centres surround this pixel
+            y = (2 * v + 1 - stride) // (2 * stride)
+            x = (2 * u + 1 - stride) // (2 * stride)
+            z = depth[v, u]
+            best, label = np.float32(np.inf), np.uint8(0)
+            for k in range(4):
+                vn = min(max(y + (k >> 1), 0), h - 1)
+                un = min(max(x + (k & 1), 0), w - 1)
+                zn = low_depth[vn, un]
+                gap = abs(zn - z) if z > 0 and zn > 0 else np.float32(100) if (z > 0) != (zn > 0) else np.float32(0)
+                if gap < best or (gap == best and low[vn, un] > label):
+                    best, label = gap, low[vn, un]
+            out[v, u] = label

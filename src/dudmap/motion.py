@@ -1,0 +1,48 @@
+"""Constant-velocity prediction of the camera, and what it makes of a jump."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.config import TrackerConfig
+
+
+class MotionModel:
+    """Predicts the next pose from the last two; after a loss it stays at the last good pose."""
+
+    def __init__(self, config: TrackerConfig) -> None:
+        self.config = config
+        self._timestamp = 0.0
+        self._T_world_camera = np.eye(4)
+        self._velocity = np.zeros(6)  # twist per second, camera axes
+        self._known = False
+
+    def predict(self, timestamp: float) -> NDArray[np.float64]:
+        """Pose (4, 4) to start the registration from."""
+        if not self.config.constant_velocity:
+            return self._T_world_camera
+        return self._T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
+
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
+        """Take over the pose of a tracked frame."""
+        if self._known:
+            motion = se3.log(se3.inverse(self._T_world_camera) @ T_world_camera)
+            self._velocity = motion / max(self._elapsed(timestamp), 1e-6)
+        self._timestamp, self._T_world_camera, self._known = timestamp, T_world_camera, True
+
+    def lost(self) -> None:
+        """Forget the velocity; the next frames are tried from the last good pose."""
+        self._velocity = np.zeros(6)
+
+    def implausible(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
+        """Sentence on a jump that no camera makes, empty if there is none."""
+        motion = se3.inverse(self._T_world_camera) @ T_world_camera
+        elapsed = self._elapsed(timestamp)
+        speed = float(np.linalg.norm(motion[:3, 3])) / elapsed
+        turn = float(np.degrees(se3.rotation_angle(motion))) / elapsed
+        if speed > self.config.max_speed or turn > self.config.max_turn_deg:
+            return f"the camera would have jumped at {speed:.1f} m/s and {turn:.0f} deg/s"
+        return ""
+
+    def _elapsed(self, timestamp: float) -> float:
+        return min(max(timestamp - self._timestamp, 1e-3), 1.0)

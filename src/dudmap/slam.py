@@ -1,0 +1,235 @@
+"""The algorithm: track a frame against the map, find what moves, fuse what does not (thesis algorithm 4)."""
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.config import Config
+from dudmap.dynamics import DynamicDetector, Labels, full_mask, grown_mask
+from dudmap.frame import Frame
+from dudmap.motion import MotionModel
+from dudmap.preprocess import Observation, Preprocessor, pyramid
+from dudmap.similarity import SimilarityTest
+from dudmap.tracker import Level, Tracker, TrackingResult
+from dudmap.trajectory import Trajectory
+from dudmap.volume import TsdfVolume
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """What one frame gave.
+
+    Attributes:
+        timestamp: Seconds, of the depth image.
+        state: "tracked" or "lost".
+        lost_reason: The check that failed, empty for a tracked frame.
+        T_world_camera: (4, 4), None if lost.
+        fused: Whether the frame changed the map.
+        skipped_similar: Whether it was left out of the fusion as a redundant view.
+        dynamic_mask: (H, W) bool.
+        dynamic_share: Share of the readings that lie in the mask.
+        residuals: (h, w) float32 signed distance to the map in metres at the label resolution, NaN off the map.
+        labels: The label step's full outcome, None where it did not run.
+        tracking: The registration's full outcome, None for the first frame.
+        timings: Milliseconds per stage.
+    """
+
+    timestamp: float
+    state: Literal["tracked", "lost"]
+    lost_reason: str
+    T_world_camera: NDArray[np.float64] | None
+    fused: bool
+    skipped_similar: bool
+    dynamic_mask: NDArray[np.bool_]
+    dynamic_share: float
+    residuals: NDArray[np.float32]
+    labels: Labels | None
+    tracking: TrackingResult | None
+    timings: dict[str, float] = field(default_factory=dict)
+
+
+class Slam:
+    """Dense RGB-D SLAM in scenes where things move.
+
+    Args:
+        camera: Camera of the frames that will come.
+        config: All parameters; None = defaults.
+    """
+
+    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+        self.config = config or Config()
+        self.preprocess = Preprocessor(camera, self.config.preprocess)
+        self.camera = self.preprocess.camera
+        self.volume = TsdfVolume(
+            self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max
+        )
+        self.tracker = Tracker(self.config.tracker, self.config.sensor)
+        self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
+        self.similarity = SimilarityTest(self.config.similarity)
+        self.motion = MotionModel(self.config.tracker)
+        self._poses: list[tuple[float, NDArray[np.float64]]] = []
+        self._T_world_fused: NDArray[np.float64] | None = None
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames tracked so far."""
+        return Trajectory.from_poses(self._poses)
+
+    def process(self, frame: Frame) -> FrameResult:
+        """Track one frame against the map, find what moves, fuse what does not.
+
+        Args:
+            frame: Depth and colour with a timestamp later than all before.
+
+        Raises:
+            DatasetError: The images do not fit the camera or each other.
+        """
+        clock = Clock()
+        with clock("preprocess"):
+            observation = self.preprocess(frame)
+            levels = self._levels(observation)
+        if self.volume.is_empty:
+            return self._start(frame, observation, clock)
+        with clock("track"):
+            tracked = self.tracker.align(self.volume, self._tracked(levels), self.motion.predict(frame.timestamp))
+        labels = None
+        if self.config.dynamics.method != "none":
+            with clock("label"):
+                labels = self._detect(levels, tracked)
+            if self.config.tracker.second_pass:
+                with clock("track_again"):
+                    weights = self._weights(labels, self._tracked(levels))
+                    tracked = self.tracker.align(
+                        self.volume, self._tracked(levels), tracked.T_world_camera, weights
+                    )
+                with clock("label"):
+                    labels = self._detect(levels, tracked)
+        reason = tracked.reason or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
+        if reason:
+            self.motion.lost()
+            return self._result(frame, observation, clock, levels, labels, tracked, reason, fused=False)
+        self.motion.update(frame.timestamp, tracked.T_world_camera)
+        self._poses.append((frame.timestamp, tracked.T_world_camera))
+        with clock("similarity"):
+            redundant = self._redundant(observation, tracked.T_world_camera)
+        result = self._result(frame, observation, clock, levels, labels, tracked, "", fused=not redundant)
+        if not redundant:
+            with clock("integrate"):
+                self._integrate(observation, tracked.T_world_camera, result.dynamic_mask)
+        return result
+
+    def _start(self, frame: Frame, observation: Observation, clock: "Clock") -> FrameResult:
+        """The first frame with readings is the world: identity pose, everything taken as static."""
+        readings = np.count_nonzero(observation.depth)
+        nothing = np.zeros(observation.depth.shape, dtype=bool)
+        reason = "" if readings >= 0.02 * observation.depth.size else "the depth image holds hardly any readings"
+        T = np.eye(4)
+        if not reason:
+            self.motion.update(frame.timestamp, T)
+            self._poses.append((frame.timestamp, T))
+            with clock("integrate"):
+                self._integrate(observation, T, nothing)
+        return FrameResult(
+            frame.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
+            nothing, 0.0, np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
+        )  # fmt: skip
+
+    def _levels(self, observation: Observation) -> dict[int, Level]:
+        """Image pyramid by number of halvings."""
+        wanted = {self._level(width) for width in (*self.config.tracker.widths, self.config.dynamics.width)}
+        return {
+            level: Level(self.camera.scaled(level), depth, intensity)
+            for level in sorted(wanted)
+            for depth, intensity in [pyramid(observation, level)]
+        }
+
+    def _level(self, width: int) -> int:
+        """Number of halvings that brings the camera's image nearest to a width."""
+        return max(0, round(np.log2(self.camera.width / width)))
+
+    def _tracked(self, levels: dict[int, Level]) -> list[Level]:
+        return [levels[self._level(width)] for width in self.config.tracker.widths]
+
+    def _detect(self, levels: dict[int, Level], tracked: TrackingResult) -> Labels:
+        level = levels[self._level(self.config.dynamics.width)]
+        return self.detector.detect(self.volume, level, tracked.T_world_camera)
+
+    def _weights(self, labels: Labels, levels: list[Level]) -> list[NDArray[np.float32]]:
+        """Static weights of the second registration at every level."""
+        import cv2
+
+        return [
+            cv2.resize(labels.static_probability, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            for level in levels
+        ]
+
+    def _redundant(self, observation: Observation, T_world_camera: NDArray[np.float64]) -> bool:
+        """The similarity test, asked only where the camera has hardly moved since the last fused frame."""
+        config = self.config.similarity
+        if not config.enabled or self._T_world_fused is None:
+            return False
+        moved = se3.inverse(self._T_world_fused) @ T_world_camera
+        if config.max_translation > 0 and (
+            np.linalg.norm(moved[:3, 3]) > config.max_translation
+            or np.degrees(se3.rotation_angle(moved)) > config.max_rotation_deg
+        ):
+            return False
+        return self.similarity.redundant(observation.rgb)
+
+    def _integrate(
+        self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
+    ) -> None:
+        static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
+        fused = Frame(observation.timestamp, observation.depth, observation.rgb)
+        self.volume.integrate(fused, T_world_camera, static)
+        self._T_world_fused = T_world_camera
+        if self.config.similarity.enabled:
+            self.similarity.accept(observation.rgb)
+
+    def _result(
+        self,
+        frame: Frame,
+        observation: Observation,
+        clock: "Clock",
+        levels: dict[int, Level],
+        labels: Labels | None,
+        tracked: TrackingResult,
+        reason: str,
+        *,
+        fused: bool,
+    ) -> FrameResult:
+        with clock("label"):
+            if labels is None:
+                mask = np.zeros(observation.depth.shape, dtype=bool)
+                residuals = np.full((1, 1), np.nan, np.float32)
+            else:
+                level = levels[self._level(self.config.dynamics.width)]
+                mask = full_mask(labels, level, observation.depth)
+                residuals = labels.sample.distance
+            readings = observation.depth > 0
+            share = np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1)
+        return FrameResult(
+            frame.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
+            fused, not fused and not reason, mask, float(share), residuals, labels, tracked, clock.timings,
+        )  # fmt: skip
+
+
+class Clock:
+    """Milliseconds per stage; a stage that runs twice adds up."""
+
+    def __init__(self) -> None:
+        self.timings: dict[str, float] = {}
+
+    @contextmanager
+    def __call__(self, stage: str) -> Iterator[None]:
+        """Time a block of code."""
+        start = time.perf_counter()
+        yield
+        self.timings[stage] = self.timings.get(stage, 0.0) + 1000 * (time.perf_counter() - start)
