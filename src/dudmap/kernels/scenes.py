@@ -1,0 +1,467 @@
+"""Rendering of analytic scenes: exact depth, the visible primitive, anti-aliased colour.
+
+A primitive is a kind, half sizes and a rigid pose. With the ray ``(x/z, y/z, 1) * t`` the ray parameter *is* the depth,
+so every formula below returns metres along the optical axis, in float64. Rays meet boxes, ellipsoids, capsules and
+cylinders in closed form (no step limit, wires thinner than a pixel are still exact); the torus, whose quartic is badly
+conditioned, is sphere traced (Hart 1996). Primitives are binned into screen tiles beforehand, and a tile visits them
+front to back until the nearest remaining one lies behind everything already hit.
+"""
+
+import numpy as np
+from numba import njit
+
+BOX, ELLIPSOID, CAPSULE, CYLINDER, TORUS = range(5)
+TILE_WIDTH, TILE_HEIGHT = 32, 16
+NEAR = 0.02  # metres; nothing closer is rendered
+TEXTURE_SIZE = 512
+TEXTURE_LEVELS = 10
+
+_MATHS = {"nsz", "contract", "reassoc"}
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
+    """Entry of the ray o + t d into the box |x| <= hx, |y| <= hy, |z| <= hz; inf if missed (slab method)."""
+    ix, iy, iz = 1.0 / dx, 1.0 / dy, 1.0 / dz
+    mx, my, mz = -ox * ix, -oy * iy, -oz * iz
+    kx, ky, kz = abs(ix) * hx, abs(iy) * hy, abs(iz) * hz
+    near = max(max(mx - kx, my - ky), mz - kz)
+    far = min(min(mx + kx, my + ky), mz + kz)
+    return near if (near <= far) & (near > NEAR) else np.inf
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
+    """First hit of an ellipsoid with semi-axes h: a sphere in scaled coordinates."""
+    px, py, pz = ox / hx, oy / hy, oz / hz
+    qx, qy, qz = dx / hx, dy / hy, dz / hz
+    a = qx * qx + qy * qy + qz * qz
+    b = (px * qx + py * qy + pz * qz) / a
+    cx, cy, cz = px - b * qx, py - b * qy, pz - b * qz  # closest approach to the centre
+    rest = 1.0 - (cx * cx + cy * cy + cz * cz)
+    t = -b - np.sqrt(max(rest, 0.0) / a)
+    return t if (rest >= 0.0) & (t > NEAR) else np.inf
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def capsule_depth(ox, oy, oz, dx, dy, dz, radius, half):
+    """First hit of a capsule: all points within ``radius`` of the segment from -half to half on the z axis."""
+    squared = radius * radius
+    a = dx * dx + dy * dy
+    b = (ox * dx + oy * dy) / a
+    cx, cy = ox - b * dx, oy - b * dy
+    rest = squared - (cx * cx + cy * cy)
+    side = -b - np.sqrt(max(rest, 0.0) / a)
+    side = side if (rest >= 0.0) & (abs(oz + side * dz) <= half) & (side > NEAR) else np.inf
+    length = a + dz * dz
+    best = side
+    for end in (-half, half):
+        pz = oz - end
+        e = (ox * dx + oy * dy + pz * dz) / length
+        ex, ey, ez = ox - e * dx, oy - e * dy, pz - e * dz
+        left = squared - (ex * ex + ey * ey + ez * ez)
+        t = -e - np.sqrt(max(left, 0.0) / length)
+        t = t if (left >= 0.0) & (t > NEAR) else np.inf
+        best = min(best, t)
+    return best
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, half):
+    """First hit of a closed cylinder of the given radius along z, |z| <= half."""
+    squared = radius * radius
+    a = dx * dx + dy * dy
+    b = (ox * dx + oy * dy) / a
+    cx, cy = ox - b * dx, oy - b * dy
+    rest = squared - (cx * cx + cy * cy)
+    side = -b - np.sqrt(max(rest, 0.0) / a)
+    side = side if (rest >= 0.0) & (abs(oz + side * dz) <= half) & (side > NEAR) else np.inf
+    cap = (-oz - (half if dz > 0 else -half)) / dz
+    px, py = ox + cap * dx, oy + cap * dy
+    cap = cap if (px * px + py * py <= squared) & (cap > NEAR) else np.inf
+    return min(side, cap)
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def torus_depth(ox, oy, oz, dx, dy, dz, ring, tube):
+    """First hit of a torus around z by sphere tracing its distance field down to a micrometre."""
+    length = np.sqrt(dx * dx + dy * dy + dz * dz)
+    middle = -(ox * dx + oy * dy + oz * dz) / (length * length)
+    reach = (ring + tube) / length
+    t = max(middle - reach - 1e-6, NEAR)
+    end = middle + reach
+    for _ in range(256):
+        if t > end:
+            return np.inf
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        rho = np.sqrt(x * x + y * y) - ring
+        distance = np.sqrt(rho * rho + z * z) - tube
+        if distance < 1e-6:
+            return t
+        t += distance / length
+    return t
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
+    """Depth at which the ray o + t d, in the primitive's own frame, enters it; inf if it does not."""
+    if kind == BOX:
+        return box_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
+    if kind == ELLIPSOID:
+        return ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
+    if kind == CAPSULE:
+        return capsule_depth(ox, oy, oz, dx, dy, dz, hx, hz)
+    if kind == CYLINDER:
+        return cylinder_depth(ox, oy, oz, dx, dy, dz, hx, hz)
+    return torus_depth(ox, oy, oz, dx, dy, dz, hx, hz)
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def trace(
+    row_from, row_to, order, nearest, in_columns, in_rows, kinds, rotations, origins, halves, intrinsics, depth, ids
+):
+    """Exact depth and visible primitive of the tile rows [row_from, row_to).
+
+    order (P,) primitives front to back, nearest (P,) their smallest depth; in_columns (P, C) and in_rows (P, R) tell
+    which tile columns and rows a primitive touches; kinds (P,), rotations (P, 3, 3) camera to primitive, origins (P, 3)
+    the camera centre in the primitive's frame, halves (P, 3); intrinsics fx fy cx cy. Fills depth (H, W) float32 metres
+    (0 = nothing) and ids (H, W) int16 (-1 = nothing).
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    best = np.empty(TILE_WIDTH * TILE_HEIGHT, np.float64)
+    found = np.empty(TILE_WIDTH * TILE_HEIGHT, np.int16)
+    for tile_row in range(row_from, row_to):
+        v0, v1 = tile_row * TILE_HEIGHT, min((tile_row + 1) * TILE_HEIGHT, height)
+        for tile_column in range((width + TILE_WIDTH - 1) // TILE_WIDTH):
+            u0, u1 = tile_column * TILE_WIDTH, min((tile_column + 1) * TILE_WIDTH, width)
+            count = u1 - u0
+            best[:] = np.inf
+            found[:] = -1
+            farthest = np.inf
+            for position in range(order.size):
+                p = order[position]
+                if nearest[p] > farthest:
+                    break
+                if not (in_columns[p, tile_column] and in_rows[p, tile_row]):
+                    continue
+                kind = kinds[p]
+                R = rotations[p]
+                ox, oy, oz = origins[p, 0], origins[p, 1], origins[p, 2]
+                hx, hy, hz = halves[p, 0], halves[p, 1], halves[p, 2]
+                number = np.int16(p)
+                for v in range(v0, v1):
+                    y = (v - cy) / fy
+                    bx, by, bz = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+                    line = (v - v0) * TILE_WIDTH
+                    if kind == BOX:
+                        for k in range(count):
+                            x = (u0 + k - cx) / fx
+                            t = box_depth(ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz)
+                            nearer = t < best[line + k]
+                            best[line + k] = t if nearer else best[line + k]
+                            found[line + k] = number if nearer else found[line + k]
+                    else:
+                        for k in range(count):
+                            x = (u0 + k - cx) / fx
+                            t = primitive_depth(
+                                kind, ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz
+                            )
+                            if t < best[line + k]:
+                                best[line + k] = t
+                                found[line + k] = number
+                farthest = 0.0
+                for v in range(v1 - v0):
+                    for k in range(count):
+                        farthest = max(farthest, best[v * TILE_WIDTH + k])
+            for v in range(v0, v1):
+                for k in range(count):
+                    t = best[(v - v0) * TILE_WIDTH + k]
+                    depth[v, u0 + k] = np.float32(t) if t < np.inf else np.float32(0.0)
+                    ids[v, u0 + k] = found[(v - v0) * TILE_WIDTH + k]
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def surface_normal(kind, x, y, z, hx, hy, hz):
+    """Outward unit normal, in the primitive's frame, at a point of its surface."""
+    if kind == BOX:
+        ax, ay, az = abs(x) - hx, abs(y) - hy, abs(z) - hz
+        if ax >= ay and ax >= az:
+            return np.sign(x), 0.0, 0.0
+        if ay >= az:
+            return 0.0, np.sign(y), 0.0
+        return 0.0, 0.0, np.sign(z)
+    if kind == ELLIPSOID:
+        nx, ny, nz = x / (hx * hx), y / (hy * hy), z / (hz * hz)
+    elif kind == CAPSULE:
+        nx, ny, nz = x, y, z - min(max(z, -hz), hz)
+    elif kind == CYLINDER:
+        if abs(z) - hz > np.sqrt(x * x + y * y) - hx:
+            return 0.0, 0.0, np.sign(z)
+        nx, ny, nz = x, y, 0.0
+    else:
+        rho = np.sqrt(x * x + y * y)
+        share = 1.0 - hx / rho
+        nx, ny, nz = x * share, y * share, z
+    scale = 1.0 / np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx * scale, ny * scale, nz * scale
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def texture_color(atlas, texture, level, u, v):
+    """Bilinear look-up in one level of a repeating texture; (red, green, blue) in 0..255."""
+    size = TEXTURE_SIZE >> level
+    start = 0
+    for finer in range(level):
+        start += (TEXTURE_SIZE >> finer) * (TEXTURE_SIZE >> finer)
+    x, y = u * size - 0.5, v * size - 0.5
+    left, top = np.floor(x), np.floor(y)
+    ax, ay = np.float32(x - left), np.float32(y - top)
+    x0, y0 = int(left) & (size - 1), int(top) & (size - 1)
+    x1, y1 = (x0 + 1) & (size - 1), (y0 + 1) & (size - 1)
+    w00, w10 = (1 - ax) * (1 - ay), ax * (1 - ay)
+    w01, w11 = (1 - ax) * ay, ax * ay
+    a, b = start + y0 * size + x0, start + y0 * size + x1
+    c, d = start + y1 * size + x0, start + y1 * size + x1
+    texels = atlas[texture]
+    red = w00 * texels[a, 0] + w10 * texels[b, 0] + w01 * texels[c, 0] + w11 * texels[d, 0]
+    green = w00 * texels[a, 1] + w10 * texels[b, 1] + w01 * texels[c, 1] + w11 * texels[d, 1]
+    blue = w00 * texels[a, 2] + w10 * texels[b, 2] + w01 * texels[c, 2] + w11 * texels[d, 2]
+    return red, green, blue
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
+    """Colour (0..1, three numbers) and cosine of incidence of primitive p where the ray (x, y, 1) t meets it.
+
+    Textures are projected along the largest component of the normal and filtered by the pixel's footprint (mip map);
+    light is Lambert's law from point lights plus a hemisphere that is brighter from above. See Renderer for the
+    columns of materials and lights.
+    """
+    R = rotations[p]
+    X, Y = x * t, y * t
+    px = R[0, 0] * X + R[0, 1] * Y + R[0, 2] * t + origins[p, 0]
+    py = R[1, 0] * X + R[1, 1] * Y + R[1, 2] * t + origins[p, 1]
+    pz = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * t + origins[p, 2]
+    lx, ly, lz = surface_normal(kinds[p], px, py, pz, halves[p, 0], halves[p, 1], halves[p, 2])
+    nx = R[0, 0] * lx + R[1, 0] * ly + R[2, 0] * lz
+    ny = R[0, 1] * lx + R[1, 1] * ly + R[2, 1] * lz
+    nz = R[0, 2] * lx + R[1, 2] * ly + R[2, 2] * lz
+    cosine = -(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0)
+
+    material = materials[p]
+    ax, ay, az = abs(lx), abs(ly), abs(lz)
+    if ax >= ay and ax >= az:
+        s, w, side = py, -pz, 0.37 * np.sign(lx)
+    elif ay >= az:
+        s, w, side = px, -pz, 0.71 * np.sign(ly)
+    else:
+        s, w, side = px, -py, 0.0
+    u, v = s * material[0] + material[2] + side * material[9], w * material[1] + material[3]
+    footprint = t / focal * 0.5 * (1.0 + 1.0 / max(cosine, 0.15)) * TEXTURE_SIZE
+    level = np.log2(max(footprint * max(material[0], material[1]), 1.0))
+    level = min(level, TEXTURE_LEVELS - 1.001)
+    finer = int(level)
+    share = np.float32(level - finer)
+    texture = textures[p]
+    r0, g0, b0 = texture_color(atlas, texture, finer, u, v)
+    r1, g1, b1 = texture_color(atlas, texture, finer + 1, u, v)
+    # Texture 0 once more, large and at an incommensurable scale, so that no two repeats of a pattern look alike.
+    cloud, _, _ = texture_color(atlas, 0, 2, s * 0.233 + material[3], w * 0.233 + material[2])
+    variation = 1.0 + material[7] * (cloud - 128.0) * (1.0 / 128.0)
+
+    light = 0.0
+    for k in range(lights.shape[0]):
+        ex, ey, ez = lights[k, 0] - X, lights[k, 1] - Y, lights[k, 2] - t
+        squared = ex * ex + ey * ey + ez * ez
+        facing = max((ex * nx + ey * ny + ez * nz) / np.sqrt(squared), 0.0)
+        light += lights[k, 3] * facing / (1.0 + squared * lights[k, 4])
+    light += up[3] * (0.75 + 0.25 * (nx * up[0] + ny * up[1] + nz * up[2])) + material[8]
+    gain = light * variation * (1.0 / 255.0)
+    return (
+        (r0 + share * (r1 - r0)) * material[4] * gain,
+        (g0 + share * (g1 - g0)) * material[5] * gain,
+        (b0 + share * (b1 - b0)) * material[6] * gain,
+        cosine,
+    )
+
+
+@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def shade(
+    row_from, row_to, order, nearest, in_columns, in_rows, kinds, rotations, origins, halves, intrinsics, depth, ids,
+    materials, textures, atlas, lights, up, sky, vignette, gain, color, cosines,
+):  # fmt: skip
+    """Colour (adds into (H, W, 3) float32, 0..255) and cosine of incidence (H, W) float32 of the tile rows.
+
+    Pixels at the border between two primitives are averaged over 2x2 rays, all others need one: inside a surface
+    the mip map already filters.
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    candidates = np.empty(order.size, np.int64)
+    for tile_row in range(row_from, row_to):
+        v0, v1 = tile_row * TILE_HEIGHT, min((tile_row + 1) * TILE_HEIGHT, height)
+        for tile_column in range((width + TILE_WIDTH - 1) // TILE_WIDTH):
+            u0, u1 = tile_column * TILE_WIDTH, min((tile_column + 1) * TILE_WIDTH, width)
+            farthest = 0.0
+            for v in range(v0, v1):
+                for u in range(u0, u1):
+                    farthest = max(farthest, depth[v, u] if depth[v, u] > 0 else np.inf)
+            count = 0
+            for position in range(order.size):
+                p = order[position]
+                if nearest[p] > farthest * 1.2:
+                    break
+                if in_columns[p, tile_column] and in_rows[p, tile_row]:
+                    candidates[count] = p
+                    count += 1
+            for v in range(v0, v1):
+                for u in range(u0, u1):
+                    p = ids[v, u]
+                    x, y = (u - cx) / fx, (v - cy) / fy
+                    border = (
+                        (u > 0 and ids[v, u - 1] != p)
+                        or (u + 1 < width and ids[v, u + 1] != p)
+                        or (v > 0 and ids[v - 1, u] != p)
+                        or (v + 1 < height and ids[v + 1, u] != p)
+                    )
+                    red, green, blue, cosine = sky[0], sky[1], sky[2], 1.0
+                    if p >= 0:
+                        red, green, blue, cosine = shade_point(
+                            p, x, y, np.float64(depth[v, u]), kinds, rotations, origins, halves, materials, textures,
+                            atlas, lights, up, fx,
+                        )  # fmt: skip
+                    if border:
+                        red, green, blue = 0.0, 0.0, 0.0
+                        for k in range(4):
+                            sx = x + (0.25 if k & 1 else -0.25) / fx
+                            sy = y + (0.25 if k & 2 else -0.25) / fy
+                            t, q = np.inf, -1
+                            for position in range(count):
+                                c = candidates[position]
+                                if nearest[c] > t:
+                                    break
+                                R = rotations[c]
+                                hit = primitive_depth(
+                                    kinds[c], origins[c, 0], origins[c, 1], origins[c, 2],
+                                    R[0, 0] * sx + R[0, 1] * sy + R[0, 2], R[1, 0] * sx + R[1, 1] * sy + R[1, 2],
+                                    R[2, 0] * sx + R[2, 1] * sy + R[2, 2], halves[c, 0], halves[c, 1], halves[c, 2],
+                                )  # fmt: skip
+                                if hit < t:
+                                    t, q = hit, c
+                            if q >= 0:
+                                r, g, b, _ = shade_point(
+                                    q, sx, sy, t, kinds, rotations, origins, halves, materials, textures, atlas,
+                                    lights, up, fx,
+                                )  # fmt: skip
+                                red, green, blue = red + 0.25 * r, green + 0.25 * g, blue + 0.25 * b
+                            else:
+                                red, green, blue = red + 0.25 * sky[0], green + 0.25 * sky[1], blue + 0.25 * sky[2]
+                    scale = gain * 255.0 / (1.0 + vignette * (x * x + y * y))
+                    color[v, u, 0] += np.float32(min(red * scale, 255.0 * gain))
+                    color[v, u, 1] += np.float32(min(green * scale, 255.0 * gain))
+                    color[v, u, 2] += np.float32(min(blue * scale, 255.0 * gain))
+                    cosines[v, u] = np.float32(cosine)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def _mix(a, b, key):
+    """64 well-mixed bits from two whole numbers and a key (splitmix64 finaliser)."""
+    x = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(key)
+    x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return x ^ (x >> np.uint64(31))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal, model, depth):
+    """What a disparity sensor reads in the rows [row_from, row_to); see sensors.SensorModel for ``model``.
+
+    exact, cosines (H, W) float32; smooth (S, S) float32 correlated noise of unit variance that repeats, S a power of
+    two; offsets (4, 2) where this frame reads it; key uint64; depth (H, W) float32 output, 0 = no reading.
+    """
+    height, width = exact.shape
+    wrap = smooth.shape[0] - 1
+    baseline, sigma, step, lateral = model[0], model[1], model[2], model[3]
+    nearest, fade, farthest = model[4], model[5], model[6]
+    fatten, grazing, edge_loss, speckle = int(model[7]), model[8], model[9], model[10]
+    scale = focal * baseline
+    seen = np.empty(width, np.float32)
+    lit = np.empty(2 * width + 2, np.float32)
+    for v in range(row_from, row_to):
+        for u in range(width):
+            # Lateral noise: the reading belongs to a ray a fraction of a pixel aside.
+            a = smooth[(v + offsets[0, 0]) & wrap, (u + offsets[0, 1]) & wrap]
+            b = smooth[(v + offsets[1, 0]) & wrap, (u + offsets[1, 1]) & wrap]
+            x = min(max(int(np.floor(u + lateral * a + 0.5)), 0), width - 1)
+            y = min(max(int(np.floor(v + lateral * b + 0.5)), 0), height - 1)
+            z = exact[y, x]
+            if fatten > 0:  # window matching lets near surfaces grow over far ones
+                for k in range(-fatten, fatten + 1):
+                    other = exact[y, min(max(x + k, 0), width - 1)]
+                    if other > 0 and (z == 0 or other < z):
+                        z = other
+            seen[u] = z
+        # A point is lit (or seen by the second camera) if nothing nearer lies on the projector's ray; the projector
+        # stands one baseline to the right, so its image is shifted left by the disparity.
+        lit[:] = 0
+        for u in range(width):
+            if seen[u] > 0:
+                disparity = np.float32(scale / seen[u])
+                column = int(np.floor(u - disparity)) + width
+                if column >= 0:
+                    lit[column] = max(lit[column], disparity)
+                    lit[column + 1] = max(lit[column + 1], disparity)
+        for u in range(width):
+            z = seen[u]
+            depth[v, u] = 0
+            if not nearest <= z <= farthest:
+                continue
+            disparity = np.float32(scale / z)
+            column = int(np.floor(u - disparity + 0.5)) + width
+            if column >= 0 and lit[column] > disparity * np.float32(1.02) + np.float32(0.4):
+                continue
+            bits = _mix(v, u, key)
+            chance = np.float32(bits & np.uint64(0xFFFF)) / np.float32(65536.0)
+            other_chance = np.float32((bits >> np.uint64(16)) & np.uint64(0xFFFF)) / np.float32(65536.0)
+            lost = np.float32(speckle)
+            if z > fade:
+                lost += np.float32((z - fade) / (farthest - fade)) ** 2
+            jump = np.float32(0.0)
+            for k in range(4):
+                uu = min(max(u + (2 if k == 0 else -2 if k == 1 else 0), 0), width - 1)
+                vv = min(max(v + (2 if k == 2 else -2 if k == 3 else 0), 0), height - 1)
+                other = exact[vv, uu]
+                jump = max(jump, z - other if other > 0 else np.float32(1.0))
+            if jump > 0.04 * z + 0.02:
+                lost += np.float32(edge_loss)
+            cosine = cosines[v, u]
+            if cosine < grazing:
+                lost += np.float32(1.5 * (grazing - cosine) / grazing)
+            if chance < lost:
+                continue
+            c = smooth[(v + offsets[2, 0]) & wrap, (u + offsets[2, 1]) & wrap]
+            d = smooth[(v + offsets[3, 0]) & wrap, (wrap - u + offsets[3, 1]) & wrap]
+            white = np.float32(np.sqrt(12.0)) * (other_chance - np.float32(0.5))
+            noisy = disparity + sigma * (0.65 * (c + d) + 0.394 * white)
+            if step > 0:
+                noisy = np.floor(noisy / step + 0.5) * step
+            reading = scale / noisy if noisy > 0 else 0.0
+            if nearest <= reading <= farthest:
+                depth[v, u] = np.float32(reading)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def measure_color(row_from, row_to, exact, table, key, sigma, color):
+    """Add sensor noise of ``sigma`` grey values to exact (H, W, 3) float32 and round into color (H, W, 3) uint8.
+
+    table (65536,) float32 holds unit Gaussian samples.
+    """
+    height, width, _ = exact.shape
+    for v in range(row_from, row_to):
+        for u in range(width):
+            bits = _mix(v + height, u, key)
+            for channel in range(3):
+                noise = table[(bits >> np.uint64(16 * channel)) & np.uint64(0xFFFF)]
+                value = exact[v, u, channel] + sigma * noise + np.float32(0.5)
+                color[v, u, channel] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))

@@ -1,0 +1,115 @@
+"""Smooth tracks over the floor, and what is derived from them."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+STEP = 0.01  # seconds between the samples of a track
+
+
+def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
+    """Gaussian mean along axis 0 of samples STEP apart; the ends are held."""
+    width = seconds / STEP
+    if width < 0.5:
+        return values
+    reach = int(np.ceil(3 * width))
+    weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
+    weights /= weights.sum()
+    padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
+    return np.stack(
+        [np.convolve(column, weights, mode="valid") for column in padded.reshape(len(padded), -1).T], axis=1
+    ).reshape(values.shape)
+
+
+class Track:
+    """Way over the floor through waypoints at given times, with rounded corners and gentle starts and stops.
+
+    Args:
+        times: (K,) seconds, increasing; before the first and after the last the track stands still.
+        points: (K, 2) floor positions in metres.
+        smooth: Standard deviation in seconds of the rounding.
+        yaw: Heading in radians while nothing has moved yet; None takes the first direction of motion.
+        gaps: (from, to) spans in seconds in which the thing is not there.
+    """
+
+    def __init__(
+        self,
+        times: Sequence[float],
+        points: Sequence[Sequence[float]],
+        *,
+        smooth: float = 0.15,
+        yaw: float | None = None,
+        gaps: Sequence[tuple[float, float]] = (),
+    ) -> None:
+        self._start = times[0] - 1.0
+        stamps = np.arange(self._start, times[-1] + 1.0 + STEP, STEP)
+        table = np.asarray(points, dtype=np.float64)
+        raw = np.stack([np.interp(stamps, times, table[:, k]) for k in range(2)], axis=1)
+        # A jump inside a gap (leaving here, coming back there) must not be smeared into a motion.
+        pieces = np.searchsorted(stamps, [0.5 * (a + b) for a, b in gaps])
+        self.positions = np.concatenate([smoothed(part, smooth) for part in np.split(raw, pieces)])
+        self.stamps, self.gaps = stamps, tuple(gaps)
+        step = np.diff(self.positions, axis=0)
+        length = np.linalg.norm(step, axis=1)
+        length[pieces[(pieces > 0) & (pieces <= len(length))] - 1] = 0.0
+        self.walked = np.concatenate([[0.0], np.cumsum(length)])
+        moving = length > 0.01 * STEP
+        if yaw is None:
+            first = int(np.argmax(moving))
+            yaw = float(np.arctan2(step[first, 1], step[first, 0])) if moving.any() else 0.0
+        headings = np.where(moving, np.arctan2(step[:, 1], step[:, 0]), np.nan)
+        known = np.where(np.isnan(headings), 0, np.arange(1, len(headings) + 1))
+        filled = np.concatenate([[yaw], headings])[np.maximum.accumulate(known)]
+        self.yaws = smoothed(np.unwrap(np.append(filled, filled[-1:]))[:, None], 0.12)[:, 0]
+
+    def at(self, t: float) -> tuple[NDArray[np.float64], float, float]:
+        """Position (2,), heading in radians and distance walked in metres at time ``t``."""
+        x = float(np.interp(t, self.stamps, self.positions[:, 0]))
+        y = float(np.interp(t, self.stamps, self.positions[:, 1]))
+        return (
+            np.array([x, y]),
+            float(np.interp(t, self.stamps, self.yaws)),
+            float(np.interp(t, self.stamps, self.walked)),
+        )
+
+    def present(self, t: float) -> bool:
+        """Whether the thing is there at time ``t``."""
+        return not any(a <= t < b for a, b in self.gaps)
+
+
+def crossing(
+    line: tuple[Sequence[float], Sequence[float]],
+    speed: float,
+    duration: float,
+    *,
+    enter: float = 1.0,
+    start_inside: bool = False,
+    pause: float = 1.0,
+    entry_speed: float = 1.2,
+) -> Track:
+    """Walk from one end of ``line`` to the other and, after a pause out of sight, back again, until ``duration``.
+
+    The middle 40 % of the line are walked at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
+    also come into view. ``enter`` shifts the start so that 25 % of the line is reached at that time in seconds;
+    with ``start_inside`` the walk begins in the middle of the view.
+    """
+    a, b = np.asarray(line[0], float), np.asarray(line[1], float)
+    length = float(np.linalg.norm(b - a))
+    fast = max(speed, entry_speed)
+    shares = np.array([0.0, 0.3, 0.7, 1.0])
+    needed = np.cumsum([0.0, 0.3 * length / fast, 0.4 * length / speed, 0.3 * length / fast])
+    begin = enter - 0.25 * length / fast
+    if start_inside:
+        begin = -float(np.interp(0.4, shares, needed))
+    times: list[float] = []
+    points: list[NDArray[np.float64]] = []
+    gaps: list[tuple[float, float]] = [(-np.inf, begin)]
+    while not times or times[-1] < duration:
+        ahead = len(points) % 8 == 0
+        for share, moment in zip(shares, needed, strict=True):
+            times.append(begin + float(moment))
+            points.append(a + (share if ahead else 1 - share) * (b - a))
+        begin = times[-1] + pause
+        gaps.append((times[-1], begin))
+    return Track(times, [list(p) for p in points], smooth=0.1, gaps=gaps[1:] if gaps[0][1] < 0 else gaps)

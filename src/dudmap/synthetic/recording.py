@@ -1,0 +1,254 @@
+"""A rendered recording: frames, true poses, masks, movers and surface."""
+
+from collections import OrderedDict
+from dataclasses import replace
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.errors import ConfigError, FrameError
+from dudmap.frame import Frame
+from dudmap.synthetic.movers import MOVING_SPEED, Mover
+from dudmap.synthetic.render import Renderer, Rendering
+from dudmap.synthetic.scene import Scene
+from dudmap.synthetic.sensors import Sensor
+from dudmap.trajectory import Trajectory
+
+DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+
+
+class MoverState(NamedTuple):
+    """A mover at the time of one frame.
+
+    Attributes:
+        id: Number from 1 on, the same in every frame.
+        T_world_mover: (4, 4) pose.
+        velocity: (3,) m/s, world frame.
+        name: What it is.
+        moving: Whether it counts as dynamic in this frame.
+    """
+
+    id: int
+    T_world_mover: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    name: str
+    moving: bool
+
+
+class SyntheticSequence:
+    """Sequence whose frames are rendered when asked for; ``sequence[i]`` is always the same frame.
+
+    Attributes:
+        name: Scene and movers.
+        camera: Intrinsics.
+        timestamps: (N,) seconds.
+        ground_truth: Exact camera poses.
+        parameters: Everything it was made from.
+        scene: The static world.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        movers: list[Mover],
+        ground_truth: Trajectory,
+        camera: Camera,
+        *,
+        noise: str,
+        seed: int,
+        fps: float,
+        motion_blur: float = 0.0,
+        exposure_change: float = 0.0,
+        parameters: dict[str, object] | None = None,
+    ) -> None:
+        self.scene, self.camera, self.ground_truth = scene, camera, ground_truth
+        self.timestamps = ground_truth.timestamps
+        self.parameters = dict(parameters or {})
+        self.name = "-".join([scene.name, *(mover.name for mover in movers)])
+        self._movers, self._noise, self._seed, self._fps = movers, noise, seed, fps
+        self._motion_blur, self._exposure_change = motion_blur, exposure_change
+        self._sensor = Sensor(noise, seed)
+        owned = [p for mover in movers for p in mover.primitives]
+        self._owner = np.repeat(np.arange(len(movers)), [len(mover.primitives) for mover in movers])
+        self._renderer = Renderer(scene, scene.primitives + owned)
+        self._kept: OrderedDict[int, tuple[Frame, NDArray[np.bool_]]] = OrderedDict()
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame number ``index`` (negative counts from the end).
+
+        Raises:
+            FrameError: There is no such frame.
+        """
+        return self._both(index)[0]
+
+    def mask(self, index: int) -> NDArray[np.bool_]:
+        """True dynamic mask (H, W): the visible surface belongs to something that moves in this frame.
+
+        A mover counts as moving while any point of it is faster than 0.01 m/s on average over the frame's interval
+        (half a frame before to half a frame after); all its parts are labelled together.
+        """
+        index = self._number(index)
+        if index in self._kept:
+            return self._kept[index][1].copy()
+        return self._mask_of(self._render(index, with_color=False), index)
+
+    def exact(self, index: int) -> Rendering:
+        """Ideal depth, colour and visible primitive of a frame, without any sensor."""
+        return self._render(self._number(index), with_color=True)
+
+    def exact_depth(self, index: int) -> NDArray[np.float32]:
+        """Ideal depth (H, W) in metres of a frame, 0 where nothing is."""
+        return self._render(self._number(index), with_color=False).depth
+
+    def movers(self, index: int) -> list[MoverState]:
+        """The movers that exist in a frame, visible or not."""
+        index = self._number(index)
+        t = float(self.timestamps[index])
+        return [
+            MoverState(number, mover.reference(t), mover.velocity(t), mover.name, self._moves(mover, t))
+            for number, mover in enumerate(self._movers, start=1)
+            if mover.present(t)
+        ]
+
+    def static_twin(self) -> "SyntheticSequence":
+        """The same camera path and sensor noise without any mover."""
+        return SyntheticSequence(
+            self.scene,
+            [],
+            self.ground_truth,
+            self.camera,
+            noise=self._noise,
+            seed=self._seed,
+            fps=self._fps,
+            motion_blur=self._motion_blur,
+            exposure_change=self._exposure_change,
+            parameters=self.parameters | {"movers": []},
+        )
+
+    def _number(self, index: int) -> int:
+        number = index + len(self) if index < 0 else index
+        if not 0 <= number < len(self):
+            raise FrameError(f"frame {index} does not exist; the sequence has {len(self)} frames")
+        return number
+
+    def _moves(self, mover: Mover, t: float) -> bool:
+        return mover.top_speed(t, 1.0 / self._fps) > MOVING_SPEED
+
+    def _both(self, index: int) -> tuple[Frame, NDArray[np.bool_]]:
+        index = self._number(index)
+        if index not in self._kept:
+            rendering = self._render(index, with_color=True)
+            depth, color = self._sensor.measure(rendering, self.camera.fx, index)
+            frame = Frame(float(self.timestamps[index]), depth, color)
+            self._kept[index] = (frame, self._mask_of(rendering, index))
+            while len(self._kept) > 2:
+                self._kept.popitem(last=False)
+        frame, mask = self._kept[index]
+        return replace(frame, depth=frame.depth.copy(), color=frame.color.copy()), mask
+
+    def _mask_of(self, rendering: Rendering, index: int) -> NDArray[np.bool_]:
+        t = float(self.timestamps[index])
+        moving = np.array([mover.present(t) and self._moves(mover, t) for mover in self._movers], dtype=bool)
+        table = np.concatenate([np.zeros(len(self.scene.primitives), dtype=bool), moving[self._owner], [False]])
+        return table[rendering.primitive]
+
+    def _render(self, index: int, with_color: bool) -> Rendering:
+        t = float(self.timestamps[index])
+        sharp = self._render_at(t, self.ground_truth.Ts_world_camera[index], with_color)
+        if not with_color or self._motion_blur <= 0 or sharp.color is None:
+            return sharp
+        color = np.zeros_like(sharp.color)
+        shares = (np.arange(5) - 2) / 5 * self._motion_blur  # of the time between two frames
+        for share in shares:
+            moment = t + share / self._fps
+            inside = min(max(moment, self.timestamps[0]), self.timestamps[-1])
+            blurred = self._render_at(moment, self.ground_truth.interpolate(inside), True)
+            assert blurred.color is not None
+            color += blurred.color / len(shares)
+        return replace(sharp, color=color)
+
+    def _render_at(self, t: float, T_world_camera: NDArray[np.float64], with_color: bool) -> Rendering:
+        Ts = np.empty((len(self._owner), 4, 4))
+        present = np.zeros(len(self._owner), dtype=bool)
+        start = 0
+        for mover in self._movers:
+            end = start + len(mover.primitives)
+            if mover.present(t):
+                Ts[start:end] = mover.parts(t) @ np.array([p.T_body_primitive for p in mover.primitives])
+                present[start:end] = True
+            else:
+                Ts[start:end] = np.eye(4)
+            start = end
+        gain = 1.0 + self._exposure_change * np.sin(2 * np.pi * t / 2.7)
+        return self._renderer.render(self.camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
+
+
+def make_sequence(
+    scene: str = "room",
+    movers: tuple[str, ...] = ("person",),
+    camera_path: str | Path = "handheld",
+    frames: int = 120,
+    fps: float = 30.0,
+    noise: str = "kinect",
+    speed: float | None = None,
+    start_dynamic: bool = False,
+    seed: int = 0,
+    camera: Camera | None = None,
+    motion_blur: float = 0.0,
+    exposure_change: float = 0.0,
+) -> SyntheticSequence:
+    """See ``dudmap.synthetic.sequence``."""
+    from dudmap.synthetic.movers import Staging, build_movers
+    from dudmap.synthetic.paths import camera_poses
+    from dudmap.synthetic.rooms import build_scene
+
+    if frames < 1:
+        raise ConfigError(f"frames is {frames}; at least one frame is needed")
+    if not 0.5 <= fps <= 1000:
+        raise ConfigError(f"fps is {fps}; expected a rate from 0.5 to 1000 frames per second")
+    if speed is not None and not 0 < speed <= 20:
+        raise ConfigError(f"speed is {speed} m/s; expected more than 0 and at most 20")
+    world = build_scene(scene, seed)
+    times = np.round(np.arange(frames) / fps, 6)
+    poses = camera_poses(camera_path, world, times, seed)
+    poses = np.stack([_clean(T) for T in poses])
+    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]) + 1.0, start_dynamic)
+    actors = build_movers(tuple(movers), staging)
+    parameters: dict[str, object] = {
+        "scene": scene,
+        "movers": list(movers),
+        "camera_path": str(camera_path),
+        "frames": frames,
+        "fps": fps,
+        "noise": noise,
+        "speed": speed,
+        "start_dynamic": start_dynamic,
+        "seed": seed,
+        "motion_blur": motion_blur,
+        "exposure_change": exposure_change,
+    }
+    return SyntheticSequence(
+        world,
+        actors,
+        Trajectory(times, poses),
+        camera or DEFAULT_CAMERA,
+        noise=noise,
+        seed=seed,
+        fps=fps,
+        motion_blur=motion_blur,
+        exposure_change=exposure_change,
+        parameters=parameters,
+    )
+
+
+def _clean(T: NDArray[np.float64]) -> NDArray[np.float64]:
+    out = T.copy()
+    out[:3, :3] = se3.nearest_rotation(T[:3, :3])
+    return out

@@ -1,0 +1,224 @@
+"""Primitives, materials and scenes: what there is, where it stands and what it looks like."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.synthetic.textures import TEXTURES
+
+Matrix = NDArray[np.float64]
+Vector = Sequence[float] | NDArray[np.float64]
+
+BOX, ELLIPSOID, CAPSULE, CYLINDER, TORUS = range(5)  # the numbers that kernels.scenes uses
+
+
+@dataclass(frozen=True)
+class Material:
+    """Look of a surface.
+
+    Attributes:
+        texture: Name of a texture (``textures.TEXTURES``).
+        scale: Repeats of the texture per metre, across and down.
+        offset: Shift of the texture in repeats.
+        tint: Factors on red, green, blue.
+        variation: Share by which large clouds of light and dark change the brightness.
+        glow: Light given off, added to the light received (screens, lamps).
+        faces: Whether the faces of a box show different parts of the texture.
+    """
+
+    texture: str = "plain"
+    scale: tuple[float, float] = (0.5, 0.5)
+    offset: tuple[float, float] = (0.0, 0.0)
+    tint: tuple[float, float, float] = (1.0, 1.0, 1.0)
+    variation: float = 0.15
+    glow: float = 0.0
+    faces: bool = True
+
+    def row(self) -> list[float]:
+        """The ten numbers that the shading kernel reads."""
+        return [*self.scale, *self.offset, *self.tint, self.variation, self.glow, float(self.faces)]
+
+
+@dataclass(frozen=True, eq=False)
+class Primitive:
+    """One solid in the frame of its body.
+
+    Attributes:
+        kind: BOX, ELLIPSOID, CAPSULE and CYLINDER (axis z), TORUS (around z).
+        half: Half extents in metres: box hx hy hz; ellipsoid semi-axes; capsule and cylinder (radius, radius, half
+            length of the axis); torus (ring radius, ring radius, tube radius).
+        T_body_primitive: (4, 4) pose in the body (for static things the body is the world).
+        material: Its look.
+    """
+
+    kind: int
+    half: tuple[float, float, float]
+    T_body_primitive: Matrix
+    material: Material
+
+    def bounds(self) -> NDArray[np.float64]:
+        """Half extents (3,) of the box around the primitive, in its own frame."""
+        hx, hy, hz = self.half
+        if self.kind == CAPSULE:
+            return np.array([hx, hy, hz + hx])
+        if self.kind == TORUS:
+            return np.array([hx + hz, hx + hz, hz])
+        return np.array([hx, hy, hz])
+
+    def moved(self, T: Matrix) -> "Primitive":
+        """The same solid after the rigid motion ``T`` (4, 4)."""
+        return replace(self, T_body_primitive=T @ self.T_body_primitive)
+
+    def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Signed distance (N,) in metres of points (N, 3) in the body frame; negative inside.
+
+        Exact but for the ellipsoid, where it is a first-order estimate with the right sign.
+        """
+        R, t = self.T_body_primitive[:3, :3], self.T_body_primitive[:3, 3]
+        local = (points - t) @ R
+        hx, _, hz = self.half
+        if self.kind == BOX:
+            excess = np.abs(local) - self.half
+            return np.linalg.norm(np.maximum(excess, 0), axis=1) + np.minimum(excess.max(axis=1), 0)
+        if self.kind == ELLIPSOID:
+            scaled = np.linalg.norm(local / self.half, axis=1)
+            slope = np.linalg.norm(local / np.square(self.half), axis=1)
+            return scaled * (scaled - 1) / np.maximum(slope, 1e-12)
+        if self.kind == CAPSULE:
+            local[:, 2] -= np.clip(local[:, 2], -hz, hz)
+            return np.linalg.norm(local, axis=1) - hx
+        rho = np.hypot(local[:, 0], local[:, 1]) - hx
+        if self.kind == TORUS:
+            return np.hypot(rho, local[:, 2]) - hz
+        excess = np.stack([rho, np.abs(local[:, 2]) - hz], axis=1)
+        return np.linalg.norm(np.maximum(excess, 0), axis=1) + np.minimum(excess.max(axis=1), 0)
+
+
+def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Matrix:
+    """Rigid motion (4, 4): ``position`` in metres, angles in degrees, turned about x (roll), y (pitch), then z (yaw)."""
+    (ca, cb, cc), (sa, sb, sc) = (f(np.radians([yaw, pitch, roll])) for f in (np.cos, np.sin))
+    T = np.eye(4)
+    T[:3, :3] = (
+        np.array([[ca, -sa, 0], [sa, ca, 0], [0, 0, 1]])
+        @ np.array([[cb, 0, sb], [0, 1, 0], [-sb, 0, cb]])
+        @ np.array([[1, 0, 0], [0, cc, -sc], [0, sc, cc]])
+    )
+    T[:3, 3] = position
+    return T
+
+
+def look_at(eye: Vector, target: Vector, roll: float = 0.0) -> Matrix:
+    """Camera pose T_world_camera (4, 4) at ``eye`` looking at ``target``, world z up, turned by ``roll`` degrees."""
+    forward = np.asarray(target, float) - np.asarray(eye, float)
+    forward /= np.linalg.norm(forward)
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([right, np.cross(forward, right), forward], axis=1)
+    c, s = np.cos(np.radians(roll)), np.sin(np.radians(roll))
+    T[:3, :3] = T[:3, :3] @ np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    T[:3, 3] = eye
+    return T
+
+
+def box(center: Vector, size: Vector, material: Material, yaw: float = 0.0, pitch: float = 0.0) -> Primitive:
+    """Box of the given full size (3,) around ``center``."""
+    x, y, z = (float(s) / 2 for s in size)
+    return Primitive(BOX, (x, y, z), pose(center, yaw, pitch), material)
+
+
+def ellipsoid(center: Vector, half: Vector, material: Material, yaw: float = 0.0) -> Primitive:
+    """Ellipsoid with semi-axes ``half`` (3,)."""
+    x, y, z = (float(s) for s in half)
+    return Primitive(ELLIPSOID, (x, y, z), pose(center, yaw), material)
+
+
+def _along(start: Vector, end: Vector) -> tuple[Matrix, float]:
+    a, b = np.asarray(start, float), np.asarray(end, float)
+    length = float(np.linalg.norm(b - a))
+    z = (b - a) / length
+    x = np.cross([0.0, 1.0, 0.0] if abs(z[1]) < 0.9 else [1.0, 0.0, 0.0], z)
+    x /= np.linalg.norm(x)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([x, np.cross(z, x), z], axis=1)
+    T[:3, 3] = (a + b) / 2
+    return T, length
+
+
+def capsule(start: Vector, end: Vector, radius: float, material: Material) -> Primitive:
+    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+    T, length = _along(start, end)
+    return Primitive(CAPSULE, (radius, radius, length / 2), T, material)
+
+
+def cylinder(start: Vector, end: Vector, radius: float, material: Material) -> Primitive:
+    """Closed cylinder between the centres of its two caps."""
+    T, length = _along(start, end)
+    return Primitive(CYLINDER, (radius, radius, length / 2), T, material)
+
+
+def torus(center: Vector, axis: Vector, ring: float, tube: float, material: Material) -> Primitive:
+    """Ring of radius ``ring`` around ``axis``, with a tube of radius ``tube``."""
+    T, _ = _along(center, np.asarray(center, float) + np.asarray(axis, float))
+    T[:3, 3] = center
+    return Primitive(TORUS, (ring, ring, tube), T, material)
+
+
+@dataclass(frozen=True)
+class Light:
+    """Point light: position (world, m), strength, and fall-off per square metre."""
+
+    position: tuple[float, float, float]
+    strength: float = 0.6
+    falloff: float = 0.04
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A static world with the places that camera paths and movers need; z is up, the floor is z = 0.
+
+    Attributes:
+        name: Its name.
+        primitives: The static solids, in the world frame.
+        home: Middle pose T_world_camera (4, 4) of the built-in camera paths.
+        target: Point (world) that the camera looks at on the whole.
+        space: ((3,), (3,)) corners of the free box in which a camera may be.
+        walk_line: Two floor points; walkers cross the view from the first to the second.
+        rest: Pose T_world_body (4, 4) of the place where boxes are put down or taken away (middle of the bottom).
+        hinge: Pose of a door's hinge, the door leaf along +x of it, or None.
+        lights: Point lights.
+        ambient: Hemisphere light.
+        sky: Colour (0..1) where nothing is.
+        detail: Edge length in metres of the triangles of the reference surface.
+        mover_scale: Factor on the size of movers (small worlds such as a desk have small movers).
+    """
+
+    name: str
+    primitives: list[Primitive]
+    home: Matrix
+    target: tuple[float, float, float]
+    space: tuple[tuple[float, float, float], tuple[float, float, float]]
+    walk_line: tuple[tuple[float, float], tuple[float, float]]
+    rest: Matrix
+    hinge: Matrix | None = None
+    lights: tuple[Light, ...] = (Light((0.0, 0.0, 2.4)),)
+    ambient: float = 0.45
+    sky: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    detail: float = 0.02
+    mover_scale: float = 1.0
+    ground: float = 0.0
+    _cache: dict[str, object] = field(default_factory=dict, repr=False)
+
+    def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Distance (N,) in metres from points (N, 3) to the nearest static solid; negative inside one."""
+        return np.min([p.distance(points) for p in self.primitives], axis=0)
+
+
+SceneBuilder = Callable[[np.random.Generator], Scene]
+
+
+def checked_texture(name: str) -> int:
+    """Number of a texture."""
+    return TEXTURES.index(name)
