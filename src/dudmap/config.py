@@ -114,6 +114,8 @@ class TrackerConfig(Part):
     """Weight of the squared intensity residual (0..1) against the squared distance residual (m), eq. 4.32."""
     color_huber: float = Field(0.1, gt=0)
     """Huber constant of the intensity residual."""
+    exposure: bool = True
+    """Fit gain and offset of the image's intensities to the map's before each level."""
     noise_weighting: bool = True
     """Weight each distance residual by the sensor's noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 4)
@@ -247,7 +249,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
         "volume": {"voxel_size": 0.01, "truncation_noise": 0.0, "weighting": "constant"},
-        "tracker": {"huber": 0.01, "damping": 0.02, "color_weight": 0.1325, "noise_weighting": False, "stop": 1e-3},
+        "tracker": {"huber": 0.01, "damping": 0.02, "color_weight": 0.1325, "noise_weighting": False, "exposure": False, "stop": 1e-3},
         "similarity": {"threshold": 0.84},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False},

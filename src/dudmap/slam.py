@@ -122,7 +122,7 @@ class Slam:
         result = self._result(frame, observation, clock, levels, labels, tracked, "", fused=not redundant)
         if not redundant:
             with clock("integrate"):
-                self._integrate(observation, tracked.T_world_camera, result.dynamic_mask)
+                self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
         return result
 
     def _start(self, frame: Frame, observation: Observation, clock: "Clock") -> FrameResult:
@@ -184,10 +184,14 @@ class Slam:
         return self.similarity.redundant(observation.rgb)
 
     def _integrate(
-        self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
+        self,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+        dynamic_mask: NDArray[np.bool_],
+        exposure: tuple[float, float] = (1.0, 0.0),
     ) -> None:
         static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
-        fused = Frame(observation.timestamp, observation.depth, observation.rgb)
+        fused = Frame(observation.timestamp, observation.depth, exposed_color(observation.rgb, exposure))
         self.volume.integrate(fused, T_world_camera, static)
         self._T_world_fused = T_world_camera
         if self.config.similarity.enabled:
@@ -219,6 +223,18 @@ class Slam:
             frame.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, float(share), residuals, labels, tracked, clock.timings,
         )  # fmt: skip
+
+
+def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
+    import cv2
+
+    gain, offset = exposure
+    return rgb if exposure == (1.0, 0.0) else cv2.LUT(rgb, _curve(gain, offset))
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
 
 
 class Clock:

@@ -53,6 +53,7 @@ class TrackingResult:
 
     Attributes:
         T_world_camera: (4, 4).
+        exposure: Gain and offset that make the frame's intensities those of the map.
         converged: Whether all checks passed.
         reason: The failed check, empty if none.
         inlier_share: Share of the readings that fall on the map.
@@ -62,6 +63,7 @@ class TrackingResult:
     """
 
     T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
     converged: bool
     reason: str
     inlier_share: float
@@ -93,15 +95,20 @@ class Tracker:
             static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
         """
         volume.look_at(T_init)
-        T, iterations, system = T_init, 0, None
+        T, iterations, system, exposure = T_init, 0, None, (1.0, 0.0)
         for index, level in enumerate(levels):
             if self.config.iterations[index] == 0:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
-            T, system, used = self._optimize(volume, level, T, weights, self.config.iterations[index])
+            if self.config.exposure:
+                residuals = self.linearize(volume, exposed(level, exposure), T, weights).residuals
+                exposure = chained(exposure, fit_exposure(exposed(level, exposure).intensity, residuals[1], weights))
+                iterations += 1
+            lit = exposed(level, exposure)
+            T, system, used = self._optimize(volume, lit, T, weights, self.config.iterations[index])
             iterations += used
         assert system is not None
-        return self._judge(T, system, iterations)
+        return self._judge(T, exposure, system, iterations)
 
     def _optimize(
         self, volume: TsdfVolume, level: Level, T: NDArray[np.float64], weights: NDArray[np.float32], limit: int
@@ -166,7 +173,9 @@ class Tracker:
             residuals,
         )  # fmt: skip
 
-    def _judge(self, T: NDArray[np.float64], system: LinearSystem, iterations: int) -> TrackingResult:
+    def _judge(
+        self, T: NDArray[np.float64], exposure: tuple[float, float], system: LinearSystem, iterations: int
+    ) -> TrackingResult:
         """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
         config = self.config
         share = system.num_inliers / max(system.num_readings, 1)
@@ -182,7 +191,7 @@ class Tracker:
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
-        return TrackingResult(T, not reason, reason, share, residual, condition, iterations)
+        return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations)
 
 
 def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -191,3 +200,50 @@ def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDA
     out[:3, 3] = T_world_camera[:3, 3] + step[:3]
     out[:3, :3] = se3.nearest_rotation(out[:3, :3])
     return out
+
+
+def exposed(level: Level, exposure: tuple[float, float]) -> Level:
+    """Level with gain and offset applied to its intensities."""
+    gain, offset = exposure
+    if (gain, offset) == (1.0, 0.0):
+        return level
+    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
+
+
+def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of one exposure after another."""
+    return then[0] * first[0], then[0] * first[1] + then[1]
+
+
+def fit_exposure(
+    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Gain and offset with ``gain * intensity + offset`` nearest to the map's intensities, robustly.
+
+    Auto-exposure changes all intensities at once; unexplained, such a change looks like motion.
+
+    Args:
+        intensity: (h, w) float32 of the image.
+        difference: (h, w) float32 map minus image, NaN off the map.
+        weights: (h, w) float32 static weights.
+    """
+    used = np.isfinite(difference) & (weights > 0.5)
+    if np.count_nonzero(used) < 100:
+        return 1.0, 0.0
+    x = intensity[used].astype(np.float64)
+    y = x + difference[used]
+    gain, offset = 1.0, float(np.median(y - x))
+    mean = x.mean()
+    for _ in range(5):  # iteratively reweighted least squares, Cauchy weights
+        error = y - gain * x - offset
+        scale = max(1.5 * float(np.median(np.abs(error))), 0.01)
+        w = 1 / (1 + (error / scale) ** 2)
+        # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
+        prior = 0.1 * w.sum() * 0.04
+        sw, swx, swy = w.sum(), w @ x, w @ y
+        sxx, sxy = w @ (x - mean) ** 2 + prior, w @ ((x - mean) * y) + prior
+        sx = swx - mean * sw
+        gain = (sxy - sx * swy / sw) / (sxx - sx * sx / sw)
+        gain = float(np.clip(gain, 0.5, 2.0))
+        offset = float((swy - gain * swx) / sw)
+    return gain, offset

@@ -15,6 +15,7 @@ TILE_WIDTH, TILE_HEIGHT = 32, 16
 NEAR = 0.02  # metres; nothing closer is rendered
 TEXTURE_SIZE = 512
 TEXTURE_LEVELS = 10
+_LEVEL_STARTS = np.array([sum((TEXTURE_SIZE >> k) ** 2 for k in range(level)) for level in range(TEXTURE_LEVELS)])
 
 _MATHS = {"nsz", "contract", "reassoc"}
 
@@ -181,7 +182,7 @@ def trace(
                     ids[v, u0 + k] = found[(v - v0) * TILE_WIDTH + k]
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
 def surface_normal(kind, x, y, z, hx, hy, hz):
     """Outward unit normal, in the primitive's frame, at a point of its surface."""
     if kind == BOX:
@@ -207,30 +208,28 @@ def surface_normal(kind, x, y, z, hx, hy, hz):
     return nx * scale, ny * scale, nz * scale
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
 def texture_color(atlas, texture, level, u, v):
     """Bilinear look-up in one level of a repeating texture; (red, green, blue) in 0..255."""
     size = TEXTURE_SIZE >> level
-    start = 0
-    for finer in range(level):
-        start += (TEXTURE_SIZE >> finer) * (TEXTURE_SIZE >> finer)
     x, y = u * size - 0.5, v * size - 0.5
     left, top = np.floor(x), np.floor(y)
     ax, ay = np.float32(x - left), np.float32(y - top)
-    x0, y0 = int(left) & (size - 1), int(top) & (size - 1)
+    x0, y0 = np.int64(left) & (size - 1), np.int64(top) & (size - 1)
     x1, y1 = (x0 + 1) & (size - 1), (y0 + 1) & (size - 1)
-    w00, w10 = (1 - ax) * (1 - ay), ax * (1 - ay)
-    w01, w11 = (1 - ax) * ay, ax * ay
-    a, b = start + y0 * size + x0, start + y0 * size + x1
-    c, d = start + y1 * size + x0, start + y1 * size + x1
-    texels = atlas[texture]
-    red = w00 * texels[a, 0] + w10 * texels[b, 0] + w01 * texels[c, 0] + w11 * texels[d, 0]
-    green = w00 * texels[a, 1] + w10 * texels[b, 1] + w01 * texels[c, 1] + w11 * texels[d, 1]
-    blue = w00 * texels[a, 2] + w10 * texels[b, 2] + w01 * texels[c, 2] + w11 * texels[d, 2]
+    start = _LEVEL_STARTS[level]
+    a, b = atlas[texture, start + y0 * size + x0], atlas[texture, start + y0 * size + x1]
+    c, d = atlas[texture, start + y1 * size + x0], atlas[texture, start + y1 * size + x1]
+    one = np.float32(1.0)
+    w00, w10 = (one - ax) * (one - ay), ax * (one - ay)
+    w01, w11 = (one - ax) * ay, ax * ay
+    red = w00 * (a & 255) + w10 * (b & 255) + w01 * (c & 255) + w11 * (d & 255)
+    green = w00 * (a >> 8 & 255) + w10 * (b >> 8 & 255) + w01 * (c >> 8 & 255) + w11 * (d >> 8 & 255)
+    blue = w00 * (a >> 16 & 255) + w10 * (b >> 16 & 255) + w01 * (c >> 16 & 255) + w11 * (d >> 16 & 255)
     return red, green, blue
 
 
-@njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
 def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textures, atlas, lights, up, focal):
     """Colour (0..1, three numbers) and cosine of incidence of primitive p where the ray (x, y, 1) t meets it.
 
@@ -238,18 +237,16 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
     light is Lambert's law from point lights plus a hemisphere that is brighter from above. See Renderer for the
     columns of materials and lights.
     """
-    R = rotations[p]
     X, Y = x * t, y * t
-    px = R[0, 0] * X + R[0, 1] * Y + R[0, 2] * t + origins[p, 0]
-    py = R[1, 0] * X + R[1, 1] * Y + R[1, 2] * t + origins[p, 1]
-    pz = R[2, 0] * X + R[2, 1] * Y + R[2, 2] * t + origins[p, 2]
+    px = rotations[p, 0, 0] * X + rotations[p, 0, 1] * Y + rotations[p, 0, 2] * t + origins[p, 0]
+    py = rotations[p, 1, 0] * X + rotations[p, 1, 1] * Y + rotations[p, 1, 2] * t + origins[p, 1]
+    pz = rotations[p, 2, 0] * X + rotations[p, 2, 1] * Y + rotations[p, 2, 2] * t + origins[p, 2]
     lx, ly, lz = surface_normal(kinds[p], px, py, pz, halves[p, 0], halves[p, 1], halves[p, 2])
-    nx = R[0, 0] * lx + R[1, 0] * ly + R[2, 0] * lz
-    ny = R[0, 1] * lx + R[1, 1] * ly + R[2, 1] * lz
-    nz = R[0, 2] * lx + R[1, 2] * ly + R[2, 2] * lz
+    nx = rotations[p, 0, 0] * lx + rotations[p, 1, 0] * ly + rotations[p, 2, 0] * lz
+    ny = rotations[p, 0, 1] * lx + rotations[p, 1, 1] * ly + rotations[p, 2, 1] * lz
+    nz = rotations[p, 0, 2] * lx + rotations[p, 1, 2] * ly + rotations[p, 2, 2] * lz
     cosine = -(nx * x + ny * y + nz) / np.sqrt(x * x + y * y + 1.0)
 
-    material = materials[p]
     ax, ay, az = abs(lx), abs(ly), abs(lz)
     if ax >= ay and ax >= az:
         s, w, side = py, -pz, 0.37 * np.sign(lx)
@@ -257,9 +254,9 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
         s, w, side = px, -pz, 0.71 * np.sign(ly)
     else:
         s, w, side = px, -py, 0.0
-    u, v = s * material[0] + material[2] + side * material[9], w * material[1] + material[3]
+    u, v = s * materials[p, 0] + materials[p, 2] + side * materials[p, 9], w * materials[p, 1] + materials[p, 3]
     footprint = t / focal * 0.5 * (1.0 + 1.0 / max(cosine, 0.15)) * TEXTURE_SIZE
-    level = np.log2(max(footprint * max(material[0], material[1]), 1.0))
+    level = np.log2(max(footprint * max(materials[p, 0], materials[p, 1]), 1.0))
     level = min(level, TEXTURE_LEVELS - 1.001)
     finer = int(level)
     share = np.float32(level - finer)
@@ -267,8 +264,8 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
     r0, g0, b0 = texture_color(atlas, texture, finer, u, v)
     r1, g1, b1 = texture_color(atlas, texture, finer + 1, u, v)
     # Texture 0 once more, large and at an incommensurable scale, so that no two repeats of a pattern look alike.
-    cloud, _, _ = texture_color(atlas, 0, 2, s * 0.233 + material[3], w * 0.233 + material[2])
-    variation = 1.0 + material[7] * (cloud - 128.0) * (1.0 / 128.0)
+    cloud, _, _ = texture_color(atlas, 0, 2, s * 0.233 + materials[p, 3], w * 0.233 + materials[p, 2])
+    variation = 1.0 + materials[p, 7] * (cloud - 128.0) * (1.0 / 128.0)
 
     light = 0.0
     for k in range(lights.shape[0]):
@@ -276,12 +273,12 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
         squared = ex * ex + ey * ey + ez * ez
         facing = max((ex * nx + ey * ny + ez * nz) / np.sqrt(squared), 0.0)
         light += lights[k, 3] * facing / (1.0 + squared * lights[k, 4])
-    light += up[3] * (0.75 + 0.25 * (nx * up[0] + ny * up[1] + nz * up[2])) + material[8]
+    light += up[3] * (0.75 + 0.25 * (nx * up[0] + ny * up[1] + nz * up[2])) + materials[p, 8]
     gain = light * variation * (1.0 / 255.0)
     return (
-        (r0 + share * (r1 - r0)) * material[4] * gain,
-        (g0 + share * (g1 - g0)) * material[5] * gain,
-        (b0 + share * (b1 - b0)) * material[6] * gain,
+        (r0 + share * (r1 - r0)) * materials[p, 4] * gain,
+        (g0 + share * (g1 - g0)) * materials[p, 5] * gain,
+        (b0 + share * (b1 - b0)) * materials[p, 6] * gain,
         cosine,
     )
 
@@ -325,38 +322,37 @@ def shade(
                         or (v > 0 and ids[v - 1, u] != p)
                         or (v + 1 < height and ids[v + 1, u] != p)
                     )
-                    red, green, blue, cosine = sky[0], sky[1], sky[2], 1.0
-                    if p >= 0:
-                        red, green, blue, cosine = shade_point(
-                            p, x, y, np.float64(depth[v, u]), kinds, rotations, origins, halves, materials, textures,
-                            atlas, lights, up, fx,
-                        )  # fmt: skip
-                    if border:
-                        red, green, blue = 0.0, 0.0, 0.0
-                        for k in range(4):
-                            sx = x + (0.25 if k & 1 else -0.25) / fx
-                            sy = y + (0.25 if k & 2 else -0.25) / fy
+                    samples = 4 if border else 1
+                    share = 0.25 if border else 1.0
+                    red, green, blue, cosine = 0.0, 0.0, 0.0, 1.0
+                    for k in range(samples):
+                        sx, sy, q, t = x, y, np.int64(p), np.float64(depth[v, u])
+                        if border:
+                            sx += (0.25 if k & 1 else -0.25) / fx
+                            sy += (0.25 if k & 2 else -0.25) / fy
                             t, q = np.inf, -1
                             for position in range(count):
                                 c = candidates[position]
                                 if nearest[c] > t:
                                     break
-                                R = rotations[c]
                                 hit = primitive_depth(
                                     kinds[c], origins[c, 0], origins[c, 1], origins[c, 2],
-                                    R[0, 0] * sx + R[0, 1] * sy + R[0, 2], R[1, 0] * sx + R[1, 1] * sy + R[1, 2],
-                                    R[2, 0] * sx + R[2, 1] * sy + R[2, 2], halves[c, 0], halves[c, 1], halves[c, 2],
+                                    rotations[c, 0, 0] * sx + rotations[c, 0, 1] * sy + rotations[c, 0, 2],
+                                    rotations[c, 1, 0] * sx + rotations[c, 1, 1] * sy + rotations[c, 1, 2],
+                                    rotations[c, 2, 0] * sx + rotations[c, 2, 1] * sy + rotations[c, 2, 2],
+                                    halves[c, 0], halves[c, 1], halves[c, 2],
                                 )  # fmt: skip
                                 if hit < t:
                                     t, q = hit, c
-                            if q >= 0:
-                                r, g, b, _ = shade_point(
-                                    q, sx, sy, t, kinds, rotations, origins, halves, materials, textures, atlas,
-                                    lights, up, fx,
-                                )  # fmt: skip
-                                red, green, blue = red + 0.25 * r, green + 0.25 * g, blue + 0.25 * b
-                            else:
-                                red, green, blue = red + 0.25 * sky[0], green + 0.25 * sky[1], blue + 0.25 * sky[2]
+                        r, g, b = sky[0], sky[1], sky[2]
+                        if q >= 0:
+                            r, g, b, facing = shade_point(
+                                q, sx, sy, t, kinds, rotations, origins, halves, materials, textures, atlas, lights,
+                                up, fx,
+                            )  # fmt: skip
+                            if q == p:
+                                cosine = facing
+                        red, green, blue = red + share * r, green + share * g, blue + share * b
                     scale = gain * 255.0 / (1.0 + vignette * (x * x + y * y))
                     color[v, u, 0] += np.float32(min(red * scale, 255.0 * gain))
                     color[v, u, 1] += np.float32(min(green * scale, 255.0 * gain))

@@ -155,5 +155,5 @@ class Renderer:
 
 
 @lru_cache(maxsize=4)
-def _atlas(names: frozenset[str]) -> NDArray[np.uint8]:
+def _atlas(names: frozenset[str]) -> NDArray[np.int32]:
     return build_atlas(set(names))

@@ -252,10 +252,13 @@ _MAKERS: dict[str, Callable[[np.random.Generator], Image]] = {
 TEXTURES = tuple(_MAKERS)
 
 
-def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.uint8]:
-    """Textures with their mip maps, (number of textures, texels of all levels, 4) uint8; unused ones stay empty."""
+def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.int32]:
+    """Textures with their mip maps, (number of textures, texels of all levels) int32; unused ones stay empty.
+
+    A texel is red | green << 8 | blue << 16, each 0..255.
+    """
     texels = sum((SIZE >> level) ** 2 for level in range(LEVELS))
-    atlas = np.zeros((len(TEXTURES), texels, 4), dtype=np.uint8)
+    atlas = np.zeros((len(TEXTURES), texels), dtype=np.int32)
     for number, name in enumerate(TEXTURES):
         if name not in names and number != 0:
             continue
@@ -263,7 +266,8 @@ def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.uint8]:
         start = 0
         for level in range(LEVELS):
             size = SIZE >> level
-            atlas[number, start : start + size * size, :3] = np.rint(image.reshape(-1, 3) * 255)
+            bytes_ = np.rint(image.reshape(-1, 3) * 255).astype(np.int32)
+            atlas[number, start : start + size * size] = bytes_ @ np.array([1, 1 << 8, 1 << 16], dtype=np.int32)
             start += size * size
             if size > 1:
                 image = image.reshape(size // 2, 2, size // 2, 2, 3).mean(axis=(1, 3))
