@@ -1,0 +1,209 @@
+"""Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, colour packing, halving.
+
+Rows are cut into slices before the inner loop: an index that the compiler cannot prove positive costs numba's
+wrap-around test, and with it the vectorisation (measured: a factor 4).
+"""
+
+import numpy as np
+
+from dudmap.kernels.threads import kernel
+
+ABSENT = np.float32(-1e9)
+"""Depth of a pixel without a reading inside the filter: so far off that its range weight vanishes by itself."""
+LONGEST_RUN = 3
+"""A hole this many pixels long in its row or its column is small."""
+FEWEST = 8
+"""Readings that the 5x5 neighbourhood of a filled pixel must hold."""
+
+
+@kernel
+def limit_depth(depth, low, high, out):
+    """Readings of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
+    source, target = depth.reshape(-1), out.reshape(-1)
+    for n in range(source.size):
+        z = source[n]
+        target[n] = z if (z >= low) & (z <= high) else np.float32(0)
+
+
+@kernel
+def _distance(line, at, step):
+    """Pixels from ``at`` to the next reading along a line, at most LONGEST_RUN; 0 = none."""
+    for k in range(1, LONGEST_RUN + 1):
+        n = at + k * step
+        if n < 0 or n >= line.size:
+            return 0
+        if line[n] > 0:
+            return k
+    return 0
+
+
+@kernel
+def _is_small(line, at, slope, noise_floor):
+    """Whether the run of missing pixels around ``at`` is short and its two ends lie on one surface."""
+    before = _distance(line, at, -1)
+    if before == 0:
+        return False
+    after = _distance(line, at, 1)
+    if after == 0 or before + after > LONGEST_RUN + 1:
+        return False
+    a, b = line[at - before], line[at + after]
+    near = min(a, b)
+    return abs(a - b) <= max(noise_floor, slope * near * near)
+
+
+@kernel
+def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
+    """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
+
+    A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
+    is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least FEWEST readings,
+    all within ``max(noise_floor, slope z^2)`` of each other. So no depth edge is bridged (its sides differ by more),
+    and a large hole keeps its border (its runs are longer in both directions).
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (H, W) float32, metres, 0 = none.
+        slope: Largest spread over squared depth, 1/m.
+        noise_floor: Largest spread near the lens, metres.
+        out: (H, W) float32 out.
+    """
+    h, w = depth.shape
+    for v in range(row_start, row_stop):
+        row = depth[v]
+        for u in range(w):
+            z = row[u]
+            out[v, u] = z
+            if z > 0 or not (_is_small(row, u, slope, noise_floor) or _is_small(depth[:, u], v, slope, noise_floor)):
+                continue
+            total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
+            for y in range(max(v - 2, 0), min(v + 3, h)):
+                for x in range(max(u - 2, 0), min(u + 3, w)):
+                    q = depth[y, x]
+                    if q > 0:
+                        total += q
+                        low, high = min(low, q), max(high, q)
+                        count += 1
+            if count >= FEWEST and high - low <= max(noise_floor, slope * low * low):
+                out[v, u] = total / np.float32(count)
+
+
+@kernel
+def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
+    """Add one tap on each side: weights (1 - d^2 inverse)^8, the range Gaussian as a polynomial."""
+    one, zero = np.float32(1), np.float32(0)
+    for u in range(middle.size):
+        z, scale = middle[u], inverse[u]
+        d, e = before[u] - z, after[u] - z
+        s = max(one - d * d * scale, zero)
+        t = max(one - e * e * scale, zero)
+        s, t = s * s, t * t
+        s, t = s * s, t * t
+        s, t = s * s * spatial, t * t * spatial
+        numerator[u] += s * d + t * e
+        denominator[u] += s + t
+
+
+@kernel
+def _start(middle, alpha, inverse, numerator, denominator):
+    for u in range(middle.size):
+        z = middle[u]
+        sigma = max(alpha * z * z, np.float32(1e-4))
+        inverse[u] = np.float32(1 / 16) / (sigma * sigma)
+        numerator[u] = np.float32(0)
+        denominator[u] = np.float32(1)
+
+
+@kernel
+def bilateral(row_start, row_stop, padded, alpha, spatial, out):
+    """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
+
+    The range weight exp(-t/2), t = (dz / sigma_c)^2, is taken as (1 - t/16)^8, 0 from t = 16 on.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading and in the border of r pixels.
+        alpha: sigma_c over squared depth, 1/m.
+        spatial: (r + 1,) float32 weights by pixel distance.
+        out: (H, W) float32 out; 0 where there is no reading.
+    """
+    r = spatial.size - 1
+    w = padded.shape[1] - 2 * r
+    column = np.empty(w + 2 * r, np.float32)
+    numerator = np.empty(w + 2 * r, np.float32)
+    denominator = np.empty(w + 2 * r, np.float32)
+    inverse = np.empty(w + 2 * r, np.float32)
+    for v in range(row_start, row_stop):
+        middle = padded[v + r]
+        _start(middle, alpha, inverse, numerator, denominator)
+        for k in range(1, r + 1):
+            before, after = padded[v + r - k], padded[v + r + k]
+            _accumulate(middle, before, after, inverse, spatial[k], numerator, denominator)
+        for u in range(column.size):
+            column[u] = middle[u] + numerator[u] / denominator[u]
+        middle = column[r : r + w]
+        _start(middle, alpha, inverse, numerator, denominator)
+        for k in range(1, r + 1):
+            before, after = column[r - k : r - k + w], column[r + k : r + k + w]
+            _accumulate(middle, before, after, inverse, spatial[k], numerator, denominator)
+        row = out[v]
+        for u in range(w):
+            z = middle[u]
+            row[u] = z + numerator[u] / denominator[u] if z > np.float32(0) else np.float32(0)
+
+
+@kernel
+def pad(row_start, row_stop, depth, margin, out):
+    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for no reading."""
+    w = depth.shape[1]
+    for v in range(row_start, row_stop):
+        source, target = depth[v], out[v + margin][margin : margin + w]
+        for u in range(w):
+            z = source[u]
+            target[u] = z if z > np.float32(0) else ABSENT
+
+
+@kernel
+def pack_colors(row_start, row_stop, rgb, intensity, packed):
+    """Intensity 0.299 R + 0.587 G + 0.114 B in 0..1, and r << 20 | g << 10 | b with ten bits (8-bit value * 4)."""
+    red, green, blue = np.float32(0.299 / 255), np.float32(0.587 / 255), np.float32(0.114 / 255)
+    for v in range(row_start, row_stop):
+        source, shade, word = rgb[v].reshape(-1), intensity[v], packed[v]
+        for u in range(shade.size):
+            r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
+            shade[u] = red * np.float32(r) + green * np.float32(g) + blue * np.float32(b)
+            word[u] = (np.int32(r) << 22) | (np.int32(g) << 12) | (np.int32(b) << 2)
+
+
+@kernel
+def halve_intensity(row_start, row_stop, image, out):
+    """Mean of each 2x2 block of ``image`` (2h or 2h + 1, 2w or 2w + 1) into ``out`` (h, w)."""
+    quarter = np.float32(0.25)
+    for v in range(row_start, row_stop):
+        upper, lower, target = image[2 * v], image[2 * v + 1], out[v]
+        for u in range(target.size):
+            k = np.uintp(2 * u)
+            j = np.uintp(2 * u + 1)
+            target[u] = quarter * ((upper[k] + upper[j]) + (lower[k] + lower[j]))
+
+
+@kernel
+def halve_depth(row_start, row_stop, depth, band, out):
+    """Mean of the readings of each 2x2 block that lie within ``max(band, band z)`` behind its nearest reading z.
+
+    Foreground and background are never mixed; a block without a reading gives 0.
+    """
+    zero, one, far = np.float32(0), np.float32(1), np.float32(1e9)
+    for v in range(row_start, row_stop):
+        upper, lower, target = depth[2 * v], depth[2 * v + 1], out[v]
+        for u in range(target.size):
+            k = np.uintp(2 * u)
+            j = np.uintp(2 * u + 1)
+            a, b, c, d = upper[k], upper[j], lower[k], lower[j]
+            a, b = a if a > zero else far, b if b > zero else far
+            c, d = c if c > zero else far, d if d > zero else far
+            near = min(min(a, b), min(c, d))
+            limit = near + band * max(one, near)
+            wa, wb = one if a <= limit else zero, one if b <= limit else zero
+            wc, wd = one if c <= limit else zero, one if d <= limit else zero
+            mean = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
+            target[u] = mean if near < far else zero

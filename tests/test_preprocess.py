@@ -1,0 +1,254 @@
+"""Preprocessing against slow oracles that follow the equations literally."""
+
+import math
+
+import numpy as np
+import pytest
+
+from dudmap.camera import Camera
+from dudmap.config import PreprocessConfig
+from dudmap.errors import DatasetError
+from dudmap.frame import Frame
+from dudmap.preprocess import Preprocessor, pyramid
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+
+
+def frame(depth, color=None):
+    if color is None:
+        color = np.random.default_rng(0).integers(0, 256, (*depth.shape, 3), dtype=np.uint8)
+    return Frame(1.5, np.asarray(depth, dtype=np.float32), color)
+
+
+def observe(depth, camera=CAMERA, **config):
+    config = {"fill_holes": False, "filter": "none", **config}
+    return Preprocessor(camera, PreprocessConfig(**config))(frame(depth))
+
+
+def noisy_step(seed=1):
+    """Two slanted surfaces with a step of 0.8 m between them, Kinect-like noise and single missing pixels."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[0:48, 0:64]
+    depth = np.where(u < 30, 1.2 + 0.004 * v, 2.0 + 0.003 * u)
+    depth = depth + rng.normal(0, 0.0015 * depth**2)
+    depth[rng.random(depth.shape) < 0.03] = 0
+    return depth.astype(np.float32)
+
+
+def filtered_exactly(depth, alpha, sigma, radius):
+    """Equations 4.8-4.11, one pixel at a time, not separable."""
+    out = np.zeros_like(depth, dtype=np.float64)
+    h, w = depth.shape
+    for v, u in zip(*np.nonzero(depth), strict=True):
+        z = float(depth[v, u])
+        total = norm = 0.0
+        for y in range(max(0, v - radius), min(h, v + radius + 1)):
+            for x in range(max(0, u - radius), min(w, u + radius + 1)):
+                q = float(depth[y, x])
+                if q > 0:
+                    near = math.exp(-((x - u) ** 2 + (y - v) ** 2) / (2 * sigma**2))
+                    weight = near * math.exp(-((q - z) ** 2) / (2 * (alpha * z * z) ** 2))
+                    total, norm = total + weight * q, norm + weight
+        out[v, u] = total / norm
+    return out
+
+
+def filtered_separably(depth, alpha, sigma, radius):
+    """One pass down the columns and one along the rows, the range weight (1 - t/16)^8, in float64."""
+
+    def one_pass(image):
+        out = np.zeros_like(image)
+        for v, u in zip(*np.nonzero(image), strict=True):
+            z = image[v, u]
+            total = norm = 0.0
+            for y in range(max(0, v - radius), min(image.shape[0], v + radius + 1)):
+                q = image[y, u]
+                t = ((q - z) / (alpha * z * z)) ** 2
+                if q > 0 and t < 16:
+                    weight = math.exp(-((y - v) ** 2) / (2 * sigma**2)) * (1 - t / 16) ** 8
+                    total, norm = total + weight * q, norm + weight
+            out[v, u] = total / norm
+        return out
+
+    return one_pass(one_pass(depth.astype(np.float64)).T).T
+
+
+def test_bilateral_equals_separable_oracle():
+    depth = noisy_step()
+    found = observe(depth, filter="bilateral").depth
+    assert np.abs(found - filtered_separably(depth, 0.012, 4.0, 6)).max() < 2e-5
+
+
+def test_bilateral_is_close_to_the_equations_and_removes_noise():
+    depth = noisy_step()
+    found = observe(depth, filter="bilateral").depth
+    exact = filtered_exactly(depth, 0.012, 4.0, 6)
+    valid = depth > 0
+    assert np.sqrt(np.mean((found - exact)[valid] ** 2)) < 1.5e-3
+    v, u = np.mgrid[0:48, 0:64]
+    truth = np.where(u < 30, 1.2 + 0.004 * v, 2.0 + 0.003 * u)
+    before = np.std((depth - truth)[valid])
+    after = np.std((found - truth)[valid])
+    assert after < 0.5 * before
+    assert after < 1.05 * np.std((exact - truth)[valid])
+    assert np.abs(found - truth)[valid].max() < 0.02  # nothing leaks across the step
+
+
+def test_missing_pixels_neither_give_nor_receive():
+    depth = np.full((48, 64), 1.0, np.float32)
+    depth[::2, ::3] = 0
+    found = observe(depth, filter="bilateral").depth
+    assert np.all(found[depth == 0] == 0)
+    assert np.allclose(found[depth > 0], 1.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("radius", [1, 6, 16])
+def test_any_values_give_finite_output(radius):
+    rng = np.random.default_rng(3)
+    depth = rng.uniform(-1, 8, (48, 64)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.3] = 0
+    for value in (np.nan, np.inf, -np.inf, 1e-30, 1e30, -1e9):
+        depth[rng.random(depth.shape) < 0.03] = value
+    for alpha in (1e-9, 0.012, 100.0):
+        result = observe(depth, fill_holes=True, filter="bilateral", filter_alpha=alpha, filter_radius=radius)
+        for level in range(4):
+            for image in pyramid(result, level):
+                assert np.isfinite(image).all()
+                assert image.min() >= 0
+        assert result.depth.max() <= 6.0 + 1e-4
+
+
+def test_limits():
+    depth = np.full((48, 64), 1.0, np.float32)
+    depth[0, :6] = [0.49, 0.51, 2.99, 3.01, np.nan, np.inf]
+    result = observe(depth, depth_min=0.5, depth_max=3.0)
+    assert result.raw_depth[0, :7].tolist() == pytest.approx([0, 0.51, 2.99, 0, 0, 0, 1], abs=1e-6)
+    assert np.array_equal(result.depth, result.raw_depth)
+
+
+def test_small_holes_are_filled_with_the_mean():
+    v, u = np.mgrid[0:48, 0:64]
+    plane = (1.0 + 0.001 * u + 0.0005 * v).astype(np.float32)
+    holes = np.zeros(plane.shape, dtype=bool)
+    holes[5, 5] = True
+    holes[10:13, 20:23] = True
+    holes[20:45, 30:33] = True  # a crack
+    filled = observe(np.where(holes, 0, plane), fill_holes=True).depth
+    assert np.abs(filled - plane).max() < 3e-3
+    assert np.array_equal(filled[~holes], plane[~holes])
+    around = plane[3:8, 3:8].copy()
+    around[2, 2] = 0
+    assert filled[5, 5] == pytest.approx(around.sum() / 24, abs=1e-6)
+
+
+def test_large_holes_and_depth_edges_stay():
+    plane = np.full((48, 64), 1.0, np.float32)
+    large = np.zeros(plane.shape, dtype=bool)
+    large[10:20, 10:20] = True
+    large[30:34, 30:40] = True
+    filled = observe(np.where(large, 0, plane), fill_holes=True).depth
+    assert np.all(filled[large] == 0)
+    step = plane.copy()
+    step[:, 30:] = 1.5
+    shadow = np.zeros(plane.shape, dtype=bool)
+    shadow[:, 29:31] = True
+    filled = observe(np.where(shadow, 0, step), fill_holes=True).depth
+    assert np.all(filled[shadow] == 0)
+
+
+def test_colors():
+    color = np.zeros((48, 64, 3), np.uint8)
+    color[0, 0], color[0, 1], color[0, 2] = (255, 255, 255), (255, 0, 0), (1, 2, 3)
+    result = Preprocessor(CAMERA)(frame(np.ones((48, 64)), color))
+    assert result.intensity[0, :3].tolist() == pytest.approx(
+        [1, 0.299, (0.299 + 2 * 0.587 + 3 * 0.114) / 255], abs=1e-6
+    )
+    assert result.color[0, 2] == (4 << 20 | 8 << 10 | 12)
+    assert result.color[0, 0] == (1020 << 20 | 1020 << 10 | 1020)
+    assert np.array_equal(result.rgb, color)
+
+
+def test_pyramid_matches_blocks():
+    rng = np.random.default_rng(5)
+    depth = rng.choice([0, 1.0, 1.01, 1.5, 3.0, 3.05], (48, 64)).astype(np.float32)
+    result = observe(depth)
+    half, intensity = pyramid(result, 1)
+    assert half.shape == intensity.shape == CAMERA.scaled(1).shape
+    blocks = depth.reshape(24, 2, 32, 2).transpose(0, 2, 1, 3).reshape(24, 32, 4)
+    for v in range(24):
+        for u in range(32):
+            readings = blocks[v, u][blocks[v, u] > 0]
+            near = readings.min() if len(readings) else 0
+            same = readings[readings <= near + 0.02 * max(1, near)]
+            assert half[v, u] == pytest.approx(same.mean() if len(same) else 0, abs=1e-6)
+    assert np.allclose(intensity, result.intensity.reshape(24, 2, 32, 2).mean(axis=(1, 3)), atol=1e-6)
+    assert pyramid(result, 0)[0] is result.depth
+    assert pyramid(result, 3)[0].shape == (6, 8)
+    assert pyramid(result, 2)[0] is pyramid(result, 2)[0]
+
+
+def test_pyramid_of_odd_sizes():
+    camera = Camera(60.0, 60.0, 31.5, 23.5, 61, 45)
+    for level in range(2):
+        depth, intensity = pyramid(observe(np.ones((45, 61)), camera), level)
+        assert depth.shape == intensity.shape == camera.scaled(level).shape
+        assert np.allclose(depth, 1)
+
+
+def test_undistortion():
+    """A pattern drawn through the lens model comes out as the model without distortion draws it."""
+    k1, k2, p1, p2 = distortion = (0.4, -0.1, 0.01, -0.003)
+    camera = Camera(60.0, 61.0, 31.0, 24.0, 64, 48, distortion=distortion)
+
+    def pattern(x, y):
+        return 127 + 100 * np.sin(6 * x) * np.cos(5 * y)
+
+    v, u = np.mgrid[0:48, 0:64].astype(np.float64)
+    x, y = (u - 31.0) / 60, (v - 24.0) / 61
+    straight = pattern(x, y)
+    # the distorted image shows at pixel d(x, y) what lies in direction (x, y): invert by fixed-point iteration
+    a, b = x.copy(), y.copy()
+    for _ in range(50):
+        r2 = a * a + b * b
+        radial = 1 + k1 * r2 + k2 * r2 * r2
+        a, b = (
+            (x - 2 * p1 * a * b - p2 * (r2 + 2 * a * a)) / radial,
+            (y - p1 * (r2 + 2 * b * b) - 2 * p2 * a * b) / radial,
+        )
+    color = np.repeat(pattern(a, b).round().astype(np.uint8)[..., None], 3, axis=2)
+    depth = (1.5 + 0.2 * a + 0.1 * b).astype(np.float32)
+    config = PreprocessConfig(fill_holes=False, filter="none")
+    result = Preprocessor(camera, config)(Frame(0.0, depth, color))
+    inner = (slice(6, 42), slice(6, 58))
+    assert np.abs(result.rgb[..., 0].astype(float) - straight)[inner].max() < 3
+    assert np.abs(color[..., 0].astype(float) - straight)[inner].max() > 10
+    assert np.abs(result.depth - (1.5 + 0.2 * x + 0.1 * y))[inner].max() < 0.006
+    assert result.camera.distortion == ()
+    assert Preprocessor(camera).camera == result.camera
+
+
+def test_deterministic_and_independent_of_the_input_afterwards():
+    depth = noisy_step()
+    preprocess = Preprocessor(CAMERA)
+    first = preprocess(frame(depth))
+    kept = first.depth.copy(), first.raw_depth.copy()
+    again = preprocess(frame(depth))
+    preprocess(frame(noisy_step(2)))
+    assert np.array_equal(first.depth, kept[0])
+    assert np.array_equal(first.raw_depth, kept[1])
+    assert np.array_equal(first.depth, again.depth)
+
+
+@pytest.mark.parametrize(
+    ("depth", "color"),
+    [
+        (np.ones((48, 60), np.float32), np.zeros((48, 64, 3), np.uint8)),
+        (np.ones((48, 64), np.float32), np.zeros((96, 128, 3), np.uint8)),
+        (np.ones((48, 64), np.float32), np.zeros((48, 64), np.uint8)),
+        (np.ones((48, 64), np.uint16), np.zeros((48, 64, 3), np.uint8)),
+        (np.ones((48, 64), np.float32), np.zeros((48, 64, 3), np.float32)),
+    ],
+)
+def test_unfit_images_are_refused(depth, color):
+    with pytest.raises(DatasetError, match=r"expected|must have"):
+        Preprocessor(CAMERA)(Frame(0.0, depth, color))
