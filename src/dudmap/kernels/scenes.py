@@ -461,3 +461,35 @@ def measure_color(row_from, row_to, exact, table, key, sigma, color):
                 noise = table[(bits >> np.uint64(16 * channel)) & np.uint64(0xFFFF)]
                 value = exact[v, u, channel] + sigma * noise + np.float32(0.5)
                 color[v, u, channel] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def count_views(first, last, vertices, normals, T, intrinsics, depth, near, far, grazing, counts):
+    """Add one to counts[k] for every vertex in [first, last) that the ideal depth image (H, W) shows.
+
+    vertices, normals (V, 3) float32 world; T (4, 4) world to camera; intrinsics fx fy cx cy; only between near and far
+    (m) and at a cosine of incidence above grazing. The tolerance is what one pixel's slant can explain.
+    """
+    height, width = depth.shape
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    for k in range(first, last):
+        X, Y, Z = vertices[k, 0], vertices[k, 1], vertices[k, 2]
+        z = T[2, 0] * X + T[2, 1] * Y + T[2, 2] * Z + T[2, 3]
+        if not near < z < far:
+            continue
+        x = T[0, 0] * X + T[0, 1] * Y + T[0, 2] * Z + T[0, 3]
+        y = T[1, 0] * X + T[1, 1] * Y + T[1, 2] * Z + T[1, 3]
+        u = int(np.floor(x / z * fx + cx + 0.5))
+        v = int(np.floor(y / z * fy + cy + 0.5))
+        if u < 0 or v < 0 or u >= width or v >= height:
+            continue
+        cosine = 0.0
+        for row in range(3):
+            ray = x if row == 0 else y if row == 1 else z
+            cosine -= ray * (T[row, 0] * normals[k, 0] + T[row, 1] * normals[k, 1] + T[row, 2] * normals[k, 2])
+        cosine /= np.sqrt(x * x + y * y + z * z)
+        if cosine <= grazing:
+            continue
+        tolerance = 0.003 + 0.8 * z / fx * np.sqrt(max(1.0 - cosine * cosine, 0.0)) / cosine
+        if abs(depth[v, u] - z) < tolerance:
+            counts[k] += 1

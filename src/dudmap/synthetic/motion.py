@@ -113,3 +113,9 @@ def crossing(
         begin = times[-1] + pause
         gaps.append((times[-1], begin))
     return Track(times, [list(p) for p in points], smooth=0.1, gaps=gaps[1:] if gaps[0][1] < 0 else gaps)
+
+
+def smooth_step(share: float) -> float:
+    """0 before 0, 1 after 1, and a rise with zero slope at both ends in between."""
+    x = min(max(share, 0.0), 1.0)
+    return x * x * (3.0 - 2.0 * x)

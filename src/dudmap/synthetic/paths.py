@@ -1,6 +1,7 @@
 """Camera paths: built-in ones, and recorded trajectories placed rigidly into a scene."""
 
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,7 @@ def handheld(
     shift += _tremor(rng, times, 0.0006 * tremor * scene.mover_scale)
     aim = _wander(rng, times, 1.0)
     Ts = np.stack([look_at(scene.home[:3, 3] + offset, scene.target) for offset in shift])
-    own = np.mean([se3.rotation_angle(se3.inverse(a) @ b) for a, b in zip(Ts[:-1], Ts[1:], strict=True)] or [0.0])
+    own = np.mean([se3.rotation_angle(se3.inverse(a) @ b) for a, b in pairwise(Ts)] or [0.0])
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     left = np.sqrt(max(np.radians(turn) ** 2 - (own / step) ** 2, np.radians(0.35 * turn) ** 2))
     shake = _tremor(rng, times, np.radians(0.07) * tremor)

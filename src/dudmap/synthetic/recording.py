@@ -12,12 +12,15 @@ from dudmap import se3
 from dudmap.camera import Camera
 from dudmap.errors import ConfigError, FrameError
 from dudmap.frame import Frame
+from dudmap.mesh import Mesh
 from dudmap.synthetic.movers import MOVING_SPEED, Mover
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.scene import Scene
 from dudmap.synthetic.sensors import Sensor
+from dudmap.synthetic.surface import count_views, tessellate, with_faces
 from dudmap.trajectory import Trajectory
 
+NEAREST, FARTHEST = 0.3, 6.0  # metres; what counts as seen by an ideal sensor
 DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
 
 
@@ -91,8 +94,8 @@ class SyntheticSequence:
     def mask(self, index: int) -> NDArray[np.bool_]:
         """True dynamic mask (H, W): the visible surface belongs to something that moves in this frame.
 
-        A mover counts as moving while any point of it is faster than 0.01 m/s on average over the frame's interval
-        (half a frame before to half a frame after); all its parts are labelled together.
+        A person always counts as moving. Anything else does while any point of it is faster than 0.01 m/s on average
+        over the frame's interval (half a frame before to half a frame after). A mover is labelled as a whole.
         """
         index = self._number(index)
         if index in self._kept:
@@ -132,6 +135,39 @@ class SyntheticSequence:
             parameters=self.parameters | {"movers": []},
         )
 
+    def mover_numbers(self, index: int) -> NDArray[np.int16]:
+        """Number (H, W) of the mover that a pixel shows, 0 for none; movers at rest are shown too."""
+        table = np.concatenate([np.zeros(len(self.scene.primitives), dtype=np.int16), self._owner + 1, [0]])
+        return table.astype(np.int16)[self._render(self._number(index), with_color=False).primitive]
+
+    def surface(self, observed: bool = False, views: int = 3) -> Mesh:
+        """True static surface in the world frame, as it is at the end of the sequence.
+
+        It holds everything static, and the movers that have been at rest for the last second. Triangles inside or
+        between solids are left out.
+
+        Args:
+            observed: Only what the camera saw in this sequence (past the movers, within the sensor's range, not at a
+                grazing angle) in at least ``views`` of up to 120 frames spread evenly.
+            views: See ``observed``.
+        """
+        end = float(self.timestamps[-1])
+        resting = [
+            primitive.moved(T)
+            for mover in self._movers
+            if mover.settles and mover.present(end) and mover.top_speed(end - 0.5, 1.0) < MOVING_SPEED
+            for primitive, T in zip(mover.primitives, mover.parts(end), strict=True)
+        ]
+        mesh = tessellate(self.scene.primitives + resting, self.scene.detail, self.scene.extent, self._renderer.atlas)
+        if not observed:
+            return mesh
+        model = self._sensor.model
+        reach = (model.nearest, model.fade) if model else (NEAREST, FARTHEST)
+        frames = np.unique(np.linspace(0, len(self) - 1, min(len(self), 120)).astype(int))
+        shots = ((self.ground_truth.Ts_world_camera[index], self.exact_depth(index)) for index in frames)
+        counts = count_views(mesh, self.camera, shots, reach, model.grazing if model else 0.1)
+        return with_faces(mesh, (counts >= min(views, len(frames)))[mesh.faces].all(axis=1))
+
     def _number(self, index: int) -> int:
         number = index + len(self) if index < 0 else index
         if not 0 <= number < len(self):
@@ -139,7 +175,7 @@ class SyntheticSequence:
         return number
 
     def _moves(self, mover: Mover, t: float) -> bool:
-        return mover.top_speed(t, 1.0 / self._fps) > MOVING_SPEED
+        return not mover.settles or mover.top_speed(t, 1.0 / self._fps) > MOVING_SPEED
 
     def _both(self, index: int) -> tuple[Frame, NDArray[np.bool_]]:
         index = self._number(index)
@@ -215,7 +251,7 @@ def make_sequence(
         raise ConfigError(f"fps is {fps}; expected a rate from 0.5 to 1000 frames per second")
     if speed is not None and not 0 < speed <= 20:
         raise ConfigError(f"speed is {speed} m/s; expected more than 0 and at most 20")
-    world = build_scene(scene, seed)
+    world = build_scene(scene)
     times = np.round(np.arange(frames) / fps, 6)
     poses = camera_poses(camera_path, world, times, seed)
     poses = np.stack([_clean(T) for T in poses])

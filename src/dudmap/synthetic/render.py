@@ -4,6 +4,7 @@ import os
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +26,7 @@ def over_rows(count: int, work, *arguments: object) -> None:  # noqa: ANN001 - a
     """Run ``work(row_from, row_to, *arguments)`` over bands of rows on all threads."""
     bands = min(count, 4 * (os.cpu_count() or 1))
     edges = np.linspace(0, count, bands + 1).astype(int)
-    for job in [workers().submit(work, a, b, *arguments) for a, b in zip(edges[:-1], edges[1:], strict=True)]:
+    for job in [workers().submit(work, a, b, *arguments) for a, b in pairwise(edges)]:
         job.result()
 
 
@@ -52,6 +53,9 @@ class Renderer:
     Args:
         scene: Light and static world.
         primitives: All primitives; those from ``len(scene.primitives)`` on belong to movers.
+
+    Attributes:
+        atlas: The textures in use.
     """
 
     def __init__(self, scene: Scene, primitives: list[Primitive]) -> None:
@@ -62,7 +66,7 @@ class Renderer:
         self._bounds = np.array([p.bounds() for p in primitives])
         self._materials = np.array([p.material.row() for p in primitives], dtype=np.float64)
         self._textures = np.array([TEXTURES.index(p.material.texture) for p in primitives], dtype=np.int32)
-        self._atlas = _atlas(frozenset(p.material.texture for p in primitives))
+        self.atlas = _atlas(frozenset(p.material.texture for p in primitives))
 
     def render(
         self,
@@ -116,7 +120,7 @@ class Renderer:
         up = np.append(T_camera_world[:3, 2], self._scene.ambient)
         color = np.zeros((*camera.shape, 3), dtype=np.float32)
         cosines = np.empty(camera.shape, dtype=np.float32)
-        look = (self._materials, self._textures, self._atlas, lights, up, np.array(self._scene.sky), vignette, gain)
+        look = (self._materials, self._textures, self.atlas, lights, up, np.array(self._scene.sky), vignette, gain)
         over_rows(rows.shape[1], kernels.shade, *geometry, *look, color, cosines)
         return Rendering(depth, ids, color, cosines)
 

@@ -1,12 +1,10 @@
 """Primitives, materials and scenes: what there is, where it stands and what it looks like."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-
-from dudmap.synthetic.textures import TEXTURES
 
 Matrix = NDArray[np.float64]
 Vector = Sequence[float] | NDArray[np.float64]
@@ -97,7 +95,7 @@ class Primitive:
 
 
 def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Matrix:
-    """Rigid motion (4, 4): ``position`` in metres, angles in degrees, turned about x (roll), y (pitch), then z (yaw)."""
+    """Rigid motion (4, 4): ``position`` in metres, angles in degrees, turned by roll (x), pitch (y), then yaw (z)."""
     (ca, cb, cc), (sa, sb, sc) = (f(np.radians([yaw, pitch, roll])) for f in (np.cos, np.sin))
     T = np.eye(4)
     T[:3, :3] = (
@@ -185,14 +183,16 @@ class Scene:
         home: Middle pose T_world_camera (4, 4) of the built-in camera paths.
         target: Point (world) that the camera looks at on the whole.
         space: ((3,), (3,)) corners of the free box in which a camera may be.
+        extent: ((3,), (3,)) corners of the free world; surfaces outside are nobody's business.
         walk_line: Two floor points; walkers cross the view from the first to the second.
         rest: Pose T_world_body (4, 4) of the place where boxes are put down or taken away (middle of the bottom).
-        hinge: Pose of a door's hinge, the door leaf along +x of it, or None.
+        hinge: Pose of a door's hinge at the ground; the closed door leaf runs along +x of it and opens against +y.
         lights: Point lights.
         ambient: Hemisphere light.
         sky: Colour (0..1) where nothing is.
         detail: Edge length in metres of the triangles of the reference surface.
         mover_scale: Factor on the size of movers (small worlds such as a desk have small movers).
+        ground: Height in metres of what the movers stand on.
     """
 
     name: str
@@ -200,25 +200,17 @@ class Scene:
     home: Matrix
     target: tuple[float, float, float]
     space: tuple[tuple[float, float, float], tuple[float, float, float]]
+    extent: tuple[tuple[float, float, float], tuple[float, float, float]]
     walk_line: tuple[tuple[float, float], tuple[float, float]]
     rest: Matrix
-    hinge: Matrix | None = None
+    hinge: Matrix
     lights: tuple[Light, ...] = (Light((0.0, 0.0, 2.4)),)
     ambient: float = 0.45
     sky: tuple[float, float, float] = (0.0, 0.0, 0.0)
     detail: float = 0.02
     mover_scale: float = 1.0
     ground: float = 0.0
-    _cache: dict[str, object] = field(default_factory=dict, repr=False)
 
     def clearance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Distance (N,) in metres from points (N, 3) to the nearest static solid; negative inside one."""
         return np.min([p.distance(points) for p in self.primitives], axis=0)
-
-
-SceneBuilder = Callable[[np.random.Generator], Scene]
-
-
-def checked_texture(name: str) -> int:
-    """Number of a texture."""
-    return TEXTURES.index(name)

@@ -83,7 +83,8 @@ class Sensor:
     def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
         """Depth (H, W) float32 in metres, 0 = no reading, and colour (H, W, 3) uint8 of frame ``index``."""
         exact, color, cosine = rendering.depth, rendering.color, rendering.cosine
-        assert color is not None and cosine is not None
+        assert color is not None
+        assert cosine is not None
         if self.model is None:
             return exact, np.clip(np.rint(color), 0, 255).astype(np.uint8)
         rng = np.random.default_rng([self._seed, 3, index])
