@@ -1,0 +1,95 @@
+"""Decoding of colour and depth images, with every defect turned into one sentence."""
+
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import FrameError
+
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """Colour image (H, W, 3), red green blue.
+
+    Raises:
+        FrameError: The file is missing, cut off, damaged or no image.
+    """
+    import cv2
+
+    image = cv2.imdecode(_bytes(path), cv2.IMREAD_COLOR)
+    if image is None:
+        raise FrameError(f"{path} is not an image that can be decoded")
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats.
+
+    Raises:
+        FrameError: The file is missing, cut off, damaged, not one channel, or neither 16 bit nor float.
+    """
+    import cv2
+
+    image = cv2.imdecode(_bytes(path), cv2.IMREAD_UNCHANGED)
+    if image is None:
+        raise FrameError(f"{path} is not an image that can be decoded")
+    if image.ndim != 2:
+        raise FrameError(f"the depth image {path} has {image.shape[2]} channels; expected one with 16 bit or float")
+    if image.dtype == np.uint16:
+        return image.astype(np.float32) / np.float32(depth_scale)
+    if image.dtype.kind == "f":
+        metres = image.astype(np.float32)
+        metres[~(np.isfinite(metres) & (metres > 0))] = 0
+        return metres
+    raise FrameError(f"the depth image {path} holds {image.dtype} values; expected 16 bit or float")
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Mask (H, W) of an 8-bit image in which values above 127 are true.
+
+    Raises:
+        FrameError: The file is missing, cut off, damaged or no image.
+    """
+    import cv2
+
+    image = cv2.imdecode(_bytes(path), cv2.IMREAD_GRAYSCALE)
+    if image is None:
+        raise FrameError(f"{path} is not an image that can be decoded")
+    return image > 127
+
+
+def _bytes(path: Path) -> NDArray[np.uint8]:
+    """Content of an image file that is whole; decoders would fill the missing rest with grey."""
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise FrameError(f"the listed file {path} does not exist") from None
+    except OSError as error:
+        raise FrameError(f"cannot read {path}: {error.strerror}") from error
+    if data.startswith(PNG):
+        _check_png(path, data)
+    elif data.startswith(JPEG) and b"\xff\xd9" not in data[-1024:]:
+        raise FrameError(f"{path} is cut off: the JPEG end marker is missing")
+    if not data:
+        raise FrameError(f"{path} is an empty file")
+    return np.frombuffer(data, dtype=np.uint8)
+
+
+def _check_png(path: Path, data: bytes) -> None:
+    """Walk the chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
+    at = len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise FrameError(f"{path} is damaged: a PNG checksum does not match")
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end + 4
+    raise FrameError(f"{path} is cut off: the PNG end is missing")

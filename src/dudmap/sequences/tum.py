@@ -1,0 +1,150 @@
+"""Folders in the layout of the TUM RGB-D benchmark (Sturm et al. 2012), which the Bonn data set shares."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.camera import Camera
+from dudmap.errors import DatasetError, FrameError
+from dudmap.frame import Frame
+from dudmap.sequences import images, intrinsics
+from dudmap.sequences.association import TimedFile, associate, read_list, read_pairs
+from dudmap.trajectory import Trajectory
+
+PROBES = 30
+"""Frames, spread evenly, one of which must be usable for a recording to be opened."""
+
+
+class TumSequence:
+    """Recording of rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
+
+    associations.txt (``t_rgb rgb_file t_depth depth_file``) says which colour belongs to which depth image; without it
+    they are paired one to one, nearest first, at most 20 ms apart. A frame's time is that of its depth image.
+
+    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder's name (TUM freiburg1-3, Bonn).
+    The published distortion of TUM freiburg1 and 2 is deliberately not among the latter: it describes the colour
+    lens, but the benchmark's depth was reprojected by the driver as if that lens had none, and undistorting both
+    images alike would bend correct depth. Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
+
+    Args:
+        path: The folder.
+        camera: Intrinsics that replace the recording's own, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+
+    Attributes:
+        name: The folder's name.
+        camera: Intrinsics.
+        timestamps: (N,) seconds, strictly increasing, of the depth images.
+        ground_truth: True poses, None without groundtruth.txt.
+
+    Raises:
+        DatasetError: A list is missing or malformed, nothing matches, or no frame is usable.
+    """
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        self.path = Path(path)
+        self.name = self.path.resolve().name
+        self._pairs = self._find_pairs()
+        self.timestamps = np.array([depth.timestamp for _, depth in self._pairs], dtype=np.float64)
+        self._masks = self._find_masks()
+        if isinstance(camera, str):
+            known = intrinsics.from_text(camera)
+        else:
+            known = intrinsics.from_camera(camera) if camera else intrinsics.of_folder(self.path)
+        self.camera = self._probe(known)
+        truth = self.path / "groundtruth.txt"
+        self.ground_truth = Trajectory.load(truth) if truth.is_file() else None
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        lists = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
+        return lists or (path / "associations.txt").is_file()
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame number ``index``.
+
+        Raises:
+            FrameError: It cannot be read, or has another size than the recording; number and file are named.
+        """
+        frame = self._read(index, self.camera.depth_scale)
+        if frame.depth.shape != self.camera.shape:
+            raise FrameError(
+                f"frame {index}: {self._pairs[index][1].path} is {_size(frame.depth)} pixels, but the recording's "
+                f"camera is {self.camera.width}x{self.camera.height}"
+            )
+        return frame
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame, None where mask.txt names none.
+
+        Raises:
+            FrameError: The mask's file cannot be read or has another size than the recording.
+        """
+        path = self._masks.get(range(len(self))[index])
+        if path is None:
+            return None
+        mask = images.read_mask(path)
+        if mask.shape != self.camera.shape:
+            raise FrameError(f"the mask {path} is {_size(mask)} pixels; expected the size of the recording's frames")
+        return mask
+
+    def _read(self, index: int, depth_scale: float) -> Frame:
+        color_file, depth_file = self._pairs[index]
+        try:
+            depth = images.read_depth(depth_file.path, depth_scale)
+            color = images.read_color(color_file.path)
+        except FrameError as error:
+            raise FrameError(f"frame {index}: {error}") from error
+        if color.shape[:2] != depth.shape:
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {_size(color)} pixels but the depth image "
+                f"{depth_file.path} is {_size(depth)}; both must have one size, with depth registered to colour"
+            )
+        return Frame(depth_file.timestamp, depth, color)
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        associations = self.path / "associations.txt"
+        if associations.is_file():
+            return read_pairs(associations)
+        colors, depths = read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt")
+        pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
+        if not pairs:
+            raise DatasetError(
+                f"{self.path}: no colour image lies within 20 ms of a depth image; rgb.txt covers "
+                f"{colors[0].timestamp:.3f} to {colors[-1].timestamp:.3f} s and depth.txt "
+                f"{depths[0].timestamp:.3f} to {depths[-1].timestamp:.3f} s"
+            )
+        return [(colors[i], depths[j]) for i, j in pairs]
+
+    def _find_masks(self) -> dict[int, Path]:
+        """Mask files by frame number; the list's times are those of the colour images."""
+        path = self.path / "mask.txt"
+        if not path.is_file():
+            return {}
+        masks = read_list(path)
+        colors = np.array([color.timestamp for color, _ in self._pairs])
+        order = np.argsort(colors, kind="stable")
+        pairs = associate(np.array([mask.timestamp for mask in masks]), colors[order])
+        return {int(order[j]): masks[i].path for i, j in pairs}
+
+    def _probe(self, known: intrinsics.Intrinsics) -> Camera:
+        """Camera in the size of the first usable frame; a recording without one is no recording."""
+        problem = None
+        for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
+            try:
+                frame = self._read(int(index), known.values.get("depth_scale", 5000.0))
+            except FrameError as error:
+                problem = problem or str(error)
+                continue
+            if frame.depth.any():
+                return known.camera(frame.depth.shape[1], frame.depth.shape[0])
+            problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"
+        raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+
+def _size(image: NDArray) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
