@@ -47,12 +47,14 @@ class Track:
         table = np.asarray(points, dtype=np.float64)
         raw = np.stack([np.interp(stamps, times, table[:, k]) for k in range(2)], axis=1)
         # A jump inside a gap (leaving here, coming back there) must not be smeared into a motion.
-        pieces = np.searchsorted(stamps, [0.5 * (a + b) for a, b in gaps])
+        inner = [0.5 * (a + b) for a, b in gaps if np.isfinite(a + b)]
+        pieces = np.searchsorted(stamps, inner)
+        pieces = pieces[(pieces > 0) & (pieces < len(stamps))]
         self.positions = np.concatenate([smoothed(part, smooth) for part in np.split(raw, pieces)])
         self.stamps, self.gaps = stamps, tuple(gaps)
         step = np.diff(self.positions, axis=0)
         length = np.linalg.norm(step, axis=1)
-        length[pieces[(pieces > 0) & (pieces <= len(length))] - 1] = 0.0
+        length[pieces - 1] = 0.0
         self.walked = np.concatenate([[0.0], np.cumsum(length)])
         moving = length > 0.01 * STEP
         if yaw is None:
@@ -104,7 +106,7 @@ def crossing(
         begin = -float(np.interp(0.4, shares, needed))
     times: list[float] = []
     points: list[NDArray[np.float64]] = []
-    gaps: list[tuple[float, float]] = [(-np.inf, begin)]
+    gaps: list[tuple[float, float]] = [] if start_inside else [(-np.inf, begin)]
     while not times or times[-1] < duration:
         ahead = len(points) % 8 == 0
         for share, moment in zip(shares, needed, strict=True):
@@ -112,7 +114,7 @@ def crossing(
             points.append(a + (share if ahead else 1 - share) * (b - a))
         begin = times[-1] + pause
         gaps.append((times[-1], begin))
-    return Track(times, [list(p) for p in points], smooth=0.1, gaps=gaps[1:] if gaps[0][1] < 0 else gaps)
+    return Track(times, [list(p) for p in points], smooth=0.1, gaps=gaps)
 
 
 def smooth_step(share: float) -> float:

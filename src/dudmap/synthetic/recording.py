@@ -1,6 +1,7 @@
 """A rendered recording: frames, true poses, masks, movers and surface."""
 
 from collections import OrderedDict
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
@@ -13,10 +14,14 @@ from dudmap.camera import Camera
 from dudmap.errors import ConfigError, FrameError
 from dudmap.frame import Frame
 from dudmap.mesh import Mesh
-from dudmap.synthetic.movers import MOVING_SPEED, Mover
+from dudmap.synthetic.crowd import crowd_of
+from dudmap.synthetic.movers import MOVING_SPEED, Mover, Staging, build_movers
+from dudmap.synthetic.paths import camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
+from dudmap.synthetic.rooms import build_scene
 from dudmap.synthetic.scene import Scene
 from dudmap.synthetic.sensors import Sensor
+from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 from dudmap.trajectory import Trajectory
 
@@ -71,7 +76,7 @@ class SyntheticSequence:
         self.scene, self.camera, self.ground_truth = scene, camera, ground_truth
         self.timestamps = ground_truth.timestamps
         self.parameters = dict(parameters or {})
-        self.name = "-".join([scene.name, *(mover.name for mover in movers)])
+        self.name = "-".join([scene.name, *dict.fromkeys(mover.name for mover in movers)])
         self._movers, self._noise, self._seed, self._fps = movers, noise, seed, fps
         self._motion_blur, self._exposure_change = motion_blur, exposure_change
         self._sensor = Sensor(noise, seed)
@@ -228,44 +233,64 @@ class SyntheticSequence:
 
 def make_sequence(
     scene: str = "room",
-    movers: tuple[str, ...] = ("person",),
-    camera_path: str | Path = "handheld",
+    movers: Sequence[str] | None = None,
+    camera_path: str | Path | None = None,
     frames: int = 120,
     fps: float = 30.0,
     noise: str = "kinect",
     speed: float | None = None,
+    coverage: float | None = None,
     start_dynamic: bool = False,
+    situation: str | None = None,
     seed: int = 0,
     camera: Camera | None = None,
     motion_blur: float = 0.0,
     exposure_change: float = 0.0,
 ) -> SyntheticSequence:
     """See ``dudmap.synthetic.sequence``."""
-    from dudmap.synthetic.movers import Staging, build_movers
-    from dudmap.synthetic.paths import camera_poses
-    from dudmap.synthetic.rooms import build_scene
-
-    if frames < 1:
-        raise ConfigError(f"frames is {frames}; at least one frame is needed")
-    if not 0.5 <= fps <= 1000:
-        raise ConfigError(f"fps is {fps}; expected a rate from 0.5 to 1000 frames per second")
-    if speed is not None and not 0 < speed <= 20:
-        raise ConfigError(f"speed is {speed} m/s; expected more than 0 and at most 20")
+    _check("frames", frames, 1, 1_000_000)
+    _check("fps", fps, 0.5, 1000)
+    _check("motion_blur", motion_blur, 0, 1)
+    _check("exposure_change", exposure_change, 0, 0.9)
+    if speed is not None:
+        _check("speed", speed, 0.001, 20)
     world = build_scene(scene)
+    special = find_situation(situation) if situation is not None else Situation(("person",))
+    names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
+    path = special.camera_path if camera_path is None else camera_path
+    at_once = start_dynamic or special.start_dynamic
     times = np.round(np.arange(frames) / fps, 6)
-    poses = camera_poses(camera_path, world, times, seed)
-    poses = np.stack([_clean(T) for T in poses])
-    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]) + 1.0, start_dynamic)
-    actors = build_movers(tuple(movers), staging)
+    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
+    if coverage is not None and coverage > 0:
+        if movers is not None and set(names) - {"person", "people"}:
+            raise ConfigError(f"coverage is made of people, but the movers are {', '.join(names)}; drop one of the two")
+        names = ("crowd",)
+        actors = crowd_of(coverage, staging).movers()
+    else:
+        actors = build_movers(names, staging) if coverage is None else []
+    poses = camera_poses(path, world, times, seed, actors)
+    poses = carried_elsewhere(poses, world, times, special.elsewhere)
+    poses[:, :3, :3] = [se3.nearest_rotation(R) for R in poses[:, :3, :3]]
+    ground_truth = Trajectory(times, poses)
+    if special.covered:
+
+        def camera_at(t: float) -> NDArray[np.float64]:
+            return ground_truth.interpolate(min(max(t, float(times[0])), float(times[-1])))
+
+        actors.append(cover(times, camera_at, special.covered))
     parameters: dict[str, object] = {
         "scene": scene,
-        "movers": list(movers),
-        "camera_path": str(camera_path),
+        "movers": list(names),
+        "camera_path": str(path),
         "frames": frames,
         "fps": fps,
         "noise": noise,
         "speed": speed,
-        "start_dynamic": start_dynamic,
+        "coverage": coverage,
+        "start_dynamic": at_once,
+        "situation": situation,
+        "covered_s": [[share * float(times[-1]) for share in span] for span in special.covered],
+        "elsewhere_s": [[share * float(times[-1]) for share in span] for span in special.elsewhere],
         "seed": seed,
         "motion_blur": motion_blur,
         "exposure_change": exposure_change,
@@ -273,7 +298,7 @@ def make_sequence(
     return SyntheticSequence(
         world,
         actors,
-        Trajectory(times, poses),
+        ground_truth,
         camera or DEFAULT_CAMERA,
         noise=noise,
         seed=seed,
@@ -284,7 +309,6 @@ def make_sequence(
     )
 
 
-def _clean(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    out = T.copy()
-    out[:3, :3] = se3.nearest_rotation(T[:3, :3])
-    return out
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}; expected a number from {low} to {high}")

@@ -1,0 +1,115 @@
+"""A stream of people that hides a chosen share of the image."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.camera import Camera
+from dudmap.errors import ConfigError
+from dudmap.synthetic.movers import Mover, Staging
+from dudmap.synthetic.person import Figure
+from dudmap.synthetic.render import Renderer
+from dudmap.synthetic.scene import pose
+
+ENTRY_SPEED = 3.0  # m/s, so that also the slowest crowd is soon in view
+STEADY = 2.7  # seconds after which the crowd fills the view (when it is not there from the start)
+
+
+class Crowd:
+    """People walking one behind the other across the view, coming back in on the other side.
+
+    Args:
+        staging: Scene, chance, speed, duration, and whether they are there at the first frame.
+        density: 0 (few people far away) to 1 (shoulder to shoulder right before the camera).
+    """
+
+    def __init__(self, staging: Staging, density: float) -> None:
+        scene, size = staging.scene, staging.scene.mover_scale
+        self.speed = staging.pace(1.0)
+        self.spacing = size * float(np.exp((1 - density) * np.log(6.0) + density * np.log(0.34)))
+        self.distance = size * (2.3 - 1.6 * density**0.7)
+        home = scene.home
+        forward = np.array([home[0, 2], home[1, 2]]) / np.hypot(home[0, 2], home[1, 2])
+        self.direction = np.array([forward[1], -forward[0]])
+        self.middle = home[:2, 3] + self.distance * forward
+        self.reach = 0.75 * self.distance + 1.0 * size  # half the length of the lane
+        self.count = int(np.ceil(2 * self.reach / self.spacing))
+        self.lane = self.count * self.spacing
+        self.staging = staging
+        stride = 1.35 * float(np.clip(np.sqrt(self.speed / size / 1.2), 0.35, 1.2))
+        rng = np.random.default_rng(staging.rng.integers(2**32))
+        self.figures = [Figure(rng, number, size, stride) for number in range(min(self.count, 5))]
+
+    def advanced(self, t: float) -> float:
+        """Metres that everybody has walked at time ``t``; before 0.5 s nobody is in view unless already at the start."""
+        if self.staging.start_dynamic:
+            return self.lane + self.speed * t
+        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
+        begin, arrived = 0.5, 0.5 + self.lane / hurry
+        if t <= arrived:
+            return hurry * (t - begin)
+        return self.lane + self.speed * (t - arrived)
+
+    def steady_from(self) -> float:
+        """Time in seconds from which the whole lane is full."""
+        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
+        return 0.0 if self.staging.start_dynamic else 0.5 + self.lane / hurry
+
+    def movers(self) -> list[Mover]:
+        """One mover per person."""
+        return [self._person(number) for number in range(self.count)]
+
+    def _person(self, number: int) -> Mover:
+        figure, ground = self.figures[number % len(self.figures)], self.staging.scene.ground
+        side = 0.05 * self.staging.scene.mover_scale * ((number * 7) % 5 - 2)  # not all in one line
+        yaw = float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))
+        across = np.array([-self.direction[1], self.direction[0]])
+
+        def way(t: float) -> float:
+            return self.advanced(t) - number * self.spacing
+
+        def reference(t: float) -> NDArray[np.float64]:
+            x = way(t) % self.lane - self.lane / 2
+            return pose((*(self.middle + x * self.direction + side * across), ground), yaw)
+
+        def parts(t: float) -> NDArray[np.float64]:
+            return figure.poses(reference(t), way(t) + 0.31 * number)
+
+        return Mover("person", figure.primitives, parts, reference, lambda t: way(t) >= 0, settles=False)
+
+
+def _coverage(crowd: Crowd) -> float:
+    """Mean share of the image that the crowd hides from the scene's home pose once it is there."""
+    scene, movers = crowd.staging.scene, crowd.movers()
+    camera = Camera(66.0, 66.0, 39.5, 29.5, 80, 60)
+    renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
+    start, shares = crowd.steady_from(), []
+    for k in range(6):  # one passing of the gap between two people
+        t = start + k / 6 * crowd.spacing / crowd.speed
+        Ts = np.concatenate([m.parts(t) @ np.array([p.T_body_primitive for p in m.primitives]) for m in movers])
+        image = renderer.render(camera, scene.home, Ts, np.ones(len(Ts), dtype=bool), with_color=False)
+        shares.append(float((image.primitive >= len(scene.primitives)).mean()))
+    return float(np.mean(shares))
+
+
+def crowd_of(coverage: float, staging: Staging) -> Crowd:
+    """The crowd that hides ``coverage`` of the image on average, seen from the scene's home pose.
+
+    Raises:
+        ConfigError: The share is not between 0.02 and 0.95.
+    """
+    if not 0.02 <= coverage <= 0.95:
+        raise ConfigError(f"coverage is {coverage}; expected a share of the image from 0.02 to 0.95")
+    low, high = 0.0, 1.0
+    seed = int(staging.rng.integers(2**32))
+
+    def attempt(density: float) -> Crowd:
+        rng = np.random.default_rng(seed)
+        return Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
+
+    for _ in range(9):
+        middle = (low + high) / 2
+        if _coverage(attempt(middle)) < coverage:
+            low = middle
+        else:
+            high = middle
+    return attempt(high)
