@@ -95,7 +95,10 @@ class Mesh:
             raise MapError(f"the mesh {path} holds no vertices")
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int32).reshape(-1, 3)
         if isinstance(loaded, trimesh.Trimesh):
-            colors = np.asarray(loaded.visual.to_color().vertex_colors, dtype=np.uint8)[:, :3]
+            visual = loaded.visual
+            if not isinstance(visual, trimesh.visual.ColorVisuals):
+                visual = visual.to_color()
+            colors = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
             normals = np.asarray(loaded.vertex_normals, dtype=np.float32)
         else:
             colors = np.asarray(getattr(loaded, "colors", np.empty((0, 4))), dtype=np.uint8)[:, :3]
