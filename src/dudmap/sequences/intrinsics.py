@@ -130,8 +130,7 @@ def _keyed(path: Path, rows: list[list[str]]) -> dict[str, float]:
     for row in rows:
         if row[0] not in KEYS or len(row) != 2 or not _is_number(row[1]):
             raise DatasetError(
-                f"{path}: cannot understand the line {' '.join(row)!r}; "
-                f"expected one of {', '.join(KEYS)} and a number"
+                f"{path}: cannot understand the line {' '.join(row)!r}; expected one of {', '.join(KEYS)} and a number"
             )
         values[row[0]] = float(row[1])
     missing = [key for key in KEYS[:4] if key not in values]

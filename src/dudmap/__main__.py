@@ -1,0 +1,5 @@
+"""``python -m dudmap``."""
+
+from dudmap.cli import main
+
+main()

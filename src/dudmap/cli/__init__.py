@@ -1,0 +1,97 @@
+"""The command line: ``dudmap COMMAND``.
+
+Each command lives in ``dudmap.cli.<command>`` as a Typer application named ``app`` and is imported when it is called,
+so that ``dudmap --help`` stays instant. Every error of the user's ends here in one sentence and an exit code:
+1 for an error that dudmap names, 2 for wrong usage, 130 for ctrl-C.
+"""
+
+from importlib import import_module
+from typing import Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+from dudmap import __version__
+from dudmap.errors import DudmapError
+
+COMMANDS = {
+    "run": "Turn a recording into a trajectory and a clean mesh.",
+    "demo": "Make a short recording with a walking person and run on it.",
+    "synth": "Render a synthetic recording with exact truth.",
+    "evaluate": "Score a trajectory, mesh or masks against the truth.",
+    "benchmark": "Run a suite of recordings and print one table.",
+    "config": "Print all parameters with their meaning, as TOML.",
+    "warmup": "Compile all kernels now, so that the first run starts at once.",
+}
+"""Name and one-line help of every command, in the order of the help page."""
+
+
+class CommandGroup(TyperGroup):
+    """Imports a command's module when the command is called, and turns errors into one sentence."""
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
+        """Replace the called command's stand-in by the command itself."""
+        if args and args[0] in COMMANDS:
+            module = import_module(f"dudmap.cli.{args[0]}")
+            self.commands[args[0]] = typer.main.get_command(module.app)
+        return super().resolve_command(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
+        """Run the command; report what the user can mend without a traceback."""
+        try:
+            return super().invoke(ctx)
+        except DudmapError as error:
+            fail(str(error))
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        except KeyboardInterrupt as interrupt:
+            fail(str(interrupt) or "interrupted", code=130)
+
+
+def fail(sentence: str, code: int = 1) -> None:
+    """Print one sentence to stderr and leave.
+
+    Raises:
+        typer.Exit: Always.
+    """
+    typer.echo(f"dudmap: {sentence}", err=True)
+    raise typer.Exit(code)
+
+
+def _stand_in() -> None:
+    """Never called: the module of the command takes its place."""
+
+
+app = typer.Typer(
+    name="dudmap",
+    cls=CommandGroup,
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    help="Dense RGB-D SLAM for places where things move: an RGB-D recording with people in it goes in, "
+    "a trajectory and a clean mesh come out.",
+)
+for _name, _help in COMMANDS.items():
+    app.command(_name, help=_help)(_stand_in)
+
+
+def _print_version(wanted: bool) -> None:
+    if wanted:
+        typer.echo(f"dudmap {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _dudmap(
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version.", is_eager=True, callback=_print_version)
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Entry point of the program ``dudmap``."""
+    app()

@@ -1,0 +1,39 @@
+"""``dudmap config``: all parameters with their meaning."""
+
+import textwrap
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from dudmap.config import Config
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def config(
+    preset: Annotated[str, typer.Option("--preset", help="default or thesis.")] = "default",
+) -> None:
+    """Print all parameters with their meaning, as TOML that --config takes."""
+    from dudmap.config import Config
+
+    typer.echo(commented(Config.from_tree({"preset": preset})), nl=False)
+
+
+def commented(config: "Config") -> str:
+    """TOML text of a configuration with each parameter's meaning above it."""
+    parts = {"": type(config).model_fields}
+    for name, field in type(config).model_fields.items():
+        parts[name] = getattr(type(getattr(config, name)), "model_fields", {}) or {name: field}
+    lines, part = [], ""
+    for line in config.to_toml().splitlines():
+        if line.startswith("["):
+            part = line.strip("[]")
+            about = type(getattr(config, part)).__doc__ or ""
+            lines += textwrap.wrap(" ".join(about.split()), 100, initial_indent="# ", subsequent_indent="# ")
+        elif " = " in line:
+            about = parts[part][line.partition(" = ")[0]].description or ""
+            lines += textwrap.wrap(about, 100, initial_indent="# ", subsequent_indent="# ")
+        lines.append(line)
+    return "\n".join(lines) + "\n"

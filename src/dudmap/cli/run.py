@@ -1,0 +1,89 @@
+"""``dudmap run``: a recording goes in, a run folder comes out."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dudmap.errors import ConfigError
+
+if TYPE_CHECKING:
+    from dudmap.config import Config
+
+app = typer.Typer(add_completion=False)
+
+CameraOption = Annotated[
+    str | None, typer.Option("--camera", help="Intrinsics: fx,fy,cx,cy[,w,h[,depth_scale]].", metavar="NUMBERS")
+]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with parameters.")]
+PresetOption = Annotated[str | None, typer.Option("--preset", help="Values to start from: default or thesis.")]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="One parameter, e.g. tracker.huber=0.02; may be repeated.", metavar="KEY=VALUE"),
+]
+QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
+JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
+
+
+@app.command()
+def run(
+    sequence: Annotated[Path, typer.Argument(help="Folder of a recording in TUM layout (rgb.txt, depth.txt).")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Run folder; default: runs/<name of the recording>.")
+    ] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    preset: PresetOption = None,
+    camera: CameraOption = None,
+    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
+    save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Turn a recording into a trajectory and a clean mesh.
+
+    Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder.
+    """
+    from dudmap.run import run as run_sequence
+    from dudmap.sequences import open_sequence
+
+    parameters = read_config(config, preset, assignments or [])
+    recording = open_sequence(sequence, camera)
+    out = out or free_folder(Path("runs") / recording.name)
+    report = run_sequence(recording, parameters, out, max_frames=max_frames, save_masks=save_masks, progress=not quiet)
+    print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
+
+
+def read_config(file: Path | None, preset: str | None, assignments: list[str]) -> "Config":
+    """Parameters of a file or a preset, with single ones assigned."""
+    from dudmap.config import Config
+
+    if file is not None and preset is not None:
+        raise ConfigError(f"--config and --preset exclude each other; write preset = {preset!r} into {file} instead")
+    config = Config.load(file) if file is not None else Config.from_tree({"preset": preset} if preset else {})
+    return config.override(assignments)
+
+
+def free_folder(wanted: Path) -> Path:
+    """The folder itself if it is new or empty, else the first free one of ``<name>-2``, ``<name>-3``, ..."""
+    folder, number = wanted, 1
+    while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        number += 1
+        folder = wanted.with_name(f"{wanted.name}-{number}")
+    return folder
+
+
+def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
+    """Metrics on stdout: one JSON object, or a table, or nothing."""
+    if as_json:
+        import json
+
+        typer.echo(json.dumps(metrics))
+    elif not quiet:
+        from rich.console import Console
+
+        from dudmap.progress import summary
+
+        console = Console()
+        console.print(summary(metrics))
+        console.print(f"written to {out}")

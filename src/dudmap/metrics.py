@@ -1,0 +1,154 @@
+"""The figures of a run: counted frame by frame, summed up once."""
+
+import csv
+import os
+import platform
+import sys
+import time
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import __version__
+from dudmap.errors import DatasetError
+from dudmap.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from dudmap.slam import FrameResult
+
+SCORED_COVERAGE = 0.05
+"""Masks are scored in frames where more than this share of the image truly moves."""
+
+
+@dataclass
+class RunRecord:
+    """What is counted while the frames pass.
+
+    Attributes:
+        rows: Per processed frame: timestamp, state, total and reading time and every stage's time, ms.
+        lost: Timestamp and reason of every frame that was not tracked.
+        unreadable: One sentence per frame that could not be read.
+        mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    lost: list[dict[str, Any]] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    mask_ious: list[float] = field(default_factory=list)
+    fused: int = 0
+    skipped_similar: int = 0
+    _wall_start: float = field(default_factory=time.perf_counter)
+    _cpu_start: float = field(default_factory=time.process_time)
+
+    def add(self, result: "FrameResult", total_ms: float, reading_ms: float, mask: NDArray[np.bool_] | None) -> None:
+        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known."""
+        self.rows.append(
+            {
+                "timestamp": f"{result.timestamp:.6f}",
+                "state": result.state,
+                "fused": int(result.fused),
+                "dynamic_share": round(result.dynamic_share, 4),
+                "reading": round(reading_ms, 3),
+                "total": round(total_ms, 3),
+            }
+            | {stage: round(ms, 3) for stage, ms in result.timings.items()}
+        )
+        self.fused += result.fused
+        self.skipped_similar += result.skipped_similar
+        if result.state == "lost":
+            self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
+        if mask is not None and mask.mean() > SCORED_COVERAGE:
+            union = np.count_nonzero(mask | result.dynamic_mask)
+            self.mask_ious.append(np.count_nonzero(mask & result.dynamic_mask) / union)
+
+    def save_timings(self, path: Path) -> None:
+        """CSV with one row per processed frame and one column per stage, milliseconds."""
+        columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, restval=0)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def metrics(self) -> dict[str, Any]:
+        """Counts and times of the whole run."""
+        totals = np.array([row["total"] for row in self.rows] or [np.nan])
+        readings = np.array([row["reading"] for row in self.rows] or [np.nan])
+        return {
+            "frames": len(self.rows) + len(self.unreadable),
+            "tracked": len(self.rows) - len(self.lost),
+            "fused": self.fused,
+            "skipped_similar": self.skipped_similar,
+            "lost": len(self.lost),
+            "unreadable": len(self.unreadable),
+            "ms_per_frame_median": _number(np.median(totals)),
+            "ms_per_frame_p95": _number(np.percentile(totals, 95)),
+            "ms_reading_median": _number(np.median(readings)),
+            "wall_s": round(time.perf_counter() - self._wall_start, 3),
+            "cpu_s": round(time.process_time() - self._cpu_start, 3),
+            "peak_rss_mb": peak_rss_mb(),
+            "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
+            "lost_frames": self.lost,
+            "unreadable_frames": self.unreadable,
+        } | (
+            {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
+            if self.mask_ious
+            else {}
+        )
+
+
+def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
+    """Absolute and relative trajectory error against the ground truth; the reason where they cannot be computed."""
+    from dudmap.evaluation.trajectory import ate, rpe
+
+    out: dict[str, Any] = {"ate_rmse_m": None, "rpe_trans_rmse_m_per_s": None, "rpe_rot_rmse_deg_per_s": None}
+    try:
+        out["ate_rmse_m"] = _number(ate(estimate, reference).rmse, 6)
+        relative = rpe(estimate, reference, delta=1.0)
+        out["rpe_trans_rmse_m_per_s"] = _number(relative.trans_rmse, 6)
+        out["rpe_rot_rmse_deg_per_s"] = _number(relative.rot_rmse_deg, 6)
+    except DatasetError as error:
+        out["accuracy_missing"] = str(error)
+    return out
+
+
+def peak_rss_mb() -> float | None:
+    """Largest resident memory of this process so far, MB; None where the system does not tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
+
+
+def versions() -> dict[str, str]:
+    """Versions of dudmap and of what its figures depend on."""
+    import cv2
+
+    return {
+        "dudmap": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": version("numba"),
+        "opencv": cv2.__version__,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores and operating system."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [line for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")]
+        cpu = names[0].partition(":")[2].strip() if names else cpu
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cpu": cpu, "cores": os.cpu_count(), "cores_usable": usable, "os": platform.platform()}
+
+
+def _number(value: float | np.floating, digits: int = 3) -> float | None:
+    """A number JSON can hold; None for NaN."""
+    return round(float(value), digits) if np.isfinite(value) else None

@@ -1,0 +1,107 @@
+"""What a run shows on the terminal: a bar while it goes, a table at the end."""
+
+import time
+from collections import deque
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+if TYPE_CHECKING:
+    from dudmap.slam import FrameResult
+
+
+class RunProgress:
+    """Bar on stderr with the current frame, frames per second, dynamic share and tracking state.
+
+    A frame that is lost or unreadable is always said, once per gap, even when the bar is off.
+
+    Args:
+        total: Number of frames.
+        bar: Whether to show the bar; it shows on a terminal only.
+    """
+
+    def __init__(self, total: int, *, bar: bool = True) -> None:
+        self.console = Console(stderr=True)
+        self._bar = Progress(
+            TextColumn("frame"),
+            MofNCompleteColumn(),
+            BarColumn(),
+            TextColumn("{task.fields[fps]:5.1f} fps"),
+            TextColumn("{task.fields[dynamic]:4.0%} dynamic"),
+            TextColumn("{task.fields[state]}"),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not (bar and self.console.is_terminal),
+        )
+        self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="")
+        self._times: deque[float] = deque(maxlen=30)
+        self._lost = 0
+
+    def __enter__(self) -> "RunProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def frame(self, index: int, result: "FrameResult") -> None:
+        """Show a processed frame."""
+        if result.state == "lost":
+            if self._lost == 0:
+                self.note(f"frame {index}: lost, {result.lost_reason}")
+            self._lost += 1
+        elif self._lost:
+            self.note(f"frame {index}: tracked again, {self._lost} lost")
+            self._lost = 0
+        self._times.append(time.perf_counter())
+        seconds = self._times[-1] - self._times[0]
+        state = "[red]lost[/]" if result.state == "lost" else "[green]tracked[/]"
+        self._bar.update(
+            self._task,
+            completed=index + 1,
+            fps=(len(self._times) - 1) / seconds if seconds > 0 else 0.0,
+            dynamic=result.dynamic_share,
+            state=state,
+        )
+
+    def note(self, sentence: str) -> None:
+        """Say something above the bar."""
+        self.console.print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+    def working(self, what: str) -> None:
+        """Show what happens after the last frame."""
+        self._bar.update(self._task, state=what)
+
+
+def summary(metrics: dict[str, Any]) -> Table:
+    """Table of a run's figures."""
+    table = Table(title=str(metrics["sequence"]), show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column(justify="right")
+    counts = "tracked", "fused", "skipped_similar", "lost", "unreadable"
+    table.add_row("frames", str(metrics["frames"]))
+    for key in counts:
+        value = metrics[key]
+        bad = key in ("lost", "unreadable") and value
+        table.add_row(f"  {key.replace('_', ' ')}", f"[red]{value}[/]" if bad else str(value))
+    table.add_row("time per frame, median", _text(metrics["ms_per_frame_median"], "{:.1f} ms"))
+    table.add_row("time per frame, 95 %", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
+    table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))
+    table.add_row("map", _text(metrics["map_bytes"], "{:.1f} MB", 1e-6))
+    table.add_row("mesh", f"{metrics['mesh_triangles']} triangles")
+    if "ate_rmse_m" in metrics:
+        table.add_row("ATE RMSE", _text(metrics["ate_rmse_m"], "{:.2f} cm", 100))
+        table.add_row("RPE RMSE, translation", _text(metrics["rpe_trans_rmse_m_per_s"], "{:.2f} cm/s", 100))
+        table.add_row("RPE RMSE, rotation", _text(metrics["rpe_rot_rmse_deg_per_s"], "{:.2f} deg/s"))
+    if "mask_iou_mean" in metrics:
+        table.add_row("mask IoU", _text(metrics["mask_iou_mean"], "{:.3f}"))
+    return table
+
+
+def _text(value: float | None, form: str, factor: float = 1.0) -> str:
+    return "unknown" if value is None else form.format(value * factor)

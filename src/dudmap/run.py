@@ -1,0 +1,244 @@
+"""A run: frames go in, a run folder comes out. No algorithm in it."""
+
+import json
+import time
+from collections import deque
+from collections.abc import Callable, Generator
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.errors import DatasetError, DudmapError, FrameError, MapError
+from dudmap.frame import Frame
+from dudmap.metrics import RunRecord, accuracy, machine, versions
+from dudmap.progress import RunProgress
+from dudmap.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from dudmap.sequences import Sequence
+    from dudmap.slam import FrameResult, Slam
+
+AHEAD = 4
+"""Frames that are read while an earlier one is processed."""
+FILES = ("trajectory.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv")
+
+
+@dataclass(frozen=True, eq=False)
+class RunReport:
+    """What a run gave.
+
+    Attributes:
+        out: The run folder.
+        metrics: The content of metrics.json.
+        trajectory: Poses of all tracked frames.
+    """
+
+    out: Path
+    metrics: dict[str, Any]
+    trajectory: Trajectory
+
+
+class Reading(NamedTuple):
+    """What the reader found.
+
+    Attributes:
+        frame: The frame, or why there is none.
+        mask: (H, W) its true dynamic mask, None if not known, or why it cannot be read.
+        ms: Reading time of the frame.
+    """
+
+    frame: Frame | FrameError
+    mask: NDArray[np.bool_] | FrameError | None
+    ms: float
+
+
+def run(
+    sequence: "Sequence",
+    config: Config,
+    out: str | Path,
+    *,
+    max_frames: int | None = None,
+    save_masks: bool = False,
+    progress: bool = True,
+    observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
+) -> RunReport:
+    """Run the system over a recording and write a run folder.
+
+    The folder gets trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
+    metrics.json, timings.csv and, if asked for, masks/<timestamp>.png (255 = dynamic). Results of an earlier run in
+    the same folder are removed first. If anything stops the run, what was computed so far is written all the same.
+
+    Args:
+        sequence: The recording; its ground truth and masks are used for scoring only.
+        config: All parameters.
+        out: The run folder; made if needed.
+        max_frames: Stop after this many frames.
+        save_masks: Write the dynamic mask of every frame.
+        progress: Show a progress bar on a terminal.
+        observe: Called after each processed frame with its number, reading and result.
+
+    Raises:
+        DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
+        KeyboardInterrupt: ctrl-C, after writing; the message says what is saved where.
+    """
+    from dudmap.slam import Slam
+
+    out = Path(out)
+    slam, record = Slam(sequence.camera, config), RunRecord()
+    _prepare(out, save_masks=save_masks)
+    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
+    stopped = ""
+    with RunProgress(count, bar=progress) as display:
+        try:
+            with closing(read_ahead(sequence, count)) as readings:
+                for index, reading in enumerate(readings):
+                    _process(index, reading, slam, record, display, out if save_masks else None, observe)
+        except KeyboardInterrupt:
+            stopped = f"interrupted after {len(record.rows)} frames"
+            raise KeyboardInterrupt(f"{stopped}; the trajectory and the map up to there are in {out}") from None
+        except DudmapError as error:
+            stopped = str(error)
+            raise type(error)(f"{stopped}; the trajectory and the map up to there are in {out}") from error
+        except BaseException as error:
+            stopped = repr(error)
+            raise
+        finally:
+            display.working("writing")
+            report = _write(out, slam, record, sequence, config, stopped)
+    if record.rows and not len(report.trajectory):
+        raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
+    if not record.rows:
+        raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
+    return report
+
+
+def read_ahead(sequence: "Sequence", count: int) -> "Generator[Reading]":
+    """The first ``count`` frames in order, read by one thread a few frames ahead."""
+    reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
+    pending: deque[Future[Reading]] = deque()
+    try:
+        for index in range(count + AHEAD):
+            if index < count:
+                pending.append(reader.submit(_read, sequence, index))
+            if index >= AHEAD:
+                yield pending.popleft().result()
+    finally:
+        reader.shutdown(cancel_futures=True)
+
+
+def _read(sequence: "Sequence", index: int) -> Reading:
+    start = time.perf_counter()
+    try:
+        frame: Frame | FrameError = sequence[index]
+    except FrameError as error:
+        return Reading(error, None, 1000 * (time.perf_counter() - start))
+    ms = 1000 * (time.perf_counter() - start)
+    try:
+        return Reading(frame, sequence.mask(index), ms)
+    except FrameError as error:
+        return Reading(frame, error, ms)
+
+
+def _process(
+    index: int,
+    reading: Reading,
+    slam: "Slam",
+    record: RunRecord,
+    display: RunProgress,
+    out_of_masks: Path | None,
+    observe: "Callable[[int, Reading, FrameResult], None] | None",
+) -> None:
+    if isinstance(reading.frame, FrameError):
+        record.unreadable.append(str(reading.frame))
+        display.note(f"skipped: {reading.frame}")
+        return
+    truth = reading.mask
+    if isinstance(truth, FrameError):
+        display.note(f"frame {index}: its mask is not scored, {truth}")
+        truth = None
+    start = time.perf_counter()
+    result = slam.process(reading.frame)
+    record.add(result, 1000 * (time.perf_counter() - start), reading.ms, truth)
+    if out_of_masks is not None:
+        _save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+    if observe is not None:
+        observe(index, reading, result)
+    display.frame(index, result)
+
+
+def _save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    import cv2
+
+    path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+
+
+def _prepare(out: Path, *, save_masks: bool) -> None:
+    """Make the run folder, prove that it can be written, and remove an earlier run's results.
+
+    Raises:
+        DudmapError: It cannot be made or written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".dudmap-probe"
+        probe.write_bytes(b"")
+        probe.unlink()
+        for name in FILES:
+            (out / name).unlink(missing_ok=True)
+        for mask in (out / "masks").glob("*.png"):
+            mask.unlink()
+        if save_masks:
+            (out / "masks").mkdir(exist_ok=True)
+    except OSError as error:
+        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+
+
+def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", config: Config, stopped: str) -> RunReport:
+    """Write all files of the run folder; one that fails does not keep the others from being written.
+
+    Raises:
+        DudmapError: A file could not be written.
+    """
+    trajectory = slam.trajectory
+    metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
+    metrics |= record.metrics()
+    sizes = {"map_blocks": slam.volume.num_blocks, "map_bytes": slam.volume.num_bytes}
+    metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
+
+    def save_mesh() -> None:
+        mesh = slam.volume.extract_mesh()
+        metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
+        mesh.save(out / "mesh.ply")
+
+    def save_metrics() -> None:
+        if sequence.ground_truth is not None:
+            metrics.update(accuracy(trajectory, sequence.ground_truth))
+        metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
+        metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
+        (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+
+    steps: list[Callable[[], None]] = [
+        lambda: trajectory.save(out / "trajectory.txt"),
+        lambda: config.save(out / "config.toml"),
+        lambda: record.save_timings(out / "timings.csv"),
+    ]
+    if not slam.volume.is_empty:
+        steps += [lambda: slam.volume.save(out / "map.npz"), save_mesh]
+    problems = []
+    try:
+        for step in steps:
+            try:
+                step()
+            except (OSError, MapError) as error:
+                problems.append(str(error))
+    finally:
+        save_metrics()
+    if problems:
+        raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
+    return RunReport(out, metrics, trajectory)

@@ -1,0 +1,243 @@
+"""The run folder, and that what was computed is written whatever happens. The algorithm is replaced by a stand-in."""
+
+import csv
+import json
+import sys
+import types
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import cv2
+import numpy as np
+import pytest
+
+from dudmap.config import Config
+from dudmap.errors import DatasetError, DudmapError
+from dudmap.mesh import Mesh
+from dudmap.run import read_ahead, run
+from dudmap.sequences import open_sequence
+from dudmap.trajectory import Trajectory
+from recordings import HEIGHT, WIDTH, cut, write_recording
+
+TRIANGLE = Mesh(
+    np.eye(3, dtype=np.float32),
+    np.array([[0, 1, 2]], np.int32),
+    np.full((3, 3), 9, np.uint8),
+    np.eye(3, dtype=np.float32),
+)
+
+
+@dataclass
+class Result:
+    timestamp: float
+    state: str = "tracked"
+    lost_reason: str = ""
+    T_world_camera: np.ndarray | None = None
+    fused: bool = True
+    skipped_similar: bool = False
+    dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
+    dynamic_share: float = 0.0
+    timings: dict = field(default_factory=lambda: {"track": 2.0})
+
+
+class Volume:
+    num_blocks, num_bytes, is_empty = 3, 12345, False
+
+    def save(self, path):
+        path.write_bytes(b"map")
+
+    def extract_mesh(self):
+        return TRIANGLE
+
+
+class StandIn:
+    """Moves 1 cm per frame along x; ``script`` holds what happens at a frame number."""
+
+    script: ClassVar[dict] = {}
+
+    def __init__(self, camera, config):
+        self.volume, self.poses, self.frames = Volume(), [], []
+
+    @property
+    def trajectory(self):
+        return Trajectory.from_poses(self.poses)
+
+    def process(self, frame):
+        index = len(self.frames)
+        self.frames.append(frame)
+        event = self.script.get(index)
+        if isinstance(event, BaseException):
+            raise event
+        if event == "lost":
+            return Result(frame.timestamp, "lost", "too few inliers", fused=False)
+        T = np.eye(4)
+        T[0, 3] = 0.01 * index
+        self.poses.append((frame.timestamp, T))
+        mask = np.zeros((HEIGHT, WIDTH), bool)
+        mask[:24, :32] = True
+        return Result(
+            frame.timestamp, T_world_camera=T, fused=event != "similar", skipped_similar=event == "similar",
+            dynamic_mask=mask, dynamic_share=0.25,
+        )  # fmt: skip
+
+
+@pytest.fixture
+def slam(monkeypatch):
+    """The stand-in in place of dudmap.slam.Slam; tests set ``slam.script``."""
+    stand_in = type("Slam", (StandIn,), {"script": {}})
+    module = types.ModuleType("dudmap.slam")
+    module.Slam = stand_in
+    monkeypatch.setitem(sys.modules, "dudmap.slam", module)
+    return stand_in
+
+
+@pytest.fixture
+def recording(tmp_path):
+    return write_recording(tmp_path / "desk", 8)
+
+
+def go(recording, out, **options):
+    return run(open_sequence(recording), Config(), out, progress=False, **options)
+
+
+def metrics_of(out):
+    return json.loads((out / "metrics.json").read_text())
+
+
+def test_the_run_folder(slam, recording, tmp_path):
+    slam.script = {2: "lost", 5: "similar"}
+    out = tmp_path / "deep" / "out"
+    report = go(recording, out)
+    assert sorted(path.name for path in out.iterdir()) == [
+        "config.toml", "map.npz", "mesh.ply", "metrics.json", "timings.csv", "trajectory.txt"
+    ]  # fmt: skip
+    metrics = metrics_of(out)
+    assert metrics == json.loads(json.dumps(report.metrics))
+    expected = {
+        "sequence": "desk", "complete": True, "frames": 8, "tracked": 7, "fused": 6, "skipped_similar": 1, "lost": 1,
+        "unreadable": 0, "map_blocks": 3, "map_bytes": 12345, "mesh_vertices": 3, "mesh_triangles": 1,
+        "lost_frames": [{"timestamp": 100.2, "reason": "too few inliers"}],
+    }  # fmt: skip
+    assert {key: metrics[key] for key in expected} == expected
+    for key in ("ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "cpu_s", "wall_s", "peak_rss_mb"):
+        assert metrics[key] >= 0
+    assert "ate_rmse_m" not in metrics
+    assert {"dudmap", "python", "numpy", "numba", "opencv"} <= set(metrics["versions"])
+    assert {"cpu", "cores", "os"} <= set(metrics["machine"])
+    trajectory = Trajectory.load(out / "trajectory.txt")
+    np.testing.assert_allclose(trajectory.timestamps, 100 + 0.1 * np.array([0, 1, 3, 4, 5, 6, 7]))
+    np.testing.assert_allclose(trajectory.Ts_world_camera[:, 0, 3], 0.01 * np.array([0, 1, 3, 4, 5, 6, 7]))
+    assert Config.load(out / "config.toml") == Config()
+    assert len(Mesh.load(out / "mesh.ply").faces) == 1
+    with (out / "timings.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert [row["timestamp"] for row in rows] == [f"{100 + 0.1 * k:.6f}" for k in range(8)]
+    assert rows[2]["state"] == "lost"
+    assert float(rows[2]["track"]) == 2.0
+
+
+def test_frames_arrive_in_order_and_no_more_than_wanted(slam, recording, tmp_path):
+    seen = []
+    report = go(recording, tmp_path / "out", max_frames=6, observe=lambda i, reading, result: seen.append((i, result)))
+    assert [i for i, _ in seen] == list(range(6))
+    np.testing.assert_allclose([result.timestamp for _, result in seen], 100 + 0.1 * np.arange(6))
+    assert report.metrics["frames"] == 6
+    assert len(list(read_ahead(open_sequence(recording), 2))) == 2
+    assert list(read_ahead(open_sequence(recording), 0)) == []
+
+
+def test_masks_are_written_and_scored(slam, recording, tmp_path):
+    truth = np.zeros((HEIGHT, WIDTH), np.uint8)
+    truth[:24, :16] = 255  # half of what the stand-in calls dynamic
+    (recording / "mask").mkdir()
+    cv2.imwrite(str(recording / "mask/1.png"), truth)
+    cv2.imwrite(str(recording / "mask/3.png"), np.zeros_like(truth))
+    (recording / "mask.txt").write_text("100.104 mask/1.png\n100.304 mask/3.png\n100.404 mask/missing.png\n")
+    report = go(recording, tmp_path / "out", save_masks=True)
+    names = sorted(path.name for path in (tmp_path / "out/masks").iterdir())
+    assert names == [f"{100 + 0.1 * k:.6f}.png" for k in range(8)]
+    mask = cv2.imread(str(tmp_path / "out/masks/100.100000.png"), cv2.IMREAD_UNCHANGED)
+    assert mask.shape == (HEIGHT, WIDTH)
+    assert set(np.unique(mask)) == {0, 255}
+    assert np.count_nonzero(mask) == 24 * 32
+    assert report.metrics["mask_iou_mean"] == pytest.approx(0.5)
+    assert report.metrics["mask_iou_frames"] == 1
+
+
+def test_unreadable_frames_are_skipped_and_counted(slam, recording, tmp_path, capsys):
+    cut(recording / "depth/3.png")
+    (recording / "rgb/4.png").unlink()
+    metrics = go(recording, tmp_path / "out").metrics
+    assert (metrics["frames"], metrics["unreadable"], metrics["tracked"]) == (8, 2, 6)
+    assert "frame 3" in metrics["unreadable_frames"][0]
+    assert "skipped: frame 4" in capsys.readouterr().err.replace("\n", "")
+
+
+def test_a_lost_track_is_said_once_per_gap(slam, recording, tmp_path, capsys):
+    slam.script = {2: "lost", 3: "lost", 6: "lost"}
+    go(recording, tmp_path / "out")
+    said = capsys.readouterr().err.splitlines()
+    assert said == [
+        "frame 2: lost, too few inliers",
+        "frame 4: tracked again, 2 lost",
+        "frame 6: lost, too few inliers",
+        "frame 7: tracked again, 1 lost",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("event", "sentence"),
+    [
+        (KeyboardInterrupt(), "interrupted after 3 frames; the trajectory and the map up to there are in"),
+        (DatasetError("the images do not fit"), "the images do not fit; the trajectory and the map up to there are in"),
+        (ZeroDivisionError("a bug"), "a bug"),
+    ],
+)
+def test_what_was_computed_is_written_whatever_happens(slam, recording, tmp_path, event, sentence):
+    slam.script = {3: event}
+    with pytest.raises(type(event), match=sentence):
+        go(recording, tmp_path / "out")
+    assert len(Trajectory.load(tmp_path / "out/trajectory.txt")) == 3
+    assert (tmp_path / "out/map.npz").read_bytes() == b"map"
+    assert (tmp_path / "out/mesh.ply").exists()
+    metrics = metrics_of(tmp_path / "out")
+    assert metrics["complete"] is False
+    assert metrics["stopped_by"]
+    assert metrics["tracked"] == 3
+
+
+def test_one_file_that_cannot_be_written_does_not_cost_the_others(slam, recording, tmp_path, monkeypatch):
+    def full(self, path):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr(Volume, "save", full)
+    with pytest.raises(DudmapError, match=r"is incomplete: .*No space left"):
+        go(recording, tmp_path / "out")
+    assert (tmp_path / "out/mesh.ply").exists()
+    assert metrics_of(tmp_path / "out")["tracked"] == 8
+
+
+def test_a_run_without_any_pose_is_an_error(slam, recording, tmp_path):
+    slam.script = dict.fromkeys(range(8), "lost")
+    with pytest.raises(DudmapError, match="none of the 8 frames could be tracked; the first: too few inliers"):
+        go(recording, tmp_path / "out")
+    assert metrics_of(tmp_path / "out")["lost"] == 8
+
+
+def test_an_earlier_run_leaves_no_trace_in_the_folder(slam, recording, tmp_path):
+    out = tmp_path / "out"
+    go(recording, out, save_masks=True)
+    (out / "notes.txt").write_text("mine")
+    go(recording, out, max_frames=2, save_masks=True)
+    assert len(list((out / "masks").iterdir())) == 2
+    assert (out / "notes.txt").exists()
+
+
+def test_a_folder_that_cannot_be_written_is_found_before_the_work(slam, recording, tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(DudmapError, match=r"cannot write into the run folder .*file"):
+        go(recording, tmp_path / "file")
+    with pytest.raises(DudmapError, match="cannot write into the run folder"):
+        go(recording, tmp_path / "file" / "below")
+    with pytest.raises(DudmapError, match="cannot write into the run folder"):
+        go(recording, "/proc/dudmap")
