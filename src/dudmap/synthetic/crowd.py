@@ -40,7 +40,7 @@ class Crowd:
         self.figures = [Figure(rng, number, size, stride) for number in range(min(self.count, 5))]
 
     def advanced(self, t: float) -> float:
-        """Metres that everybody has walked at time ``t``; before 0.5 s nobody is in view unless already at the start."""
+        """Metres that everybody has walked at time ``t``; before 0.5 s nobody is in view, unless at the start."""
         if self.staging.start_dynamic:
             return self.lane + self.speed * t
         hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)

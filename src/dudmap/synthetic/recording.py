@@ -20,7 +20,7 @@ from dudmap.synthetic.paths import camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.rooms import build_scene
 from dudmap.synthetic.scene import Scene
-from dudmap.synthetic.sensors import Sensor
+from dudmap.synthetic.sensors import Sensor, SensorModel
 from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 from dudmap.trajectory import Trajectory
@@ -114,6 +114,11 @@ class SyntheticSequence:
     def exact_depth(self, index: int) -> NDArray[np.float32]:
         """Ideal depth (H, W) in metres of a frame, 0 where nothing is."""
         return self._render(self._number(index), with_color=False).depth
+
+    @property
+    def sensor_model(self) -> SensorModel | None:
+        """What the sensor does to the images, None for an ideal one."""
+        return self._sensor.model
 
     def movers(self, index: int) -> list[MoverState]:
         """The movers that exist in a frame, visible or not."""
@@ -267,7 +272,8 @@ def make_sequence(
         names = ("crowd",)
         actors = crowd_of(coverage, staging).movers()
     else:
-        actors = build_movers(names, staging) if coverage is None else []
+        names = names if coverage is None else ()
+        actors = build_movers(names, staging)
     poses = camera_poses(path, world, times, seed, actors)
     poses = carried_elsewhere(poses, world, times, special.elsewhere)
     poses[:, :3, :3] = [se3.nearest_rotation(R) for R in poses[:, :3, :3]]

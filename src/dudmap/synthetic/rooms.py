@@ -146,7 +146,10 @@ def desk() -> Scene:
         capsule((0.8, 0.3, top), (0.86, 0.34, top + 0.4), 0.009, METAL),
         capsule((0.86, 0.34, top + 0.4), (0.66, 0.2, top + 0.55), 0.009, METAL),
         ellipsoid((0.64, 0.18, top + 0.54), (0.07, 0.07, 0.05), Material("plaid", (4, 4), glow=0.4)),
-        *[capsule((-0.9 + 0.015 * k, 0.3, top + 0.05), (-0.9 + 0.03 * k, 0.31, top + 0.19), 0.004, spine[k]) for k in range(5)],
+        *[
+            capsule((-0.9 + 0.015 * k, 0.3, top + 0.05), (-0.9 + 0.03 * k, 0.31, top + 0.19), 0.004, spine[k])
+            for k in range(5)
+        ],
         cylinder((-0.87, 0.3, top), (-0.87, 0.3, top + 0.11), 0.042, Material("checks", (5, 5))),
         poster(-0.75, 0.595, 1.5, (0.4, 0.3), 1, 0.01),
         poster(0.6, 0.595, 1.45, (0.35, 0.45), 2, 0.01),
@@ -170,6 +173,7 @@ def desk() -> Scene:
 
 def yard() -> Scene:
     """Yard under the sky: paving, house wall, fence of slats and thin wires, washing line, tree, bench, bin."""
+    stone = Material("plaster", (1, 1), tint=(0.7, 0.68, 0.65), variation=0.5)
     slat, wire = Material("wood", (1, 1), tint=(0.9, 0.85, 0.8)), Material("plain", tint=(0.4, 0.4, 0.42))
     solids = [
         box((0, 2, -0.1), (16, 14, 0.2), Material("grass", (0.5, 0.5))),
@@ -200,7 +204,7 @@ def yard() -> Scene:
         *[box((x, 2.3, 0.2), (0.07, 0.36, 0.4), METAL) for x in (0.1, 1.1)],
         cylinder((1.75, 2.0, 0), (1.75, 2.0, 0.75), 0.24, Material("stripes", (1.2, 1.2), tint=(0.6, 0.8, 0.6))),
         box((-1.3, 1.7, 0.22), (0.5, 0.4, 0.44), CARDBOARD, 25),
-        ellipsoid((-0.6, 1.9, 0.16), (0.3, 0.22, 0.18), Material("plaster", (1, 1), tint=(0.7, 0.68, 0.65), variation=0.5)),
+        ellipsoid((-0.6, 1.9, 0.16), (0.3, 0.22, 0.18), stone),
         *plant(-0.3, 3.3),
     ]  # fmt: skip
     return Scene(

@@ -76,7 +76,7 @@ def cover(times: Array, T_world_camera: Callable[[float], Array], spans: tuple[t
     def aside(t: float) -> float:
         """1 out of view, 0 covering."""
         closed = [
-            smooth_step((t - begin * duration) / 0.15) - smooth_step((t - end * duration + 0.15) / 0.15)
+            smooth_step((t - begin * duration) / 0.15 + 1.0) - smooth_step((t - end * duration) / 0.15)
             for begin, end in spans
         ]
         return 1.0 - max(closed)

@@ -1,0 +1,118 @@
+"""``dudmap synth``: render a synthetic recording with exact truth."""
+
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dudmap.errors import ConfigError
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def synth(
+    out: Annotated[Path, typer.Argument(help="Folder to write, in TUM layout with the truth beside it.")],
+    scene: Annotated[
+        str, typer.Option("--scene", help="room, corridor, desk, yard, textureless, plane or box.")
+    ] = "room",
+    camera_path: Annotated[
+        str | None,
+        typer.Option(
+            "--camera-path",
+            help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file in TUM format.",
+            metavar="FILE|NAME",
+        ),
+    ] = None,
+    movers: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--movers",
+            help="person, people, wanderer, carried_box, removed_box, ball, balloon, creeper, stopping_cart, "
+            "starting_cart, door; several with commas or by repeating; none for a static world.",
+        ),
+    ] = None,
+    speed: Annotated[float | None, typer.Option("--speed", help="Speed of the movers.", metavar="M_PER_S")] = None,
+    coverage: Annotated[
+        float | None,
+        typer.Option("--coverage", help="Share of the image hidden by a stream of people, 0 to 0.95.", metavar="SHARE"),
+    ] = None,
+    start_dynamic: Annotated[
+        bool, typer.Option("--start-dynamic", help="Movers in view from the first frame.")
+    ] = False,
+    situation: Annotated[
+        str | None,
+        typer.Option(
+            "--situation",
+            help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away.",
+        ),
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 120,
+    fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0,
+    noise: Annotated[str, typer.Option("--noise", help="Sensor: kinect, realsense or none.")] = "kinect",
+    seed: Annotated[int, typer.Option("--seed", help="Chooses path, looks and noise.", min=0)] = 0,
+    size: Annotated[str, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = "640x480",
+    motion_blur: Annotated[
+        float, typer.Option("--motion-blur", help="Share of the frame interval with the shutter open.")
+    ] = 0.0,
+    exposure_change: Annotated[
+        float, typer.Option("--exposure-change", help="Relative amplitude of a slow change of brightness.")
+    ] = 0.0,
+    overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+) -> None:
+    """Render a synthetic recording with exact truth.
+
+    Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
+    surface_observed.ply and scene.json.
+    """
+    from dudmap import synthetic
+    from dudmap.synthetic.folder import write_folder
+    from dudmap.synthetic.recording import DEFAULT_CAMERA
+
+    sequence = synthetic.sequence(
+        scene=scene,
+        movers=_names(movers),
+        camera_path=camera_path,
+        frames=frames,
+        fps=fps,
+        noise=noise,
+        speed=speed,
+        coverage=coverage,
+        start_dynamic=start_dynamic,
+        situation=situation,
+        seed=seed,
+        camera=DEFAULT_CAMERA.resized(*_size(size)),
+        motion_blur=motion_blur,
+        exposure_change=exposure_change,
+    )
+    if quiet:
+        write_folder(sequence, out, overwrite=overwrite)
+        return
+    import time
+
+    from rich.console import Console
+    from rich.progress import Progress
+
+    console = Console(stderr=True)
+    start = time.perf_counter()
+    with Progress(console=console, disable=not console.is_terminal) as bar:
+        task = bar.add_task("rendering", total=len(sequence))
+        write_folder(sequence, out, overwrite=overwrite, progress=lambda done: bar.update(task, completed=done))
+    seconds = time.perf_counter() - start
+    console.print(f"{out}: {len(sequence)} frames of {sequence.name} in {seconds:.1f} s", highlight=False)
+
+
+def _names(movers: list[str] | None) -> list[str] | None:
+    if movers is None:
+        return None
+    found = [name.strip() for text in movers for name in text.split(",") if name.strip()]
+    return [] if found == ["none"] else found
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
+    if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
+        raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
+    return int(match[1]), int(match[2])
