@@ -1,0 +1,114 @@
+"""The redundant-view test: what it must tell apart, and that it always says the same."""
+
+import numpy as np
+import pytest
+
+from dudmap.config import SimilarityConfig
+from dudmap.similarity import SimilarityTest
+
+cv2 = pytest.importorskip("cv2")
+
+
+@pytest.fixture(scope="module")
+def scene():
+    """A wide picture of random shapes (480, 1280, 3)."""
+    rng = np.random.default_rng(4)
+    picture = np.full((480, 1280, 3), 120, np.uint8)
+    for _ in range(700):
+        center = tuple(int(x) for x in rng.integers(0, (1280, 480)))
+        color = tuple(int(x) for x in rng.integers(0, 256, 3))
+        axes = tuple(int(x) for x in rng.integers(4, 40, 2))
+        cv2.ellipse(picture, center, axes, float(rng.uniform(0, 180)), 0, 360, color, -1, cv2.LINE_AA)
+    return picture
+
+
+def view(scene, left, noise=0.0, seed=0):
+    part = scene[:, left : left + 640].astype(float)
+    return np.clip(part + np.random.default_rng(seed).normal(0, noise, part.shape), 0, 255).astype(np.uint8)
+
+
+def accepted(image, **config):
+    test = SimilarityTest(SimilarityConfig(**config))
+    test.accept(image)
+    return test
+
+
+def test_nothing_is_redundant_at_first(scene):
+    assert not SimilarityTest().redundant(view(scene, 0))
+
+
+def test_same_view_is_redundant(scene):
+    test = accepted(view(scene, 0, 1, seed=1))
+    assert test.redundant(view(scene, 0, 1, seed=2))
+    assert test.share(view(scene, 0, 1, seed=1)) > 0.97
+
+
+def test_other_views_are_not(scene):
+    test = accepted(view(scene, 0))
+    assert not test.redundant(view(scene, 640))
+    assert not test.redundant(view(scene, 200))
+    shares = [test.share(view(scene, left)) for left in (0, 40, 160, 400, 640)]
+    assert shares == sorted(shares, reverse=True)
+    assert shares[-1] < 0.1
+
+
+def test_accept_moves_on(scene):
+    test = accepted(view(scene, 0))
+    test.accept(view(scene, 640))
+    assert not test.redundant(view(scene, 0))
+    assert test.redundant(view(scene, 640))
+
+
+def test_reduced_image_gives_about_the_share_of_the_full_one(scene):
+    for left, noise in ((3, 3), (20, 2), (150, 2)):
+        first, second = view(scene, 0, noise, 1), view(scene, left, noise, 2)
+        full = accepted(first, image_width=640, max_features=5000)
+        share = full.share(second) ** (1 / 1.4)  # the exponent at full width makes up for the 500 features only
+        assert accepted(first).share(second) == pytest.approx(share, abs=0.15)
+
+
+def test_threshold_counts(scene):
+    first, second = view(scene, 0, 2, 1), view(scene, 60, 2, 2)
+    share = accepted(first).share(second)
+    assert 0.1 < share < 0.95
+    assert accepted(first, threshold=share - 0.01).redundant(second)
+    assert not accepted(first, threshold=share + 0.01).redundant(second)
+
+
+def test_blank_images_are_never_redundant():
+    blank = np.full((480, 640, 3), 90, np.uint8)
+    assert not accepted(blank).redundant(blank)
+
+
+def test_small_images(scene):
+    small = cv2.resize(view(scene, 0), (160, 120), interpolation=cv2.INTER_AREA)
+    assert accepted(small).redundant(small)
+
+
+def test_deterministic_whatever_was_drawn_before(scene):
+    first, second = view(scene, 0, 4, 1), view(scene, 30, 4, 2)
+    shares = set()
+    for seed in range(4):
+        cv2.setRNGSeed(seed)
+        shares.add(accepted(first).share(second))
+    assert len(shares) == 1
+
+
+def test_features_are_computed_once(scene, monkeypatch):
+    test = accepted(view(scene, 0))
+    image = view(scene, 5)
+    test.redundant(image)
+    known = test.features(image)
+    assert test.features(image.copy()) is known
+    test.accept(image)
+    detector = test._detector
+    calls = []
+
+    class Counting:
+        def detectAndCompute(self, *args):
+            calls.append(1)
+            return detector.detectAndCompute(*args)
+
+    test._detector = Counting()
+    test.redundant(view(scene, 9))
+    assert len(calls) == 1  # the accepted frame's features were known
