@@ -1,0 +1,37 @@
+# Needs Python 3.11 to 3.13 as python3, with pip, and nothing else: "make demo" and "make test" set up .venv themselves.
+# The environment is made without its own pip and filled by the system's, since Debian keeps ensurepip in another package.
+
+PYTHON ?= python3
+BIN := .venv/bin
+PIP := $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check
+
+.PHONY: demo test check clean
+
+demo: .venv/installed
+	$(BIN)/dudmap demo
+
+test: .venv/developed check
+	$(BIN)/pytest
+
+check: .venv/developed
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/pyright --pythonpath $(BIN)/python
+
+clean:
+	rm -rf .venv
+
+$(BIN)/python:
+	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
+		{ echo "$(PYTHON) is not Python 3.11 to 3.13; name one that is: make demo PYTHON=python3.12" >&2; exit 1; }
+	@$(PYTHON) -m pip --version >/dev/null 2>&1 || \
+		{ echo "$(PYTHON) has no pip; on Debian: apt install python3-pip" >&2; exit 1; }
+	$(PYTHON) -m venv --without-pip .venv
+
+.venv/installed: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet --editable .
+	@touch $@
+
+.venv/developed: $(BIN)/python pyproject.toml
+	$(PIP) install --quiet --editable '.[dev]'
+	@touch $@ .venv/installed
