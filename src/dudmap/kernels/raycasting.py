@@ -1,0 +1,313 @@
+"""The map seen from a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
+
+Blocks are first splatted into an image of tiles with the nearest and farthest depth at which a surface can lie
+(Prisacariu et al. 2017), so that a ray starts just before the first block it can meet and ends behind the last.
+"""
+
+import numpy as np
+
+from dudmap.kernels.registration import load_corners
+from dudmap.kernels.threads import bands, kernel, run_bands
+
+TILE = 8
+"""Pixels along the edge of a tile."""
+BAND = 16
+"""Image rows of one piece of work."""
+NOWHERE = np.float32(1e9)
+
+
+@kernel
+def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_max, near, far):
+    """Widen the depth ranges of all tiles that the blocks with voxels in planes ``start`` to ``stop`` may cover.
+
+    Args:
+        start, stop: First and last plane of the window.
+        window: (Wx, Wy, Wz) int32.
+        T: (3, 4) float32, block indices of the window to metres in the camera frame; block centres at whole numbers.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        size: (2,) int64 image height and width.
+        radius: Of the sphere around a block, metres.
+        depth_min, depth_max: Limits of the view, metres.
+        near, far: (tiles down, tiles across) float32, in and out.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    rows, columns = near.shape
+    for i in range(start, stop):
+        for j in range(window.shape[1]):
+            line = window[i, j]
+            highest = np.int32(-1)
+            for k in range(line.size):
+                highest = max(highest, line[k])
+            if highest < 0:
+                continue
+            for k in range(line.size):
+                if line[k] < 0:
+                    continue
+                fi, fj, fk = np.float32(i), np.float32(j), np.float32(k)
+                z = T[2, 0] * fi + T[2, 1] * fj + T[2, 2] * fk + T[2, 3]
+                if z + radius < depth_min or z - radius > depth_max:
+                    continue
+                first_row, last_row, first_column, last_column = 0, rows - 1, 0, columns - 1
+                low = z - radius
+                if low > np.float32(0.02):
+                    x = T[0, 0] * fi + T[0, 1] * fj + T[0, 2] * fk + T[0, 3]
+                    y = T[1, 0] * fi + T[1, 1] * fj + T[1, 2] * fk + T[1, 3]
+                    # a point within the radius is seen at most this far from the centre
+                    du = fx * radius * np.sqrt(x * x + z * z) / (z * low) + np.float32(1)
+                    dv = fy * radius * np.sqrt(y * y + z * z) / (z * low) + np.float32(1)
+                    u, v = fx * x / z + cx, fy * y / z + cy
+                    if u + du < 0 or v + dv < 0 or u - du > size[1] or v - dv > size[0]:
+                        continue
+                    first_column = np.int64(max(u - du, np.float32(0))) // TILE
+                    last_column = min(np.int64(u + du) // TILE, columns - 1)
+                    first_row = np.int64(max(v - dv, np.float32(0))) // TILE
+                    last_row = min(np.int64(v + dv) // TILE, rows - 1)
+                for row in range(first_row, last_row + 1):
+                    for column in range(first_column, last_column + 1):
+                        near[row, column] = min(near[row, column], low)
+                        far[row, column] = max(far[row, column], z + radius)
+
+
+@kernel
+def _blend(values, fx, fy, fz):
+    """Trilinear interpolation of eight corner values, corner 4 dx + 2 dy + dz."""
+    a = values[0] + (values[1] - values[0]) * fz
+    b = values[2] + (values[3] - values[2]) * fz
+    c = values[4] + (values[5] - values[4]) * fz
+    d = values[6] + (values[7] - values[6]) * fz
+    low, high = a + (b - a) * fy, c + (d - c) * fy
+    return low + (high - low) * fx
+
+
+@kernel
+def _sample(window, geometry, shape, x, y, z, least, corners, values):
+    """Signed distance in stored steps at lattice point (x, y, z) inside the window; NaN where it is not known."""
+    lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
+    load_corners(window, geometry, np.int64(lx), np.int64(ly), np.int64(lz), corners, 0, shape[1], shape[2])
+    known = True
+    for k in range(8):
+        word = corners[k, 0]
+        known &= ((word >> 8) & 0xFF) >= least
+        values[k] = np.float32(word >> 16)
+    if not known:
+        return np.float32(np.nan)
+    return _blend(values, x - lx, y - ly, z - lz)
+
+
+@kernel
+def _leave(p, d):
+    """Ray parameter from ``p`` to the boundary of its block along one axis."""
+    if d == 0:
+        return NOWHERE
+    block = np.floor(p * np.float32(0.125)) * np.float32(8)
+    return (block + np.float32(8) - p) / d if d > 0 else (block - p) / d
+
+
+@kernel
+def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
+    """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
+
+    Args:
+        window: (Wx * Wy * Wz,) int32; negative entries are skipped as a whole.
+        shape: (3,) int64 blocks of the window.
+        geometry: (slots * 512,) int32.
+        o, d: (3,) float32, voxels, and voxels per metre of depth.
+        t, end: Depths, metres.
+        unit: Voxels per step of the stored distance.
+        least: Smallest trusted weight.
+        corners, values: (8, 1) int32 and (8,) float32 work space.
+    """
+    zero = np.float32(0)
+    speed = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+    nudge = np.float32(1e-2) / speed
+    for axis in range(3):  # stay inside the window
+        last = np.float32(8 * shape[axis] - 1)
+        if d[axis] != zero:
+            a, b = -o[axis] / d[axis], (last - o[axis]) / d[axis]
+            t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
+        elif o[axis] < zero or o[axis] >= last:
+            return np.float32(-1)
+    t_before, before = np.float32(-1), np.float32(-1)
+    while t < end:
+        x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+        bx, by, bz = np.int64(x) >> 3, np.int64(y) >> 3, np.int64(z) >> 3
+        if window[np.uintp((bx * shape[1] + by) * shape[2] + bz)] < 0:
+            t += min(min(_leave(x, d[0]), _leave(y, d[1])), _leave(z, d[2])) + nudge
+            before = np.float32(-1)
+            continue
+        value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
+        if value > zero:
+            t_before, before = t, value
+            t += max(np.float32(0.8) * value, np.float32(0.5)) / speed
+        elif value <= zero:
+            if before > zero:
+                return _refine(window, shape, geometry, o, d, t_before, before, t, value, unit, least, corners, values)
+            t += max(np.float32(-0.8) * value, np.float32(1)) / speed
+        else:
+            before = np.float32(-1)
+            t += np.float32(1) / speed
+    return np.float32(-1)
+
+
+@kernel
+def _refine(window, shape, geometry, o, d, a, at_a, b, at_b, unit, least, corners, values):
+    """Zero between depths ``a`` (outside) and ``b`` (inside) by false position (Illinois variant)."""
+    side = 0
+    t = a + (b - a) * at_a / (at_a - at_b)
+    for _ in range(4):
+        x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
+        value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
+        if np.isnan(value) or abs(value) < np.float32(0.01):
+            break
+        if value > np.float32(0):
+            a, at_a = t, value
+            if side > 0:
+                at_b *= np.float32(0.5)
+            side = 1
+        else:
+            b, at_b = t, value
+            if side < 0:
+                at_a *= np.float32(0.5)
+            side = -1
+        t = a + (b - a) * at_a / (at_a - at_b)
+    return t
+
+
+@kernel
+def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, normal):
+    """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 where it has no slope."""
+    lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
+    ix, iy, iz = np.int64(lx), np.int64(ly), np.int64(lz)
+    fx, fy, fz = x - lx, y - ly, z - lz
+    one = np.float32(1)
+    load_corners(window, geometry, ix, iy, iz, corners, 0, shape[1], shape[2])
+    s0, s1 = np.float32(corners[0, 0] >> 16), np.float32(corners[1, 0] >> 16)
+    s2, s3 = np.float32(corners[2, 0] >> 16), np.float32(corners[3, 0] >> 16)
+    s4, s5 = np.float32(corners[4, 0] >> 16), np.float32(corners[5, 0] >> 16)
+    s6, s7 = np.float32(corners[6, 0] >> 16), np.float32(corners[7, 0] >> 16)
+    wy, wz = one - fy, one - fz
+    wx = one - fx
+    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
+    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
+    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
+    length = np.sqrt(gx * gx + gy * gy + gz * gz)
+    scale = one / length if length > np.float32(0) else np.float32(0)
+    normal[0], normal[1], normal[2] = gx * scale, gy * scale, gz * scale
+    load_corners(window, colors, ix, iy, iz, corners, 0, shape[1], shape[2])
+    for channel in range(3):
+        for k in range(8):
+            values[k] = np.float32((corners[k, 0] >> (20 - 10 * channel)) & 1023)
+        value = _blend(values, fx, fy, fz) * np.float32(0.25) + np.float32(0.5)
+        color[channel] = np.uint8(min(value, np.float32(255)))
+
+
+@kernel
+def _trace(
+    row_start, row_stop, window, shape, geometry, colors, intrinsics, T, near, far, depth_min, depth_max, unit, least,
+    depth, color, normals,
+):  # fmt: skip
+    """Fill pixel rows ``row_start`` to ``row_stop`` of a view; see ``raycast``.
+
+    ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the window.
+    """
+    corners = np.empty((8, 1), np.int32)
+    values = np.empty(8, np.float32)
+    o = T[:, 3].copy()
+    d = np.empty(3, np.float32)
+    for v in range(row_start, row_stop):
+        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
+        for u in range(depth.shape[1]):
+            start = max(near[v // TILE, u // TILE], depth_min)
+            end = min(far[v // TILE, u // TILE], depth_max)
+            t = np.float32(-1)
+            if start < end:
+                x = (np.float32(u) - intrinsics[2]) / intrinsics[0]
+                for axis in range(3):
+                    d[axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2]
+                t = _find(window, shape, geometry, o, d, start, end, unit, least, corners, values)
+            if t > np.float32(0) and t <= depth_max:
+                depth[v, u] = t
+                _shade(
+                    window, shape, geometry, colors, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2],
+                    corners, values, color[v, u], normals[v, u],
+                )  # fmt: skip
+            else:
+                depth[v, u] = 0
+                color[v, u, :] = 0
+                normals[v, u, :] = 0
+
+
+def raycast(
+    window,
+    window_origin,
+    geometry,
+    colors,
+    voxel_size,
+    sdf_unit,
+    T_world_camera,
+    camera,
+    depth_min,
+    depth_max,
+    min_weight,
+):
+    """Depth, colour and normals of the first surface that each pixel of a camera sees.
+
+    A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes from
+    unknown space straight to the inside, there is none.
+
+    Args:
+        window: (Wx, Wy, Wz) int32, slots of the blocks; negative = no voxels.
+        window_origin: (3,) int32, block coordinates of the window's first block.
+        geometry: (num_slots, 512) int32, packed voxels.
+        colors: (num_slots, 512) int32, packed colours.
+        voxel_size: Metres.
+        sdf_unit: Metres per step of the stored distance.
+        T_world_camera: (4, 4) float64.
+        camera: Camera of the view.
+        depth_min, depth_max: Limits of the depth, metres.
+        min_weight: Smallest weight of a trusted voxel (at least 1).
+
+    Returns:
+        depth (H, W) float32 metres, 0 = no surface; color (H, W, 3) uint8; normals (H, W, 3) float32, world frame,
+        unit length, 0 where there is no surface.
+    """
+    shape = np.array(window.shape, dtype=np.int64)
+    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
+    low, high = np.float32(depth_min), np.float32(depth_max)
+    corner = 8 * voxel_size * np.asarray(window_origin, dtype=np.float64)  # of the window, world frame
+    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    to_camera = np.empty((3, 4), dtype=np.float32)
+    to_camera[:, :3] = rotation.T * (8 * voxel_size)
+    to_camera[:, 3] = rotation.T @ (corner + 4 * voxel_size - position)
+    to_lattice = np.empty((3, 4), dtype=np.float32)
+    to_lattice[:, :3] = rotation / voxel_size
+    to_lattice[:, 3] = (position - corner) / voxel_size
+
+    tiles = (-(-camera.height // TILE), -(-camera.width // TILE))
+    ranges = bands(len(window), -(-len(window) // 8))
+    nears = np.full((len(ranges), *tiles), NOWHERE, dtype=np.float32)
+    fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
+    size = np.array(camera.shape, dtype=np.int64)
+    radius = np.float32(4 * np.sqrt(3) * voxel_size)
+    run_bands(
+        lambda start, stop, near, far: _splat(
+            start, stop, window, to_camera, intrinsics, size, radius, low, high, near, far
+        ),
+        ranges,
+        nears,
+        fars,
+    )
+    near, far = nears.min(axis=0), fars.max(axis=0)
+
+    depth = np.empty(camera.shape, dtype=np.float32)
+    color = np.empty((*camera.shape, 3), dtype=np.uint8)
+    normals = np.empty((*camera.shape, 3), dtype=np.float32)
+    flat, unit, least = window.reshape(-1), np.float32(sdf_unit / voxel_size), max(int(min_weight), 1)
+    run_bands(
+        lambda start, stop: _trace(
+            start, stop, flat, shape, geometry.reshape(-1), colors.reshape(-1), intrinsics, to_lattice, near, far,
+            low, high, unit, least, depth, color, normals,
+        ),
+        bands(camera.height, BAND),
+    )  # fmt: skip
+    return depth, color, normals
