@@ -12,7 +12,7 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
-from dudmap.kernels import hashing, integration
+from dudmap.kernels import hashing, integration, meshing, raycasting
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 
