@@ -249,7 +249,14 @@ PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
         "volume": {"voxel_size": 0.01, "truncation_noise": 0.0, "weighting": "constant"},
-        "tracker": {"huber": 0.01, "damping": 0.02, "color_weight": 0.1325, "noise_weighting": False, "exposure": False, "stop": 1e-3},
+        "tracker": {
+            "huber": 0.01,
+            "damping": 0.02,
+            "color_weight": 0.1325,
+            "noise_weighting": False,
+            "exposure": False,
+            "stop": 1e-3,
+        },
         "similarity": {"threshold": 0.84},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False},

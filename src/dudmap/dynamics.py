@@ -33,7 +33,10 @@ class Mixture:
         """Densities (2, ...) of both components, priors included."""
         r = np.asarray(residual, dtype=np.float64)
         return np.stack(
-            [p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2) for p, s in zip(self.prior, self.sigma, strict=True)]
+            [
+                p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2)
+                for p, s in zip(self.prior, self.sigma, strict=True)
+            ]
         )
 
 
@@ -107,16 +110,19 @@ class DynamicDetector:
         near = sample.place == SURFACE
         evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
         noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
-        evidence[near & (np.abs(sample.distance) < noise)] += 3  # eq. 4.57: below the noise nothing is called motion
-        evidence[near & (sample.distance < 0)] = np.maximum(evidence[near & (sample.distance < 0)], 0)
+        fits = near & (np.abs(sample.distance) < noise)  # eq. 4.57: below the noise nothing is called motion
+        evidence[fits] = np.maximum(evidence[fits], 1)
+        behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
+        evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
             evidence[sample.place == FREE] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         if self.config.regions:
-            dynamic = self._regions(dynamic, evidence, level, tolerance)
-        probability = np.where(dynamic, np.float32(0), probability)
-        return Labels(probability.astype(np.float32), dynamic, mixture, histogram, sample)
+            dynamic = self._regions(_solid(dynamic) | (dynamic & (sample.place == FREE)), evidence, level, tolerance)
+            # what is no region fits the map badly for another reason: the robust weights deal with it
+            probability = np.where(dynamic, np.float32(0), np.float32(1))
+        return Labels(probability, dynamic, mixture, histogram, sample)
 
     def _sigma(self, depth: NDArray[np.float32], volume: TsdfVolume) -> NDArray[np.float32]:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
@@ -149,6 +155,13 @@ class DynamicDetector:
         tolerance = np.float32(0.007 / scale) * level.depth
         labeling.grow(core & (level.depth > 0), everywhere, level.depth, tolerance, labels)
         return cv2.dilate((labels > 0).astype(np.uint8), _ellipse(10 * scale)) > 0
+
+
+def _solid(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask without what is thinner than three pixels: the seams along depth edges, where readings fit no map."""
+    import cv2
+
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:

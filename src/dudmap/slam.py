@@ -67,9 +67,7 @@ class Slam:
         self.config = config or Config()
         self.preprocess = Preprocessor(camera, self.config.preprocess)
         self.camera = self.preprocess.camera
-        self.volume = TsdfVolume(
-            self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max
-        )
+        self.volume = TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
         self.tracker = Tracker(self.config.tracker, self.config.sensor)
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
@@ -106,9 +104,7 @@ class Slam:
             if self.config.tracker.second_pass:
                 with clock("track_again"):
                     weights = self._weights(labels, self._tracked(levels))
-                    tracked = self.tracker.align(
-                        self.volume, self._tracked(levels), tracked.T_world_camera, weights
-                    )
+                    tracked = self.tracker.align(self.volume, self._tracked(levels), tracked.T_world_camera, weights)
                 with clock("label"):
                     labels = self._detect(levels, tracked)
         reason = tracked.reason or self.motion.implausible(frame.timestamp, tracked.T_world_camera)

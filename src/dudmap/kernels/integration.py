@@ -134,7 +134,21 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
 
 @kernel
 def integrate(
-    start, stop, slots, coords, T, intrinsics, size, depth, near, colors, weights, map_geometry, map_colors, voxel, state
+    start,
+    stop,
+    slots,
+    coords,
+    T,
+    intrinsics,
+    size,
+    depth,
+    near,
+    colors,
+    weights,
+    map_geometry,
+    map_colors,
+    voxel,
+    state,
 ):
     """Fuse one frame into blocks ``slots[start:stop]`` (eq. 4.18-4.23).
 
@@ -388,14 +402,7 @@ def sample_map(
             gy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
             gz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
             ix, iy, iz = np.int64(np.floor(gx)), np.int64(np.floor(gy)), np.int64(np.floor(gz))
-            if (
-                ix < 0
-                or iy < 0
-                or iz < 0
-                or ix >= shape[0] * 8 - 1
-                or iy >= shape[1] * 8 - 1
-                or iz >= shape[2] * 8 - 1
-            ):
+            if ix < 0 or iy < 0 or iz < 0 or ix >= shape[0] * 8 - 1 or iy >= shape[1] * 8 - 1 or iz >= shape[2] * 8 - 1:
                 continue
             slot = window[((ix >> 3) * shape[1] + (iy >> 3)) * shape[2] + (iz >> 3)]
             if slot < 0:

@@ -27,10 +27,14 @@ class Sequence(Protocol):
         ground_truth: True camera poses, if known; for scoring only.
     """
 
-    name: str
-    camera: "Camera"
-    timestamps: NDArray[np.float64]
-    ground_truth: "Trajectory | None"
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def camera(self) -> "Camera": ...  # noqa: D102
+    @property
+    def timestamps(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def ground_truth(self) -> "Trajectory | None": ...  # noqa: D102
 
     def __len__(self) -> int:
         """Number of frames."""

@@ -17,9 +17,8 @@ def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]
     weights = np.exp(-0.5 * (np.arange(-reach, reach + 1) / width) ** 2)
     weights /= weights.sum()
     padded = np.pad(values, [(reach, reach)] + [(0, 0)] * (values.ndim - 1), mode="edge")
-    return np.stack(
-        [np.convolve(column, weights, mode="valid") for column in padded.reshape(len(padded), -1).T], axis=1
-    ).reshape(values.shape)
+    columns = [np.convolve(column, weights, mode="valid") for column in padded.reshape(len(padded), -1).T]
+    return np.asarray(np.stack(columns, axis=1), dtype=np.float64).reshape(values.shape)
 
 
 class Track:

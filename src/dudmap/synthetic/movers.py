@@ -111,8 +111,9 @@ def shifted(line: Line, shift: float, reverse: bool = False) -> Line:
     """The line moved by ``shift`` metres to its left, turned round with ``reverse``."""
     a, b = np.asarray(line[0]), np.asarray(line[1])
     normal = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
-    ends = [tuple(map(float, end + shift * normal)) for end in (a, b)]
-    return (ends[1], ends[0]) if reverse else (ends[0], ends[1])
+    (ax, ay), (bx, by) = (end + shift * normal for end in (a, b))
+    start, end = (float(ax), float(ay)), (float(bx), float(by))
+    return (end, start) if reverse else (start, end)
 
 
 def _figure(staging: Staging, outfit: int, speed: float) -> Figure:

@@ -176,7 +176,8 @@ class SyntheticSequence:
         frames = np.unique(np.linspace(0, len(self) - 1, min(len(self), 120)).astype(int))
         shots = ((self.ground_truth.Ts_world_camera[index], self.exact_depth(index)) for index in frames)
         counts = count_views(mesh, self.camera, shots, reach, model.grazing if model else 0.1)
-        return with_faces(mesh, (counts >= min(views, len(frames)))[mesh.faces].all(axis=1))
+        enough = counts >= min(views, len(frames))
+        return with_faces(mesh, np.all(enough[mesh.faces], axis=1))
 
     def _number(self, index: int) -> int:
         number = index + len(self) if index < 0 else index

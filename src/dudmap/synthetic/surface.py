@@ -116,7 +116,7 @@ def _colors(primitive: Primitive, local: Points, normals: Points, detail: float,
     axis = np.abs(normals).argmax(axis=1)
     s = np.where(axis == 0, local[:, 1], local[:, 0])
     w = np.where(axis == 2, -local[:, 1], -local[:, 2])
-    side = np.choose(axis, [0.37 * np.sign(normals[:, 0]), 0.71 * np.sign(normals[:, 1]), 0.0])
+    side = np.where(axis == 0, 0.37 * np.sign(normals[:, 0]), np.where(axis == 1, 0.71 * np.sign(normals[:, 1]), 0.0))
     u = s * material.scale[0] + material.offset[0] + side * float(material.faces)
     v = w * material.scale[1] + material.offset[1]
     level = int(np.clip(np.log2(max(detail * max(material.scale) * SIZE, 1.0)), 0, LEVELS - 1))
