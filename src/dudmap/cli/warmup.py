@@ -1,0 +1,72 @@
+"""``dudmap warmup``: compile every kernel and leave it in the cache."""
+
+import time
+from collections.abc import Callable
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def warmup(
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+) -> None:
+    """Compile all kernels now, so that the first run starts at once.
+
+    Runs a tiny synthetic recording through every part of the system; what is compiled stays on disk.
+    """
+    from rich.console import Console
+
+    console = Console(stderr=True, quiet=quiet)
+    start = time.perf_counter()
+    for name, step in steps():
+        with console.status(name):
+            begin = time.perf_counter()
+            step()
+        console.print(f"{name}: {time.perf_counter() - begin:.1f} s", highlight=False)
+    console.print(f"ready after {time.perf_counter() - start:.1f} s", highlight=False)
+
+
+def steps() -> list[tuple[str, Callable[[], object]]]:
+    """Name and action of every part that has kernels; a later one builds on what an earlier one left."""
+    import tempfile
+    from pathlib import Path
+
+    from dudmap.config import Config
+    from dudmap.slam import Slam
+    from dudmap.synthetic import sequence
+    from dudmap.synthetic.recording import DEFAULT_CAMERA
+    from dudmap.volume import TsdfVolume
+
+    camera = DEFAULT_CAMERA.resized(160, 120)
+    recording = sequence(frames=4, camera=camera, start_dynamic=True)
+    frames = []
+    small = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
+    slam = Slam(camera, Config().override(small))
+
+    def render() -> None:
+        frames.extend(recording[index] for index in range(len(recording)))
+
+    def process(system: Slam) -> None:
+        for frame in frames:
+            system.process(frame)
+
+    def process_variants() -> None:
+        for variant in ("preset=thesis", "dynamics.method=threshold", "tracker.robust=tukey"):
+            process(Slam(camera, Config().override([variant, *small])))
+
+    def save_and_load() -> None:
+        with tempfile.TemporaryDirectory() as folder:
+            slam.volume.save(Path(folder) / "map.npz")
+            TsdfVolume.load(Path(folder) / "map.npz")
+
+    return [
+        ("synthetic frames", render),
+        ("tracking, labels and map", lambda: process(slam)),
+        ("variants of the method", process_variants),
+        ("mesh", lambda: slam.volume.extract_mesh()),
+        ("view", lambda: slam.volume.raycast(slam.trajectory.Ts_world_camera[-1], camera)),
+        ("map file", save_and_load),
+    ]
