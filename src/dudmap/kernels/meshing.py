@@ -11,7 +11,7 @@ import numpy as np
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.kernels.threads import bands, kernel, run_bands
 
-BAND = 128
+BAND = 256
 """Blocks of one piece of work."""
 CLOSEST = np.float32(1e-3)
 """Vertices keep this distance from the voxels, as a share of the edge: where sdf is 0 at a voxel, the vertices of the

@@ -14,6 +14,8 @@ TILE = 8
 BAND = 16
 """Image rows of one piece of work."""
 NOWHERE = np.float32(1e9)
+FAR = np.float32(2)
+"""Distance from the surface, voxels, at which the nearest voxel's value is good enough."""
 
 
 @kernel
@@ -95,17 +97,17 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
 
 
 @kernel
-def _leave(p, d):
+def _leave(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
-    if d == 0:
-        return NOWHERE
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
-    return (block + np.float32(8) - p) / d if d > 0 else (block - p) / d
+    return (block + np.float32(8) - p) * inverse if d > np.float32(0) else (block - p) * inverse
 
 
 @kernel
 def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
     """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
+
+    Far from the surface one voxel tells how far to go; only within FAR of it the field is interpolated.
 
     Args:
         window: (Wx * Wy * Wz,) int32; negative entries are skipped as a whole.
@@ -117,9 +119,11 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
         least: Smallest trusted weight.
         corners, values: (8, 1) int32 and (8,) float32 work space.
     """
-    zero = np.float32(0)
-    speed = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
-    nudge = np.float32(1e-2) / speed
+    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], d[0], d[1], d[2]
+    speed = np.sqrt(dx * dx + dy * dy + dz * dz)
+    per_voxel = one / speed
+    nudge = np.float32(1e-2) * per_voxel
     for axis in range(3):  # stay inside the window
         last = np.float32(8 * shape[axis] - 1)
         if d[axis] != zero:
@@ -127,26 +131,42 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
             t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
         elif o[axis] < zero or o[axis] >= last:
             return np.float32(-1)
-    t_before, before = np.float32(-1), np.float32(-1)
+    rx = one / dx if dx != zero else NOWHERE
+    ry = one / dy if dy != zero else NOWHERE
+    rz = one / dz if dz != zero else NOWHERE
+    size_y, size_z = shape[1], shape[2]
+    t_before, before = -one, -one
     while t < end:
-        x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]
-        bx, by, bz = np.int64(x) >> 3, np.int64(y) >> 3, np.int64(z) >> 3
-        if window[np.uintp((bx * shape[1] + by) * shape[2] + bz)] < 0:
-            t += min(min(_leave(x, d[0]), _leave(y, d[1])), _leave(z, d[2])) + nudge
-            before = np.float32(-1)
+        x, y, z = ox + t * dx, oy + t * dy, oz + t * dz
+        i, j, k = np.int64(x + half), np.int64(y + half), np.int64(z + half)
+        slot = window[np.uintp(((i >> 3) * size_y + (j >> 3)) * size_z + (k >> 3))]
+        if slot < 0:
+            steps = min(_leave(x + half, dx, rx), _leave(y + half, dy, ry))
+            t += min(steps, _leave(z + half, dz, rz)) + nudge
+            before = -one
+            continue
+        word = geometry[np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
+        if ((word >> 8) & 0xFF) < least:
+            before = -one
+            t += per_voxel
+            continue
+        value = np.float32(word >> 16) * unit
+        if value > FAR:
+            t_before, before = t, value
+            t += (value - one) * per_voxel
             continue
         value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
         if value > zero:
             t_before, before = t, value
-            t += max(np.float32(0.8) * value, np.float32(0.5)) / speed
+            t += max(np.float32(0.8) * value, half) * per_voxel
         elif value <= zero:
             if before > zero:
                 return _refine(window, shape, geometry, o, d, t_before, before, t, value, unit, least, corners, values)
-            t += max(np.float32(-0.8) * value, np.float32(1)) / speed
+            t += max(np.float32(-0.8) * value, one) * per_voxel
         else:
-            before = np.float32(-1)
-            t += np.float32(1) / speed
-    return np.float32(-1)
+            before = -one
+            t += per_voxel
+    return -one
 
 
 @kernel
