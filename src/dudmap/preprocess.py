@@ -109,7 +109,8 @@ class Preprocessor:
 
         assert self._maps is not None
         straight = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        return straight, cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        color = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
 
     def _fill(self, depth: NDArray[np.float32], out: NDArray[np.float32]) -> None:
         if not self.config.fill_holes:
@@ -161,4 +162,5 @@ def _undistortion(camera: Camera) -> tuple[NDArray[np.int16], NDArray[np.uint16]
 
     coefficients = np.array(camera.distortion, dtype=np.float64)
     size = (camera.width, camera.height)
-    return cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_16SC2)
+    where, between = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_16SC2)
+    return np.asarray(where, dtype=np.int16), np.asarray(between, dtype=np.uint16)

@@ -75,7 +75,7 @@ class SimilarityTest:
         import cv2
 
         if self._detector is None:
-            self._detector = cv2.SIFT_create(nfeatures=self.config.max_features)
+            self._detector = cv2.SIFT.create(nfeatures=self.config.max_features)
         _, descriptors = self._detector.detectAndCompute(image, None)
         if descriptors is None:
             descriptors = np.empty((0, 128), dtype=np.float32)
@@ -86,12 +86,12 @@ class SimilarityTest:
     def _reduced(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
         import cv2
 
-        grey = cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY)
+        grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
         width = self.config.image_width
         if width >= grey.shape[1]:
             return grey
         height = max(1, round(grey.shape[0] * width / grey.shape[1]))
-        return cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA)
+        return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _good_matches(self, last: NDArray[np.float32], new: NDArray[np.float32]) -> int:
         """Features of ``last`` whose best match in ``new`` is clearly better than the second best (Lowe 2004).
