@@ -206,7 +206,7 @@ def _carrier(staging: Staging, put_down: bool) -> list[Mover]:
 
 def _ball(staging: Staging) -> list[Mover]:
     scene, size = staging.scene, staging.scene.mover_scale
-    radius, speed = 0.16 * size, staging.pace(0.8)
+    radius, speed = 0.2 * size, staging.pace(0.8)
     track = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=speed)
 
     def reference(t: float) -> Matrix:
