@@ -108,8 +108,9 @@ class Preprocessor:
         import cv2
 
         assert self._maps is not None
-        straight = cv2.remap(depth, *self._maps, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
-        color = cv2.remap(rgb, *self._maps, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        nearest, between = self._maps
+        straight = cv2.remap(depth, *nearest, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        color = cv2.remap(rgb, *between, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
 
     def _fill(self, depth: NDArray[np.float32], out: NDArray[np.float32]) -> None:
@@ -156,11 +157,16 @@ def _halved(
     return small
 
 
-def _undistortion(camera: Camera) -> tuple[NDArray[np.int16], NDArray[np.uint16]]:
-    """Fixed-point maps of cv2.remap from the undistorted image into the distorted one."""
+def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
+    """Map pairs of cv2.remap from the undistorted image into the distorted one: to the nearest pixel, between pixels.
+
+    The fixed-point map of the interpolation cannot serve both: without its fractions it rounds down, half a pixel off.
+    """
     import cv2
 
     coefficients = np.array(camera.distortion, dtype=np.float64)
     size = (camera.width, camera.height)
-    where, between = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_16SC2)
-    return np.asarray(where, dtype=np.int16), np.asarray(between, dtype=np.uint16)
+    u, v = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_32FC1)
+    nearest, _ = cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=True)
+    whole, fraction = cv2.convertMaps(u, v, cv2.CV_16SC2)
+    return (np.asarray(nearest), np.empty(0, np.uint16)), (np.asarray(whole), np.asarray(fraction))
