@@ -210,6 +210,51 @@ def test_untrusted_and_missing_blocks_make_a_border():
     assert len(np.unique(part[1])) == len(part[0])
 
 
+def triangle_soup(vertices, faces):
+    """Sorted triangles (F, 9), each starting with its smallest corner: equal for equal surfaces."""
+    corners = vertices[faces]
+    turned = np.stack([np.roll(corners, -k, axis=1).reshape(-1, 9) for k in range(3)])
+    smallest = np.array([min(map(tuple, turned[:, n])) for n in range(turned.shape[1])])
+    return smallest[np.lexsort(smallest.T)]
+
+
+def test_chunks_make_up_the_whole():
+    rng = np.random.default_rng(3)
+    sdf = rng.uniform(-1, 1, (24, 24, 24))
+    weight = rng.choice([0, 9], sdf.shape, p=[0.03, 0.97])
+    arrays = blocks_of(sdf, weight, 100 + 0 * weight)
+    whole = meshing.extract(*arrays, 0.01, UNIT, 3)
+    _, _, slots, coords, _ = arrays
+    chunks = coords[slots] @ np.array([1, 0, 1])  # 0 to 4
+    parts = meshing.extract_chunks(*arrays, 0.01, UNIT, 3, chunks)
+    assert len(parts) == 5
+    for vertices, faces, _, normals in parts:
+        assert np.array_equal(np.unique(faces), np.arange(len(vertices)))
+        assert len(np.unique(vertices, axis=0)) == len(vertices)
+        assert len(normals) == len(vertices)
+    soups = np.concatenate([part[0][part[1]].reshape(-1, 3, 3) for part in parts])
+    joined = triangle_soup(soups.reshape(-1, 3), np.arange(3 * len(soups)).reshape(-1, 3))
+    assert np.array_equal(joined, triangle_soup(*whole[:2]))
+
+
+def test_changed_chunk_alone_equals_the_same_chunk_of_all():
+    """A chunk's mesh needs its own blocks and those at +(dx, dy, dz); all others may be left out."""
+    rng = np.random.default_rng(8)
+    sdf = rng.uniform(-1, 1, (32, 32, 32))
+    geometry, colors, slots, coords, neighbours = blocks_of(sdf, 9 + 0 * sdf, 100 + 0 * sdf)
+    places = coords[slots]
+    chunks = (places // 2) @ np.array([4, 2, 1])
+    parts = meshing.extract_chunks(geometry, colors, slots, coords, neighbours, 0.01, UNIT, 3, chunks)
+    wanted = 2  # blocks (0..1, 2..3, 0..1)
+    needed = np.all((places >= [0, 2, 0]) & (places <= [2, 4, 2]), axis=1)
+    only = np.where(chunks == wanted, 0, -1)[needed]
+    alone = meshing.extract_chunks(
+        geometry, colors, slots[needed], coords, neighbours[needed], 0.01, UNIT, 3, only
+    )  # fmt: skip
+    assert len(alone) == 1
+    assert np.array_equal(triangle_soup(*alone[0][:2]), triangle_soup(*parts[wanted][:2]))
+
+
 def test_nothing_to_mesh():
     vertices, faces, colors, normals = extracted(np.ones((16, 16, 16)))
     assert (len(vertices), len(faces), len(colors), len(normals)) == (0, 0, 0, 0)
@@ -217,6 +262,10 @@ def test_nothing_to_mesh():
     geometry = np.zeros((4, 512), np.int32)
     result = meshing.extract(geometry, geometry, empty[:, 0], np.zeros((4, 3), np.int32), empty, 0.01, UNIT, 1)
     assert [len(part) for part in result] == [0, 0, 0, 0]
+    assert (
+        meshing.extract_chunks(geometry, geometry, empty[:, 0], geometry[:, :3], empty, 0.01, UNIT, 1, empty[:, 0])
+        == []
+    )
 
 
 def test_deterministic():

@@ -227,23 +227,23 @@ def fit_exposure(
         difference: (h, w) float32 map minus image, NaN off the map.
         weights: (h, w) float32 static weights.
     """
-    used = np.isfinite(difference) & (weights > 0.5)
-    if np.count_nonzero(used) < 100:
+    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
+    if len(used) < 100:
         return 1.0, 0.0
-    x = intensity[used].astype(np.float64)
-    y = x + difference[used]
+    used = used[:: max(1, len(used) // 2000)]  # two thousand pixels tell two numbers
+    x = intensity.reshape(-1)[used].astype(np.float64)
+    y = x + difference.reshape(-1)[used]
     gain, offset = 1.0, float(np.median(y - x))
-    mean = x.mean()
     for _ in range(5):  # iteratively reweighted least squares, Cauchy weights
         error = y - gain * x - offset
         scale = max(1.5 * float(np.median(np.abs(error))), 0.01)
         w = 1 / (1 + (error / scale) ** 2)
+        total = w.sum()
         # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
-        prior = 0.1 * w.sum() * 0.04
-        sw, swx, swy = w.sum(), w @ x, w @ y
-        sxx, sxy = w @ (x - mean) ** 2 + prior, w @ ((x - mean) * y) + prior
-        sx = swx - mean * sw
-        gain = (sxy - sx * swy / sw) / (sxx - sx * sx / sw)
-        gain = float(np.clip(gain, 0.5, 2.0))
-        offset = float((swy - gain * swx) / sw)
+        prior = 0.1 * total * 0.04
+        x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
+        variance = (w * (x - x_mean) ** 2).sum() + prior
+        covariance = (w * (x - x_mean) * (y - y_mean)).sum() + prior
+        gain = float(np.clip(covariance / variance, 0.5, 2.0))
+        offset = float(y_mean - gain * x_mean)
     return gain, offset

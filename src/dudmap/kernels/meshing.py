@@ -37,7 +37,7 @@ def _corner_words(geometry, near, row, words):
 
 @kernel
 def _classify(start, stop, geometry, near, min_weight, triangle_count, cases):
-    """Case of each cell of blocks ``start`` to ``stop``, 0 where there is no surface or a corner is not trusted.
+    """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or a trusted corner keep their 0.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -72,8 +72,6 @@ def _classify(start, stop, geometry, near, min_weight, triangle_count, cases):
                         case = 0 if bad != 0 or case == 255 else case
                         cases[row, (i * 8 + j) * 8 + k] = case
                         total += np.int64(triangle_count[case])
-        else:
-            cases[row, :] = 0
         count[row - start] = total
     return count
 
@@ -187,7 +185,7 @@ def _write_vertices(
     start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, begin, voxel_size,
     first, vertices, vertex_colors, normals,
 ):  # fmt: skip
-    """Position, colour and normal of each vertex; ``first`` gets the number of the first vertex of each voxel."""
+    """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex, counted in its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
     half = np.float32(0.5)
@@ -199,7 +197,7 @@ def _write_vertices(
         slot = slots[row]
         for n in range(512):
             flag = flags[row, n]
-            first[row, n] = number
+            first[row, n] = number - begin[row]
             if flag == 0:
                 continue
             x, y, z = n >> 6, (n >> 3) & 7, n & 7
@@ -239,7 +237,7 @@ def _write_vertices(
 
 
 @kernel
-def _write_faces(start, stop, near, row_of, cases, flags, first, begin, triangle_count, triangles, faces):
+def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, begin, triangle_count, triangles, faces):
     """Triangles of the cells of blocks ``start`` to ``stop`` as numbers of vertices."""
     for row in range(start, stop):
         number = begin[row]
@@ -258,7 +256,8 @@ def _write_faces(start, stop, near, row_of, cases, flags, first, begin, triangle
                     owner = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (m >> 3)]])
                 voxel = ((i & 7) * 8 + (j & 7)) * 8 + (m & 7)
                 below = flags[owner, voxel] & ((1 << axis) - 1)
-                faces[number + k // 3, k % 3] = first[owner, voxel] + (below & 1) + (below >> 1)
+                vertex = first_vertex[owner] + np.int64(first[owner, voxel]) + (below & 1) + (below >> 1)
+                faces[number + k // 3, k % 3] = vertex
             number += np.int64(triangle_count[case])
 
 
@@ -274,6 +273,35 @@ def _link(slots, near, row_of, behind):
             slot = near[row, m]
             if slot >= 0 and row_of[slot] >= 0:
                 behind[row_of[slot], m] = row
+
+
+@kernel
+def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
+    """Give each chunk its own vertices: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
+
+    Args:
+        begin: (chunks + 1,) int64.
+        num_vertices: Of all chunks together, each counted once.
+        faces: (F, 3) int32.
+        vertex_ids: (>= sum of the chunks' vertices,) int32 out: the shared vertex that each vertex is a copy of.
+        local_faces: (F, 3) int32 out, vertices counted within the chunk.
+        first_vertex: (chunks + 1,) int64 out, into ``vertex_ids``.
+    """
+    known_in = np.full(num_vertices, -1, np.int32)
+    local = np.empty(num_vertices, np.int32)
+    total = 0
+    for chunk in range(len(begin) - 1):
+        first_vertex[chunk] = total
+        for face in range(begin[chunk], begin[chunk + 1]):
+            for k in range(3):
+                vertex = faces[face, k]
+                if known_in[vertex] != chunk:
+                    known_in[vertex] = chunk
+                    local[vertex] = total - first_vertex[chunk]
+                    vertex_ids[total] = vertex
+                    total += 1
+                local_faces[face, k] = local[vertex]
+    first_vertex[len(begin) - 1] = total
 
 
 def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight):
@@ -293,28 +321,63 @@ def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, m
         vertices (V, 3) float32 metres, faces (F, 3) int32 counter-clockwise seen from free space, colors (V, 3) uint8,
         normals (V, 3) float32 unit length, pointing to free space. No vertex occurs twice or without a triangle.
     """
+    return _surface(geometry, colors, slots, coords, neighbours, voxel_size, min_weight, len(slots))[:4]
+
+
+def extract_chunks(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, chunks):
+    """Meshes of groups of blocks that share no vertices, so that each can be replaced when its blocks change.
+
+    Args:
+        geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight: As in ``extract``.
+        chunks: (n,) int chunk of each block, counted from 0; -1 for blocks that only lend their voxels. A mesh is
+            complete if the up to seven blocks at +(dx, dy, dz) from each of its blocks are among ``slots``.
+
+    Returns:
+        One tuple (vertices, faces, colors, normals) as of ``extract`` per chunk.
+    """
+    num_chunks = int(chunks.max(initial=-1)) + 1
+    order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
+    per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
+    vertices, faces, vertex_colors, normals, first_face = _surface(
+        geometry, colors, slots[order], coords, neighbours[order], voxel_size, min_weight, int(per_chunk.sum())
+    )
+    begin = first_face[_begins([per_chunk])]
+    ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
+    first = np.empty(num_chunks + 1, dtype=np.int64)
+    _split(begin, len(vertices), faces, ids, local_faces, first)
+    out = []
+    for chunk in range(num_chunks):
+        own = ids[first[chunk] : first[chunk + 1]]
+        out.append((vertices[own], local_faces[begin[chunk] : begin[chunk + 1]], vertex_colors[own], normals[own]))
+    return out
+
+
+def _surface(geometry, colors, slots, coords, neighbours, voxel_size, min_weight, num_meshed):
+    """``extract`` for the cells of the first ``num_meshed`` blocks; and the first face (n + 1,) of each block."""
     n = len(slots)
     slots = np.ascontiguousarray(slots, dtype=np.int32)
     row_of = np.empty(len(geometry), dtype=np.int32)
     behind = np.empty((n, 8), dtype=np.int32)
     near = np.ascontiguousarray(neighbours, dtype=np.int32)
     _link(slots, near, row_of, behind)
-    # a block that is not meshed does not exist here
+    # a block that is not among the slots does not exist here
     near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))
     ranges = bands(n, BAND)
-    cases = np.empty((n, 512), dtype=np.uint8)
+    cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.empty((n, 512), dtype=np.uint8)
     least = max(int(min_weight), 1)
     triangles = run_bands(
-        lambda start, stop: _classify(start, stop, geometry, near, least, TRIANGLE_COUNT, cases), ranges
+        lambda start, stop: _classify(start, stop, geometry, near, least, TRIANGLE_COUNT, cases),
+        bands(num_meshed, BAND),
     )
     owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
-    first_face, first_vertex = _begins(triangles), _begins(owned)
+    first_face = _begins([*triangles, np.zeros(n - num_meshed)])
+    first_vertex = _begins(owned)
     vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
     vertex_colors = np.empty((first_vertex[-1], 3), dtype=np.uint8)
     normals = np.empty((first_vertex[-1], 3), dtype=np.float32)
     faces = np.empty((first_face[-1], 3), dtype=np.int32)
-    first = np.empty((n, 512), dtype=np.int32)
+    first = np.empty((n, 512), dtype=np.uint16)
     run_bands(
         lambda start, stop: _write_vertices(
             start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, first_vertex,
@@ -324,11 +387,11 @@ def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, m
     )  # fmt: skip
     run_bands(
         lambda start, stop: _write_faces(
-            start, stop, near, row_of, cases, flags, first, first_face, TRIANGLE_COUNT, TRIANGLES, faces
+            start, stop, near, row_of, cases, flags, first_vertex, first, first_face, TRIANGLE_COUNT, TRIANGLES, faces
         ),
-        ranges,
+        bands(num_meshed, BAND),
     )
-    return vertices, faces, vertex_colors, normals
+    return vertices, faces, vertex_colors, normals, first_face
 
 
 def _begins(counts):
