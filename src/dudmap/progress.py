@@ -36,7 +36,7 @@ class RunProgress:
             console=self.console,
             disable=not (bar and self.console.is_terminal),
         )
-        self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="")
+        self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="starting")
         self._times: deque[float] = deque(maxlen=30)
         self._lost = 0
 
