@@ -144,6 +144,8 @@ def test_frames_arrive_in_order_and_no_more_than_wanted(slam, recording, tmp_pat
     assert report.metrics["frames"] == 6
     assert len(list(read_ahead(open_sequence(recording), 2))) == 2
     assert list(read_ahead(open_sequence(recording), 0)) == []
+    with pytest.raises(DatasetError, match="desk has 8 frames and 0 are wanted"):
+        go(recording, tmp_path / "none", max_frames=0)
 
 
 def test_masks_are_written_and_scored(slam, recording, tmp_path):

@@ -104,9 +104,12 @@ def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
     """Absolute and relative trajectory error against the ground truth; the reason where they cannot be computed."""
     from dudmap.evaluation.trajectory import ate, rpe
 
-    out: dict[str, Any] = {"ate_rmse_m": None, "rpe_trans_rmse_m_per_s": None, "rpe_rot_rmse_deg_per_s": None}
+    keys = ("ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s")
+    out: dict[str, Any] = dict.fromkeys(keys)
     try:
-        out["ate_rmse_m"] = _number(ate(estimate, reference).rmse, 6)
+        absolute = ate(estimate, reference)
+        out["ate_rmse_m"] = _number(absolute.rmse, 6)
+        out["ate_rot_rmse_deg"] = _number(absolute.rot_rmse_deg, 6)
         relative = rpe(estimate, reference, delta=1.0)
         out["rpe_trans_rmse_m_per_s"] = _number(relative.trans_rmse, 6)
         out["rpe_rot_rmse_deg_per_s"] = _number(relative.rot_rmse_deg, 6)

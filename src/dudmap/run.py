@@ -90,9 +90,13 @@ def run(
     from dudmap.slam import Slam
 
     out = Path(out)
+    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
+    if count < 1:
+        raise DatasetError(
+            f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
+        )
     slam, record = Slam(sequence.camera, config), RunRecord()
     _prepare(out, save_masks=save_masks)
-    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:

@@ -86,4 +86,4 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
 
         console = Console()
         console.print(summary(metrics))
-        console.print(f"written to {out}")
+        console.print(f"written to {out}", highlight=False, soft_wrap=True)
