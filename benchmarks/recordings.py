@@ -1,0 +1,87 @@
+"""The development recordings against their targets.
+
+    python benchmarks/recordings.py --data FOLDER [--systems dudmap,none] [--only fr1_xyz_static] [--out DIR]
+
+Runs every recording in a folder with every system, each in its own process, one after the other. The semi-synthetic
+recordings fr1_xyz_static, fr1_xyz_confusao, pan_confusao and ist_confusao (by folder name) have targets; any other
+recording is scored all the same. Prints the table and writes recordings.md, .csv and .json.
+"""
+
+import argparse
+from pathlib import Path
+
+from dudmap.benchmark.entries import local_entries
+from dudmap.benchmark.measure import Job, Row, measure_all
+from dudmap.benchmark.systems import systems
+from dudmap.benchmark.table import COLUMNS, Column, grid, markdown, save
+from dudmap.metrics import machine, versions
+
+TWINS = {"fr1_xyz_confusao": "fr1_xyz_static"}
+"""The same frames without people."""
+TARGETS: dict[str, list[tuple[str, str, float, str]]] = {
+    "fr1_xyz_static": [("ate_rmse_m", "ATE RMSE, m", 0.012, "<=")],
+    "fr1_xyz_confusao": [
+        ("twin_ratio", "ATE against the static twin", 1.25, "<="),
+        ("lost", "frames lost", 0, "<="),
+        ("mask_iou_mean", "mean mask IoU where people cover > 5 %", 0.7, ">="),
+    ],
+    "pan_confusao": [("rotation_rmse_deg", "rotation RMSE, deg", 2.0, "<=")],
+    "ist_confusao": [("drift_rmse_m", "translation RMSE from the first frame, m", 0.015, "<=")],
+}
+"""Figure, its meaning, bound and direction, by recording."""
+EVERYWHERE = [("ms_per_frame_median", "ms per frame, median", 100.0, "<="), ("peak_rss_mb", "peak MB", 2000.0, "<=")]
+
+
+def with_twins(rows: list[Row]) -> None:
+    """Add the ratio of the ATE to that of the same frames without people, same system."""
+    ates = {(row["sequence"], row["system"]): row.get("ate_rmse_m") for row in rows}
+    for row in rows:
+        twin = ates.get((TWINS.get(row["sequence"]), row["system"]))
+        if twin and row.get("ate_rmse_m"):
+            row["twin_ratio"] = round(row["ate_rmse_m"] / twin, 3)
+
+
+def verdicts(rows: list[Row]) -> str:
+    """Markdown table of every target that a row can be held against."""
+    lines = []
+    for row in rows:
+        for key, meaning, bound, direction in [*TARGETS.get(row["sequence"], []), *EVERYWHERE]:
+            value = row.get(key)
+            if value is None:
+                continue
+            reached = value <= bound if direction == "<=" else value >= bound
+            figure = f"{value:.4g}"
+            lines.append([row["sequence"], row["system"], meaning, f"{direction} {bound:g}", figure])
+            lines[-1].append("yes" if reached else "NO")
+    return grid(["sequence", "system", "what", "target", "measured", "reached"], lines, words=3)
+
+
+def main() -> None:
+    """Parse, run, print, save."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--data", type=Path, required=True, help="folder that holds the recordings")
+    parser.add_argument("--systems", default="dudmap", help="comma-separated; default: dudmap")
+    parser.add_argument("--only", default="", help="comma-separated names of recordings")
+    parser.add_argument("--out", type=Path, default=Path("runs/recordings"))
+    parser.add_argument("--max-frames", type=int, default=None)
+    parser.add_argument("--set", action="append", default=[], help="key=value on top of every system")
+    arguments = parser.parse_args()
+    wanted = [name for name in arguments.only.split(",") if name]
+    entries = [entry for entry in local_entries(arguments.data) if not wanted or entry.name in wanted]
+    if arguments.max_frames:
+        entries = [type(entry)(entry.name, entry.path, max_frames=arguments.max_frames) for entry in entries]
+    jobs = [
+        Job(entry, name, config.override(arguments.set), arguments.out / name / entry.name)
+        for entry in entries
+        for name, config in systems(arguments.systems).items()
+    ]
+    rows = measure_all(jobs, 1, lambda row: print(row["sequence"], row["system"], row.get("error", "done"), flush=True))
+    with_twins(rows)
+    columns = [*COLUMNS[:3], Column("twin_ratio", "x static twin", 1, 2), *COLUMNS[3:]]
+    text = markdown(rows, columns) + "\nTargets:\n\n" + verdicts(rows)
+    save(rows, text, arguments.out, "recordings", {"machine": machine(), "versions": versions()})
+    print(text)
+
+
+if __name__ == "__main__":
+    main()

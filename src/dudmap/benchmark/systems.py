@@ -1,0 +1,43 @@
+"""Systems that a benchmark compares: configurations with a name."""
+
+from pathlib import Path
+
+from dudmap.config import Config
+from dudmap.errors import ConfigError
+
+SYSTEMS: dict[str, tuple[str, ...]] = {
+    "dudmap": (),
+    "thesis": ("preset=thesis",),
+    "threshold": ("dynamics.method=threshold",),
+    "none": ("dynamics.method=none",),
+    "em": ("dynamics.free_space=false", "dynamics.regions=false"),
+}
+"""What each differs in from the default configuration: the default itself, the thesis' values, the threshold-and-flood
+rule of the thesis' ancestor, no dynamic handling at all, and EM on the residuals alone."""
+
+
+def system(name: str) -> tuple[str, Config]:
+    """Name and configuration of a system: one of ``SYSTEMS``, or the path of a TOML file named by its stem.
+
+    Raises:
+        ConfigError: It is neither, or the file is not an acceptable configuration.
+    """
+    if name in SYSTEMS:
+        return name, Config().override(SYSTEMS[name])
+    if name.endswith(".toml"):
+        return Path(name).stem, Config.load(name)
+    raise ConfigError(f"unknown system {name!r}; known are {', '.join(SYSTEMS)} and the path of a .toml file")
+
+
+def systems(names: str) -> dict[str, Config]:
+    """Systems of a comma-separated list.
+
+    Raises:
+        ConfigError: The list is empty, a name is unknown, or two systems have the same name.
+    """
+    found = [system(name.strip()) for name in names.split(",") if name.strip()]
+    if not found:
+        raise ConfigError(f"no system is named; known are {', '.join(SYSTEMS)} and the path of a .toml file")
+    if len(dict(found)) < len(found):
+        raise ConfigError(f"two systems have the same name in {names!r}; give the .toml files different names")
+    return dict(found)
