@@ -162,6 +162,22 @@ def trace(
                             nearer = t < best[line + k]
                             best[line + k] = t if nearer else best[line + k]
                             found[line + k] = number if nearer else found[line + k]
+                    elif kind == ELLIPSOID:
+                        for k in range(count):
+                            x = (u0 + k - cx) / fx
+                            t = ellipsoid_depth(
+                                ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz
+                            )
+                            nearer = t < best[line + k]
+                            best[line + k] = t if nearer else best[line + k]
+                            found[line + k] = number if nearer else found[line + k]
+                    elif kind == CAPSULE:
+                        for k in range(count):
+                            x = (u0 + k - cx) / fx
+                            t = capsule_depth(ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hz)
+                            nearer = t < best[line + k]
+                            best[line + k] = t if nearer else best[line + k]
+                            found[line + k] = number if nearer else found[line + k]
                     else:
                         for k in range(count):
                             x = (u0 + k - cx) / fx
@@ -285,7 +301,7 @@ def shade_point(p, x, y, t, kinds, rotations, origins, halves, materials, textur
 
 @njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
 def shade(
-    row_from, row_to, order, nearest, in_columns, in_rows, kinds, rotations, origins, halves, intrinsics, depth, ids,
+    row_from, row_to, kinds, rotations, origins, halves, intrinsics, depth, ids,
     materials, textures, atlas, lights, up, sky, vignette, gain, color, cosines,
 ):  # fmt: skip
     """Colour (adds into (H, W, 3) float32, 0..255) and cosine of incidence (H, W) float32 of the tile rows.
@@ -295,23 +311,11 @@ def shade(
     """
     height, width = depth.shape
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    candidates = np.empty(order.size, np.int64)
+    around = np.empty(9, np.int64)
     for tile_row in range(row_from, row_to):
         v0, v1 = tile_row * TILE_HEIGHT, min((tile_row + 1) * TILE_HEIGHT, height)
         for tile_column in range((width + TILE_WIDTH - 1) // TILE_WIDTH):
             u0, u1 = tile_column * TILE_WIDTH, min((tile_column + 1) * TILE_WIDTH, width)
-            farthest = 0.0
-            for v in range(v0, v1):
-                for u in range(u0, u1):
-                    farthest = max(farthest, depth[v, u] if depth[v, u] > 0 else np.inf)
-            count = 0
-            for position in range(order.size):
-                p = order[position]
-                if nearest[p] > farthest * 1.2:
-                    break
-                if in_columns[p, tile_column] and in_rows[p, tile_row]:
-                    candidates[count] = p
-                    count += 1
             for v in range(v0, v1):
                 for u in range(u0, u1):
                     p = ids[v, u]
@@ -322,6 +326,18 @@ def shade(
                         or (v > 0 and ids[v - 1, u] != p)
                         or (v + 1 < height and ids[v + 1, u] != p)
                     )
+                    count = 0
+                    if border:  # the sub-pixels show what the pixels around show
+                        for k in range(9):
+                            vv, uu = v + k // 3 - 1, u + k % 3 - 1
+                            if vv < 0 or uu < 0 or vv >= height or uu >= width or ids[vv, uu] < 0:
+                                continue
+                            known = False
+                            for position in range(count):
+                                known = known or around[position] == ids[vv, uu]
+                            if not known:
+                                around[count] = ids[vv, uu]
+                                count += 1
                     samples = 4 if border else 1
                     share = 0.25 if border else 1.0
                     red, green, blue, cosine = 0.0, 0.0, 0.0, 1.0
@@ -332,9 +348,7 @@ def shade(
                             sy += (0.25 if k & 2 else -0.25) / fy
                             t, q = np.inf, -1
                             for position in range(count):
-                                c = candidates[position]
-                                if nearest[c] > t:
-                                    break
+                                c = around[position]
                                 hit = primitive_depth(
                                     kinds[c], origins[c, 0], origins[c, 1], origins[c, 2],
                                     rotations[c, 0, 0] * sx + rotations[c, 0, 1] * sy + rotations[c, 0, 2],

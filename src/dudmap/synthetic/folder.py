@@ -87,7 +87,11 @@ def _quantised(sequence: SyntheticSequence, depth: NDArray[np.float32]) -> NDArr
 
 
 def _write_image(path: Path, image: NDArray) -> None:
-    if not cv2.imwrite(str(path), image, [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]):
+    if not cv2.imwrite(
+        str(path),
+        image,
+        [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY],
+    ):
         raise OSError(f"the image {path} could not be written")
 
 

@@ -99,20 +99,9 @@ class Renderer:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
         depth = np.empty(camera.shape, dtype=np.float32)
         ids = np.empty(camera.shape, dtype=np.int16)
-        geometry = (
-            order,
-            nearest,
-            columns,
-            rows,
-            self._kinds,
-            rotations,
-            origins,
-            self._halves,
-            intrinsics,
-            depth,
-            ids,
-        )
-        over_rows(rows.shape[1], kernels.trace, *geometry)
+        bins = (order, nearest, columns, rows)
+        geometry = (self._kinds, rotations, origins, self._halves, intrinsics, depth, ids)
+        over_rows(rows.shape[1], kernels.trace, *bins, *geometry)
         if not with_color:
             return Rendering(depth, ids, None, None)
         lights = np.array([[*light.position, light.strength, light.falloff] for light in self._scene.lights])
