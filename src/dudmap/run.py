@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from dudmap.slam import FrameResult, Slam
 
 AHEAD = 4
-"""Frames that are read while an earlier one is processed."""
+"""Frames of a recording on disk that are read while an earlier one is processed."""
 FILES = ("trajectory.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv")
 
 
@@ -66,6 +66,7 @@ def run(
     max_frames: int | None = None,
     save_masks: bool = False,
     progress: bool = True,
+    ahead: int = AHEAD,
     observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -81,6 +82,8 @@ def run(
         max_frames: Stop after this many frames.
         save_masks: Write the dynamic mask of every frame.
         progress: Show a progress bar on a terminal.
+        ahead: Frames that are read while an earlier one is processed; 0 where reading is work for all cores, as with
+            rendered frames, and would disturb the times. The result does not depend on it.
         observe: Called after each processed frame with its number, reading and result.
 
     Raises:
@@ -100,7 +103,7 @@ def run(
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:
-            with closing(read_ahead(sequence, count)) as readings:
+            with closing(read_ahead(sequence, count, ahead)) as readings:
                 for index, reading in enumerate(readings):
                     _process(index, reading, slam, record, display, out if save_masks else None, observe)
         except KeyboardInterrupt:
@@ -122,15 +125,15 @@ def run(
     return report
 
 
-def read_ahead(sequence: "Sequence", count: int) -> "Generator[Reading]":
-    """The first ``count`` frames in order, read by one thread a few frames ahead."""
+def read_ahead(sequence: "Sequence", count: int, ahead: int = AHEAD) -> "Generator[Reading]":
+    """The first ``count`` frames in order, read by one thread up to ``ahead`` frames ahead."""
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
     pending: deque[Future[Reading]] = deque()
     try:
-        for index in range(count + AHEAD):
+        for index in range(count + ahead):
             if index < count:
                 pending.append(reader.submit(_read, sequence, index))
-            if index >= AHEAD:
+            if index >= ahead:
                 yield pending.popleft().result()
     finally:
         reader.shutdown(cancel_futures=True)

@@ -40,7 +40,7 @@ def demo(
     recording = sequence(scene="room", movers=("person",), frames=frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     moment = FullestMoment()
-    report = run(recording, config, out, save_masks=True, progress=not quiet, observe=moment.observe)
+    report = run(recording, config, out, save_masks=True, progress=not quiet, ahead=0, observe=moment.observe)
     moment.save_picture(out, recording.camera)
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 
