@@ -1,0 +1,275 @@
+"""Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V)."""
+
+from dataclasses import dataclass
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.errors import ConfigError, DatasetError
+from dudmap.sequences.association import LARGEST_GAP, associate
+from dudmap.trajectory import Trajectory
+
+Numbers = NDArray[np.float64]
+Align = Literal["se3", "origin", "none"]
+Unit = Literal["s", "m", "frames"]
+
+FEWEST_PAIRS = 3
+SMALLEST_SPREAD = 1e-3
+"""Positions that spread less than this across their main direction (metres, and as a share of the spread along it)
+do not determine a rotation."""
+PATH_TOLERANCE = 0.1
+"""Relative: poses one metre apart may be 0.9 to 1.1 m apart along the path."""
+
+
+@dataclass(frozen=True, eq=False)
+class AteResult:
+    """Absolute trajectory error.
+
+    Attributes:
+        rmse: Root mean square of the distances between aligned estimated and true positions, metres.
+        mean: Mean of the same, metres.
+        median: Median, metres.
+        max: Largest, metres.
+        rot_rmse_deg: Root mean square of the angles between aligned estimated and true orientations, degrees.
+        rot_mean_deg: Mean of the same, degrees.
+        rot_median_deg: Median, degrees.
+        rot_max_deg: Largest, degrees.
+        num_pairs: Number N of pose pairs.
+        timestamps: (N,) seconds, of the estimate.
+        errors: (N,) metres.
+        rot_errors_deg: (N,) degrees.
+        T_reference_estimate: (4, 4) motion that was applied to the estimate.
+        alignment: How that motion was found: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3`` was
+            asked for but the positions (all equal, or on one line) leave the rotation open.
+    """
+
+    rmse: float
+    mean: float
+    median: float
+    max: float
+    rot_rmse_deg: float
+    rot_mean_deg: float
+    rot_median_deg: float
+    rot_max_deg: float
+    num_pairs: int
+    timestamps: Numbers
+    errors: Numbers
+    rot_errors_deg: Numbers
+    T_reference_estimate: Numbers
+    alignment: str
+
+
+@dataclass(frozen=True, eq=False)
+class RpeResult:
+    """Relative pose error over a fixed distance in time, path or frames.
+
+    Attributes:
+        trans_rmse: Root mean square of the translations of the relative errors, metres.
+        trans_mean: Mean of the same, metres.
+        trans_median: Median, metres.
+        trans_max: Largest, metres.
+        rot_rmse_deg: Root mean square of the angles of the relative errors, degrees.
+        rot_mean_deg: Mean of the same, degrees.
+        rot_median_deg: Median, degrees.
+        rot_max_deg: Largest, degrees.
+        num_pairs: Number N of relative motions.
+        delta: Their distance.
+        unit: Unit of the distance.
+        timestamps: (N,) seconds, of the first pose of each.
+        trans_errors: (N,) metres.
+        rot_errors_deg: (N,) degrees.
+    """
+
+    trans_rmse: float
+    trans_mean: float
+    trans_median: float
+    trans_max: float
+    rot_rmse_deg: float
+    rot_mean_deg: float
+    rot_median_deg: float
+    rot_max_deg: float
+    num_pairs: int
+    delta: float
+    unit: str
+    timestamps: Numbers
+    trans_errors: Numbers
+    rot_errors_deg: Numbers
+
+
+class PosePairs(NamedTuple):
+    """Poses that belong together in time: (N,) timestamps of the estimate, and (N, 4, 4) poses of both."""
+
+    timestamps: Numbers
+    Ts_estimate: Numbers
+    Ts_reference: Numbers
+
+
+def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> PosePairs:
+    """Poses of both trajectories, one to one: the closest times first, then the closest of what is left, and so on.
+
+    Args:
+        estimate: Estimated poses.
+        reference: True poses.
+        max_difference: Times further apart than this are no pair, seconds.
+
+    Raises:
+        DatasetError: The trajectories do not overlap in time, or there are fewer than three pairs.
+    """
+    for name, trajectory in (("estimated", estimate), ("reference", reference)):
+        if not len(trajectory):
+            raise DatasetError(f"the {name} trajectory holds no pose; nothing can be compared")
+    pairs = associate(estimate.timestamps, reference.timestamps, max_difference)
+    if not pairs:
+        raise DatasetError(
+            f"no pose of the estimate ({_span(estimate)}) lies within {1000 * max_difference:g} ms of a pose of the "
+            f"reference ({_span(reference)}); give the reference of the same recording, or a larger difference"
+        )
+    if len(pairs) < FEWEST_PAIRS:
+        raise DatasetError(
+            f"only {len(pairs)} of {len(estimate)} estimated poses lie within {1000 * max_difference:g} ms of one of "
+            f"{len(reference)} reference poses; at least {FEWEST_PAIRS} are needed"
+        )
+    pairs.sort()
+    first, second = np.array(pairs).T
+    return PosePairs(estimate.timestamps[first], estimate.Ts_world_camera[first], reference.Ts_world_camera[second])
+
+
+def ate(
+    estimate: Trajectory, reference: Trajectory, align: Align = "se3", max_difference: float = LARGEST_GAP
+) -> AteResult:
+    """Absolute trajectory error: E_i = T_reference_i^-1 A T_estimate_i with one rigid motion A for all i.
+
+    The errors are the norm of E_i's translation and the angle of its rotation.
+
+    Args:
+        estimate: Estimated poses, camera to world.
+        reference: True poses, camera to world.
+        align: ``se3``: A brings the positions closest to each other in the least-squares sense, without scale (Umeyama
+            1991, as in the TUM script); where the positions leave its rotation open it is the mean of the rotations
+            that align the orientations. ``origin``: A maps the first pose onto its partner, so that a fixed camera is
+            measured against where it started. ``none``: A is the identity.
+        max_difference: Poses further apart in time are no pair, seconds.
+
+    Raises:
+        DatasetError: No overlap in time, or fewer than three pairs.
+        ConfigError: ``align`` is none of the three.
+    """
+    if align not in get_args(Align):
+        raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
+    stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
+    alignment: str = align
+    T = np.eye(4)
+    if align == "origin":
+        T = Ts_reference[0] @ se3.inverse(Ts_estimate[0])
+    elif align == "se3":
+        T, alignment = _align(Ts_estimate, Ts_reference)
+    E = se3.inverse(Ts_reference) @ (T @ Ts_estimate)
+    errors, angles = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E))
+    return AteResult(*_statistics(errors), *_statistics(angles), len(stamps), stamps, errors, angles, T, alignment)
+
+
+def rpe(
+    estimate: Trajectory,
+    reference: Trajectory,
+    delta: float = 1.0,
+    unit: Unit = "s",
+    max_difference: float = LARGEST_GAP,
+) -> RpeResult:
+    """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
+
+    Every pose i that has a partner j ``delta`` further on gives one error, as in the TUM script with ``--fixed_delta``:
+    j is the pose nearest to that distance. Unlike there, a j that is not really ``delta`` away (the tail of the
+    trajectory, and gaps where tracking was lost) gives none: off by more than half the usual time between two poses
+    (at least ``max_difference``) for ``s``, by more than a tenth for ``m``. Metres are counted along the reference's
+    path; ``frames`` counts poses that have a partner in the reference.
+
+    Args:
+        estimate: Estimated poses, camera to world.
+        reference: True poses, camera to world.
+        delta: The distance; a whole number for ``frames``.
+        unit: ``s``, ``m`` or ``frames``.
+        max_difference: Poses further apart in time are no pair, seconds.
+
+    Raises:
+        DatasetError: No overlap in time, fewer than three pairs, or no two poses are ``delta`` apart.
+        ConfigError: ``delta`` or ``unit`` is not acceptable.
+    """
+    if unit not in get_args(Unit):
+        raise ConfigError(f"the unit of delta is {unit!r}; expected one of {', '.join(get_args(Unit))}")
+    if not (np.isfinite(delta) and delta > 0) or (unit == "frames" and delta != int(delta)):
+        raise ConfigError(f"delta is {delta} {unit}; expected a positive number, whole for frames")
+    stamps, Ts_estimate, Ts_reference = pair_poses(estimate, reference, max_difference)
+    if unit == "s":
+        position, tolerance = stamps, max(max_difference, float(np.median(np.diff(stamps))) / 2)
+    elif unit == "m":
+        steps = np.linalg.norm(np.diff(Ts_reference[:, :3, 3], axis=0), axis=1)
+        position, tolerance = np.concatenate([[0.0], np.cumsum(steps)]), PATH_TOLERANCE * delta
+    else:
+        position, tolerance = np.arange(len(stamps), dtype=np.float64), 0.0
+    i, j = _partners(position, delta, tolerance)
+    if not len(i):
+        length = position[-1] - position[0]
+        raise DatasetError(f"no two poses are {delta:g} {unit} apart; the compared part is {length:.3g} {unit} long")
+    motion_reference = se3.inverse(Ts_reference[i]) @ Ts_reference[j]
+    motion_estimate = se3.inverse(Ts_estimate[i]) @ Ts_estimate[j]
+    E = se3.inverse(motion_reference) @ motion_estimate
+    errors, angles = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E))
+    return RpeResult(*_statistics(errors), *_statistics(angles), len(i), delta, unit, stamps[i], errors, angles)
+
+
+def umeyama(points: Numbers, targets: Numbers) -> tuple[Numbers, Numbers]:
+    """Rigid motion (4, 4) that brings points (N, 3) closest to targets (N, 3), least squares (Umeyama 1991, eq. 34-42).
+
+    Also returns (3,) how far the two spread together along the principal directions, metres: the square roots of the
+    singular values of their cross-covariance. The rotation is determined only if the second is not zero.
+    """
+    center, target_center = points.mean(axis=0), targets.mean(axis=0)
+    covariance = (targets - target_center).T @ (points - center) / len(points)
+    U, singular, V_t = np.linalg.svd(covariance)
+    T = np.eye(4)
+    T[:3, :3] = U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
+    T[:3, 3] = target_center - T[:3, :3] @ center
+    return T, np.sqrt(singular)
+
+
+def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
+    positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
+    T, spread = umeyama(positions, targets)
+    if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
+        return T, "se3"
+    rotations = Ts_reference[:, :3, :3] @ np.swapaxes(Ts_estimate[:, :3, :3], 1, 2)
+    T[:3, :3] = se3.nearest_rotation(rotations.mean(axis=0))  # chordal mean, Hartley et al. 2013, section 5.3
+    T[:3, 3] = targets.mean(axis=0) - T[:3, :3] @ positions.mean(axis=0)
+    return T, "se3-orientations"
+
+
+def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices i and, for each, the j > i whose position is nearest to that of i plus delta; position increases."""
+    wanted = position + delta
+    after = np.clip(np.searchsorted(position, wanted), 1, len(position) - 1)
+    before = after - 1
+    j = np.where(wanted - position[before] <= position[after] - wanted, before, after)
+    i = np.arange(len(position))
+    keep = (j > i) & (np.abs(position[j] - wanted) <= tolerance + 1e-9)
+    return i[keep], j[keep]
+
+
+def rotation_angles(Ts: Numbers) -> Numbers:
+    """Angles (N,) in radians, in [0, pi], of the rotations of (N, 4, 4) or (N, 3, 3) matrices.
+
+    From ``|R - I|_F^2 = 8 sin^2(angle / 2)``, which is exact for small angles where the trace is not.
+    """
+    chord = np.linalg.norm(Ts[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
+    return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
+
+
+def _statistics(errors: Numbers) -> tuple[float, float, float, float]:
+    """Root mean square, mean, median and maximum."""
+    rmse = float(np.sqrt(np.mean(errors**2)))
+    return rmse, float(errors.mean()), float(np.median(errors)), float(errors.max())
+
+
+def _span(trajectory: Trajectory) -> str:
+    return f"{trajectory.timestamps[0]:.3f} to {trajectory.timestamps[-1]:.3f} s"
