@@ -24,28 +24,28 @@ class Part(BaseModel):
 class SensorConfig(Part):
     """Noise of the depth sensor: sigma(z) = sigma_base + sigma_scale z^2 (thesis eq. 3.91)."""
 
-    sigma_base: float = Field(0.001, ge=0, le=0.1)
+    sigma_base: float = Field(default=0.001, ge=0, le=0.1)
     """Standard deviation at the lens, metres."""
-    sigma_scale: float = Field(0.0019, ge=0, le=0.1)
+    sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m."""
 
 
 class PreprocessConfig(Part):
     """Depth limits, hole filling and smoothing (thesis section 4.3)."""
 
-    depth_min: float = Field(0.2, ge=0)
+    depth_min: float = Field(default=0.2, ge=0)
     """Readings nearer than this are ignored, metres."""
-    depth_max: float = Field(6.0, gt=0)
+    depth_max: float = Field(default=6.0, gt=0)
     """Readings farther than this are ignored, metres."""
     fill_holes: bool = True
     """Give pixels without a reading the mean of their 5x5 neighbours where those lie on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
     """Depth-adaptive bilateral filter (eq. 4.8-4.11) or none."""
-    filter_alpha: float = Field(0.012, gt=0)
+    filter_alpha: float = Field(default=0.012, gt=0)
     """sigma_c = filter_alpha z^2, 1/m (the thesis' 12 is in millimetres at one metre)."""
-    filter_sigma_px: float = Field(4.0, gt=0)
+    filter_sigma_px: float = Field(default=4.0, gt=0)
     """Spatial standard deviation sigma_s, pixels."""
-    filter_radius: int = Field(6, ge=1, le=16)
+    filter_radius: int = Field(default=6, ge=1, le=16)
     """Half width of the filter window, pixels."""
 
     @model_validator(mode="after")
@@ -60,42 +60,42 @@ class SimilarityConfig(Part):
 
     enabled: bool = True
     """Leave frames out of the fusion that show what the last fused one showed; they still get a pose."""
-    threshold: float = Field(0.84, gt=0, le=1)
+    threshold: float = Field(default=0.84, gt=0, le=1)
     """Share of SIFT features of the last fused frame found again above which a view is redundant."""
-    ratio: float = Field(0.7, gt=0, lt=1)
+    ratio: float = Field(default=0.7, gt=0, lt=1)
     """Lowe's ratio test: best over second best descriptor distance."""
-    image_width: int = Field(320, ge=80)
+    image_width: int = Field(default=320, ge=80)
     """Width of the image the features are found in, pixels."""
-    max_features: int = Field(500, ge=50)
+    max_features: int = Field(default=500, ge=50)
     """Most features a frame may have."""
-    max_translation: float = Field(0.005, ge=0)
+    max_translation: float = Field(default=0.005, ge=0)
     """A camera that moved more than this since the last fused frame is not tested, metres; 0 tests all frames."""
-    max_rotation_deg: float = Field(0.3, ge=0)
+    max_rotation_deg: float = Field(default=0.3, ge=0)
     """A camera that turned more than this since the last fused frame is not tested, degrees."""
 
 
 class VolumeConfig(Part):
     """Voxel-hashed truncated signed distance field (thesis section 4.5)."""
 
-    voxel_size: float = Field(0.01, gt=0, le=1)
+    voxel_size: float = Field(default=0.01, gt=0, le=1)
     """Edge of a voxel, metres."""
-    truncation_voxels: float = Field(4.0, ge=1, le=64)
+    truncation_voxels: float = Field(default=4.0, ge=1, le=64)
     """Band in front of a surface that is stored, voxels; grows with the sensor's noise."""
-    truncation_behind_voxels: float = Field(4.0, ge=1, le=64)
+    truncation_behind_voxels: float = Field(default=4.0, ge=1, le=64)
     """Band behind a surface that is stored, voxels."""
-    truncation_noise: float = Field(3.0, ge=0)
+    truncation_noise: float = Field(default=3.0, ge=0)
     """The band is at least this many standard deviations of the depth reading wide; 0 keeps it fixed."""
-    max_weight: int = Field(100, ge=1, le=255)
+    max_weight: int = Field(default=100, ge=1, le=255)
     """Cap of the running average (eq. 4.19)."""
     weighting: Literal["constant", "angle"] = "constant"
     """Weight of one observation: 1, or cos(theta) / err(z) (eq. 4.20)."""
-    min_weight: int = Field(3, ge=1, le=255)
+    min_weight: int = Field(default=3, ge=1, le=255)
     """Observations a voxel needs before the mesh and the views trust it."""
     carving: bool = True
     """Remove what is seen to be empty (thesis section 7.1)."""
-    carve_rate: int = Field(4, ge=1, le=64)
+    carve_rate: int = Field(default=4, ge=1, le=64)
     """Weight of an observation of emptiness in a voxel that holds a surface."""
-    free_after: int = Field(4, ge=1, le=200)
+    free_after: int = Field(default=4, ge=1, le=200)
     """Frames a block must be seen empty before it counts as free space."""
 
 
@@ -104,39 +104,39 @@ class TrackerConfig(Part):
 
     robust: Literal["huber", "tukey"] = "huber"
     """Weight function (eq. 4.44, 4.45)."""
-    huber: float = Field(0.01, gt=0)
+    huber: float = Field(default=0.01, gt=0)
     """Huber constant of the distance residual, metres at one metre depth."""
-    tukey: float = Field(0.05, gt=0)
+    tukey: float = Field(default=0.05, gt=0)
     """Tukey constant of the distance residual, metres at one metre depth."""
-    damping: float = Field(0.02, gt=0)
+    damping: float = Field(default=0.02, gt=0)
     """First Levenberg-Marquardt damping, relative to the diagonal of J^T J (eq. 4.42)."""
-    color_weight: float = Field(0.1325, ge=0)
+    color_weight: float = Field(default=0.1325, ge=0)
     """Weight of the squared intensity residual (0..1) against the squared distance residual (m), eq. 4.32."""
-    color_huber: float = Field(0.1, gt=0)
+    color_huber: float = Field(default=0.1, gt=0)
     """Huber constant of the intensity residual."""
     exposure: bool = True
     """Fit gain and offset of the image's intensities to the map's before each level."""
     noise_weighting: bool = True
     """Weight each distance residual by the sensor's noise at its depth."""
-    iterations: tuple[int, ...] = (8, 6, 4)
+    iterations: tuple[int, ...] = (8, 6, 3)
     """Most iterations per level, coarse to fine; 0 leaves the level out."""
     widths: tuple[int, ...] = (80, 160, 320)
     """Image width per level, coarse to fine, pixels; the nearest halving of the camera's image is taken."""
-    stop: float = Field(1e-4, gt=0)
+    stop: float = Field(default=5e-4, gt=0)
     """A level ends when the step's norm falls below this."""
     second_pass: bool = True
     """Register again with the dynamic labels (algorithm 4)."""
     constant_velocity: bool = True
     """Start from the motion of the last frame."""
-    min_inliers: float = Field(0.15, ge=0, le=1)
+    min_inliers: float = Field(default=0.15, ge=0, le=1)
     """Share of the readings that must fall on the map for a frame to count as tracked."""
-    max_residual: float = Field(4.0, gt=0)
+    max_residual: float = Field(default=4.0, gt=0)
     """Largest median residual of a tracked frame, in standard deviations of the reading."""
-    min_condition: float = Field(1e-4, ge=0, lt=1)
+    min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the extreme eigenvalues of the scaled J^T J of a tracked frame."""
-    max_speed: float = Field(5.0, gt=0)
+    max_speed: float = Field(default=5.0, gt=0)
     """Fastest believable camera, m/s."""
-    max_turn_deg: float = Field(360.0, gt=0)
+    max_turn_deg: float = Field(default=360.0, gt=0)
     """Fastest believable turn, degrees per second."""
 
     @model_validator(mode="after")
@@ -159,13 +159,13 @@ class DynamicsConfig(Part):
     """Points that appear in space the map knows to be free are dynamic (EM only)."""
     regions: bool = True
     """Decide per depth-connected region, not per pixel (EM only)."""
-    width: int = Field(160, ge=40, le=1280)
+    width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; the nearest halving of the camera's image is taken."""
-    noise_threshold: float = Field(0.03, gt=0)
+    noise_threshold: float = Field(default=0.03, gt=0)
     """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
-    noise_sigmas: float = Field(3.0, ge=0)
+    noise_sigmas: float = Field(default=3.0, ge=0)
     """The same in standard deviations of the reading; the larger of both counts."""
-    margin_px: int = Field(5, ge=0, le=50)
+    margin_px: int = Field(default=5, ge=0, le=50)
     """Pixels around a moving region that are not fused either."""
 
 

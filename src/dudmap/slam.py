@@ -95,18 +95,7 @@ class Slam:
             levels = self._levels(observation)
         if self.volume.is_empty:
             return self._start(frame, observation, clock)
-        with clock("track"):
-            tracked = self.tracker.align(self.volume, self._tracked(levels), self.motion.predict(frame.timestamp))
-        labels = None
-        if self.config.dynamics.method != "none":
-            with clock("label"):
-                labels = self._detect(levels, tracked)
-            if self.config.tracker.second_pass:
-                with clock("track_again"):
-                    weights = self._weights(labels, self._tracked(levels))
-                    tracked = self.tracker.align(self.volume, self._tracked(levels), tracked.T_world_camera, weights)
-                with clock("label"):
-                    labels = self._detect(levels, tracked)
+        tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), clock)
         reason = tracked.reason or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
         if reason:
             self.motion.lost()
@@ -137,6 +126,34 @@ class Slam:
             nothing, 0.0, np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
         )  # fmt: skip
 
+    def _register(
+        self, levels: dict[int, Level], T_init: NDArray[np.float64], clock: "Clock"
+    ) -> tuple[TrackingResult, Labels | None]:
+        """Register without labels, find what moves, register again without that (thesis algorithm 4).
+
+        The coarse levels bring the pose near enough to tell what moves, the fine ones make it exact.
+        """
+        tracked_levels = self._tracked(levels)
+        if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
+            with clock("track"):
+                tracked = self.tracker.align(self.volume, tracked_levels, T_init)
+            return tracked, None if self.config.dynamics.method == "none" else self._detect(levels, tracked, clock)
+        split = max(1, len(tracked_levels) - 1)
+        with clock("track"):
+            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, first_level=0)
+        labels = self._detect(levels, tracked, clock)
+        with clock("track_again"):
+            again = tracked_levels[split - 1 :]
+            tracked = self.tracker.align(
+                self.volume,
+                again,
+                tracked.T_world_camera,
+                self._weights(labels, again),
+                first_level=split - 1,
+                exposure=tracked.exposure,
+            )
+        return tracked, labels
+
     def _levels(self, observation: Observation) -> dict[int, Level]:
         """Image pyramid by number of halvings."""
         wanted = {self._level(width) for width in (*self.config.tracker.widths, self.config.dynamics.width)}
@@ -153,9 +170,10 @@ class Slam:
     def _tracked(self, levels: dict[int, Level]) -> list[Level]:
         return [levels[self._level(width)] for width in self.config.tracker.widths]
 
-    def _detect(self, levels: dict[int, Level], tracked: TrackingResult) -> Labels:
+    def _detect(self, levels: dict[int, Level], tracked: TrackingResult, clock: "Clock") -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
-        return self.detector.detect(self.volume, level, tracked.T_world_camera)
+        with clock("label"):
+            return self.detector.detect(self.volume, level, tracked.T_world_camera)
 
     def _weights(self, labels: Labels, levels: list[Level]) -> list[NDArray[np.float32]]:
         """Static weights of the second registration at every level."""

@@ -85,19 +85,24 @@ class Tracker:
         levels: list[Level],
         T_init: NDArray[np.float64],
         static_weights: list[NDArray[np.float32]] | None = None,
+        first_level: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
     ) -> TrackingResult:
         """Pose that minimises the distances and intensity differences of a frame to the map (eq. 4.32).
 
         Args:
             volume: The map.
-            levels: Image pyramid, coarse to fine, one entry per level of the configuration.
+            levels: Image pyramid, coarse to fine.
             T_init: (4, 4) first guess of T_world_camera.
             static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
+            first_level: Number of the first of these levels in the configuration.
+            exposure: First guess of the gain and offset.
         """
         volume.look_at(T_init)
-        T, iterations, system, exposure = T_init, 0, None, (1.0, 0.0)
+        T, iterations, system = T_init, 0, None
         for index, level in enumerate(levels):
-            if self.config.iterations[index] == 0:
+            limit = self.config.iterations[first_level + index]
+            if limit == 0:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
             if self.config.exposure:
@@ -105,9 +110,10 @@ class Tracker:
                 exposure = chained(exposure, fit_exposure(exposed(level, exposure).intensity, residuals[1], weights))
                 iterations += 1
             lit = exposed(level, exposure)
-            T, system, used = self._optimize(volume, lit, T, weights, self.config.iterations[index])
+            T, system, used = self._optimize(volume, lit, T, weights, limit)
             iterations += used
-        assert system is not None
+        if system is None:  # every level is left out: judge the first guess
+            system = self.linearize(volume, levels[-1], T, np.ones_like(levels[-1].depth))
         return self._judge(T, exposure, system, iterations)
 
     def _optimize(

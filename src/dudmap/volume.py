@@ -385,9 +385,13 @@ class TsdfVolume:
         out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
         window, cells, geometry = self.window
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
-        integration.sample_map(
-            depth, intensity, intrinsics, self.lattice(T_world_camera), window, cells, geometry,
-            np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
+        T = self.lattice(T_world_camera)
+        run_bands(
+            lambda start, stop: integration.sample_map(
+                start, stop, depth, intensity, intrinsics, T, window, cells, geometry,
+                np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
+            ),
+            bands(shape[0], max(8, -(-shape[0] // 8))),
         )  # fmt: skip
         return MapSample(*out)
 

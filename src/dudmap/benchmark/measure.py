@@ -7,11 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from dudmap.benchmark.entries import Entry
 from dudmap.config import Config
-from dudmap.errors import DudmapError
+from dudmap.errors import DatasetError, DudmapError
+
+if TYPE_CHECKING:
+    from dudmap.mesh import Mesh
+    from dudmap.sequences import Sequence
 
 Row = dict[str, Any]
 """One line of a table: sequence, system, and figures by name; ``error`` holds a sentence where there are none."""
@@ -26,14 +30,12 @@ class Job:
         system: Name of the system.
         config: Its parameters.
         out: Folder that keeps the run; None keeps nothing.
-        surface: Whether to score the mesh where the true surface is known.
     """
 
     entry: Entry
     system: str
     config: Config
     out: Path | None = None
-    surface: bool = True
 
 
 def measure(job: Job) -> Row:
@@ -42,17 +44,46 @@ def measure(job: Job) -> Row:
     Raises:
         DudmapError: The recording cannot be used, or nothing could be tracked.
     """
-    from dudmap.benchmark.score import score_trajectory
+    sequence = job.entry.open()
+    row = measure_sequence(sequence, job.config, job.entry.surfaces(sequence), job.out, job.entry.max_frames)
+    return {"sequence": job.entry.name, "system": job.system} | row
+
+
+def measure_sequence(
+    sequence: "Sequence",
+    config: Config,
+    surfaces: "tuple[Mesh, Mesh] | None",
+    out: Path | None = None,
+    max_frames: int | None = None,
+) -> Row:
+    """Figures of one run: those of its metrics.json, and how trajectory and mesh compare with the truth.
+
+    Args:
+        sequence: The recording.
+        config: The system.
+        surfaces: True static surface, whole and as far as it was seen, in the frame of the ground truth, if known.
+        out: Folder that keeps the run; None keeps nothing.
+        max_frames: Use only the first frames.
+
+    Raises:
+        DudmapError: The recording cannot be used, or nothing could be tracked.
+    """
+    from dudmap.benchmark.score import score_mesh, score_trajectory
+    from dudmap.mesh import Mesh
     from dudmap.run import run
 
-    sequence = job.entry.open()
-    row: Row = {"sequence": job.entry.name, "system": job.system}
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
-        out = job.out or Path(temporary)
-        report = run(sequence, job.config, out, max_frames=job.entry.max_frames, progress=False)
-        row |= {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
-        row |= score_trajectory(report.trajectory, sequence.ground_truth)
-        row["tracked_share"] = round(report.metrics["tracked"] / max(report.metrics["frames"], 1), 4)
+        report = run(sequence, config, out or Path(temporary), max_frames=max_frames, progress=False)
+        row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
+        row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)
+        truth = sequence.ground_truth
+        if truth is not None:
+            row |= score_trajectory(report.trajectory, truth)
+        if truth is not None and surfaces is not None and report.metrics["mesh_triangles"]:
+            try:
+                row |= score_mesh(Mesh.load(report.out / "mesh.ply"), report.trajectory, truth, *surfaces)
+            except DatasetError as error:
+                row["mesh_missing"] = str(error)
     return row
 
 
@@ -66,7 +97,7 @@ def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] =
     """
 
     def one(job: Job) -> Row:
-        row = _in_own_process(job)
+        row = {"sequence": job.entry.name, "system": job.system} | in_own_process(measure, job)
         done(row)
         return row
 
@@ -74,26 +105,26 @@ def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] =
         return list(pool.map(one, jobs))
 
 
-def _in_own_process(job: Job) -> Row:
+def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
+    """What ``function(argument)`` returns in a fresh process; {"error": sentence} where it fails."""
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send_measure, args=(job, sender))
+    process = context.Process(target=_send, args=(function, argument, sender))
     process.start()
     sender.close()
     try:
-        row: Row = receiver.recv()
+        return receiver.recv()
     except EOFError:
         process.join()
-        row = {"error": f"its process ended with code {process.exitcode} and without a result"}
+        return {"error": f"its process ended with code {process.exitcode} and without a result"}
     finally:
         process.join()
         receiver.close()
-    return {"sequence": job.entry.name, "system": job.system} | row
 
 
-def _send_measure(job: Job, sender: Connection) -> None:
+def _send(function: Callable[[Any], Row], argument: Any, sender: Connection) -> None:  # noqa: ANN401
     try:
-        sender.send(measure(job))
+        sender.send(function(argument))
     except DudmapError as error:
         sender.send({"error": str(error)})
     finally:

@@ -2,61 +2,63 @@
 
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from dudmap import se3
+from dudmap.errors import DatasetError
 from dudmap.metrics import accuracy
 from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from dudmap.mesh import Mesh
 
-LARGEST_GAP = 0.02
-"""A true pose counts for a time at most this far outside the ground truth's rows, seconds."""
+COMPLETE_WITHIN = 0.02
+"""A point of the true surface counts as mapped if the mesh is this near, metres."""
+SAMPLES = 100_000
+"""Points drawn on each surface."""
 
 
-def score_trajectory(estimate: Trajectory, truth: Trajectory | None) -> dict[str, Any]:
-    """ATE and RPE (see ``dudmap.evaluation``), and the errors when only the first pose is aligned.
+def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
+    """ATE and RPE, and the errors when only the first pose is aligned.
 
-    ``drift_rmse_m`` and ``rotation_rmse_deg`` compare the motion since the first pose: translation and angle of
-    inv(T_true_first) T_true against inv(T_first) T, root mean square over all poses.
+    ``drift_rmse_m`` and ``rotation_rmse_deg`` are the root mean squares of distance and angle after the motion that
+    brings the first estimated pose onto the true one: what a fixed or merely turning camera is judged by.
     """
-    if truth is None or not len(estimate):
-        return {}
+    from dudmap.evaluation.trajectory import ate
+
     out = accuracy(estimate, truth)
-    pairs = matched(estimate, truth)
-    if pairs is not None:
-        Ts, Ts_true = (se3.inverse(poses[0]) @ poses for poses in pairs)
-        shift = Ts[:, :3, 3] - Ts_true[:, :3, 3]
-        angles = [se3.rotation_angle(se3.inverse(a) @ b) for a, b in zip(Ts, Ts_true, strict=True)]
-        out["drift_rmse_m"] = round(float(np.sqrt(np.mean(np.sum(shift**2, axis=1)))), 6)
-        out["rotation_rmse_deg"] = round(float(np.degrees(np.sqrt(np.mean(np.square(angles))))), 5)
+    try:
+        from_start = ate(estimate, truth, align="origin")
+    except DatasetError:  # told by accuracy_missing
+        return out
+    out["drift_rmse_m"] = round(from_start.rmse, 6)
+    out["rotation_rmse_deg"] = round(from_start.rot_rmse_deg, 5)
     return out
 
 
-def matched(estimate: Trajectory, truth: Trajectory) -> tuple[NDArray[np.float64], NDArray[np.float64]] | None:
-    """Estimated poses (N, 4, 4) within the truth's time, and the true ones interpolated to their times."""
-    first, last = truth.timestamps[0], truth.timestamps[-1]
-    stamps = estimate.timestamps
-    inside = (stamps >= first - LARGEST_GAP) & (stamps <= last + LARGEST_GAP)
-    if not inside.any():
-        return None
-    Ts_true = np.array([truth.interpolate(min(max(t, first), last)) for t in stamps[inside]])
-    return estimate.Ts_world_camera[inside], Ts_true
+def score_mesh(mesh: "Mesh", estimate: Trajectory, truth: Trajectory, whole: "Mesh", seen: "Mesh") -> dict[str, Any]:
+    """How the mesh compares with the true static surface.
 
+    The mesh is moved by the motion that brings the first estimated pose onto the true one, and not fitted: a bent or
+    shifted map counts as wrong.
 
-def into_true_world(mesh: "Mesh", estimate: Trajectory, truth: Trajectory) -> "Mesh | None":
-    """The mesh moved by the transformation that makes the first pose the true one; None without a common time."""
-    from dudmap.mesh import Mesh
+    Args:
+        mesh: In the frame of ``estimate``.
+        estimate: The system's trajectory.
+        truth: True poses.
+        whole: True static surface, in the frame of ``truth``; accuracy and ghosts are measured against it.
+        seen: The part of it that the camera saw; completeness is measured on it.
 
-    pairs = matched(estimate, truth)
-    if pairs is None:
-        return None
-    T = pairs[1][0] @ se3.inverse(pairs[0][0])
-    return Mesh(
-        (mesh.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
-        mesh.faces,
-        mesh.colors,
-        (mesh.normals @ T[:3, :3].T).astype(np.float32),
-    )
+    Raises:
+        DatasetError: The trajectories have fewer than three poses in common.
+        MapError: A mesh has no faces.
+    """
+    from dudmap.evaluation.reconstruction import compare_surfaces
+    from dudmap.evaluation.surface import moved
+    from dudmap.evaluation.trajectory import ate
+
+    T = ate(estimate, truth, align="origin").T_reference_estimate
+    result = compare_surfaces(moved(mesh, T), whole, observed=seen, thresholds=(COMPLETE_WITHIN,), samples=SAMPLES)
+    return {
+        "mesh_accuracy_m": round(result.accuracy.mean, 6),
+        "mesh_completeness": round(result.scores[0].recall, 5),
+        "ghost_area_m2": None if result.ghost_area_m2 is None else round(result.ghost_area_m2, 5),
+        "ghost_share": round(result.ghost_share, 5),
+    }

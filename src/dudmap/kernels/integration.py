@@ -369,11 +369,12 @@ def observe_free(
 
 @kernel
 def sample_map(
-    depth, intensity, intrinsics, T, window, shape, geometry, unit, free_count, free_after, distance, difference, place
+    row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, unit, free_count, free_after, distance, difference, place
 ):
     """What the map says at the points of a depth image.
 
     Args:
+        row_start, row_stop: Rows of the band.
         depth: (h, w) float32.
         intensity: (h, w) float32 in [0, 1].
         intrinsics: (4,) float32.
@@ -388,9 +389,8 @@ def sample_map(
         difference: (h, w) float32 out, map minus image intensity, NaN likewise.
         place: (h, w) uint8 out: 0 no reading or unknown space, 1 on the map, 2 in confirmed free space.
     """
-    corners = np.empty((8, 1), np.int32)
     nan = np.float32(np.nan)
-    for v in range(depth.shape[0]):
+    for v in range(row_start, row_stop):
         for u in range(depth.shape[1]):
             z = depth[v, u]
             distance[v, u], difference[v, u], place[v, u] = nan, nan, 0
