@@ -1,0 +1,206 @@
+"""How well a reconstructed surface matches the true one, and how much of it is not there in truth.
+
+Surfaces are compared by area: points are drawn uniformly over one of them, and each is measured to the nearest
+triangle of the other. Vertex by vertex, a mesh would be judged mostly where its triangles are small.
+"""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import ConfigError
+from dudmap.evaluation.surface import Surface
+from dudmap.mesh import Mesh
+
+Distances = NDArray[np.float32]
+
+THRESHOLDS = (0.01, 0.02, 0.05)
+"""Distances in metres at which precision and recall are given."""
+GHOST_DISTANCE = 0.05
+"""Surface farther than this from the true one is a ghost, metres: above what noise and a band of a few voxels do to a
+good surface, and less than the thickness of an arm."""
+SAMPLES = 300_000
+"""Points drawn on each surface; a share of 1 % is then known to 0.02 % (standard error)."""
+HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
+"""Distances are counted in bins of 2 mm up to 20 cm; the last bin also holds everything beyond."""
+
+
+@dataclass(frozen=True)
+class DistanceStatistics:
+    """Distances from one surface to the other, metres."""
+
+    mean: float
+    median: float
+    rmse: float
+    p95: float
+    max: float
+
+    @classmethod
+    def of(cls, distances: Distances) -> "DistanceStatistics":
+        """Statistics of distances (N,)."""
+        d = distances.astype(np.float64)
+        median, p95 = np.percentile(d, [50, 95])
+        return cls(float(d.mean()), float(median), float(np.sqrt(np.mean(d**2))), float(p95), float(d.max()))
+
+
+@dataclass(frozen=True)
+class ThresholdScore:
+    """Shares within a distance (Knapitsch et al. 2017, Tanks and Temples, eq. 3-5).
+
+    Attributes:
+        distance: Metres.
+        precision: Share of the estimate that lies within it of the reference.
+        recall: Share of the reference that lies within it of the estimate.
+        f_score: Their harmonic mean.
+    """
+
+    distance: float
+    precision: float
+    recall: float
+    f_score: float
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceResult:
+    """Comparison of an estimated surface with the true one.
+
+    Attributes:
+        accuracy: Distances from the estimate to the reference.
+        completeness: Distances from the reference to the estimate.
+        scores: Precision, recall and F-score per distance.
+        area_m2: Area of the estimate; None for a point cloud.
+        reference_area_m2: Area of the surface that completeness is measured on; None for a point cloud.
+        ghost_distance: What lies farther than this from the reference is a ghost, metres.
+        ghost_area_m2: Area of the estimate that does; None for a point cloud.
+        ghost_share: Share of the estimate's area that does.
+        missing_share: Share of the reference that is farther than the ghost distance from the estimate.
+        histogram_edges: (B + 1,) metres; the last bin also holds everything beyond.
+        accuracy_histogram: (B,) share of the estimate per bin.
+        completeness_histogram: (B,) share of the reference per bin.
+        num_samples: Points drawn on each surface.
+    """
+
+    accuracy: DistanceStatistics
+    completeness: DistanceStatistics
+    scores: tuple[ThresholdScore, ...]
+    area_m2: float | None
+    reference_area_m2: float | None
+    ghost_distance: float
+    ghost_area_m2: float | None
+    ghost_share: float
+    missing_share: float
+    histogram_edges: NDArray[np.float64]
+    accuracy_histogram: NDArray[np.float64]
+    completeness_histogram: NDArray[np.float64]
+    num_samples: int
+
+    def figures(self) -> dict[str, float | int | None]:
+        """All numbers by name and unit, for tables and JSON."""
+        out: dict[str, float | int | None] = {}
+        for name, statistics in (("accuracy", self.accuracy), ("completeness", self.completeness)):
+            for key in ("mean", "median", "rmse", "p95", "max"):
+                out[f"{name}_{key}_m"] = round(getattr(statistics, key), 6)
+        for score in self.scores:
+            suffix = f"{1000 * score.distance:g}mm"
+            out[f"precision_{suffix}"] = round(score.precision, 5)
+            out[f"recall_{suffix}"] = round(score.recall, 5)
+            out[f"f_score_{suffix}"] = round(score.f_score, 5)
+        for key in ("ghost_distance", "ghost_area_m2", "ghost_share", "missing_share", "area_m2", "reference_area_m2"):
+            value = getattr(self, key)
+            out["ghost_distance_m" if key == "ghost_distance" else key] = None if value is None else round(value, 5)
+        out["num_samples"] = self.num_samples
+        return out
+
+
+def compare_surfaces(
+    estimate: Mesh,
+    reference: Mesh,
+    *,
+    observed: Mesh | None = None,
+    thresholds: Iterable[float] = THRESHOLDS,
+    ghost_distance: float = GHOST_DISTANCE,
+    samples: int = SAMPLES,
+    points: bool = False,
+    seed: int = 0,
+) -> SurfaceResult:
+    """Accuracy, completeness, F-scores and ghosts of an estimated surface.
+
+    Args:
+        estimate: The reconstruction, in the reference's frame.
+        reference: The true static surface: accuracy and ghosts are distances to it.
+        observed: The part of it that a perfect system would have found, which completeness is measured on; None for
+            all of the reference.
+        thresholds: Distances in metres for precision, recall and F-score.
+        ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
+        samples: Points drawn on each surface.
+        points: Accept a point cloud for either; its points are taken as they are and it has no area.
+        seed: Of the drawing.
+
+    Raises:
+        MapError: A mesh has no faces (without ``points``) or holds NaN.
+        ConfigError: A distance or the number of samples is not positive.
+    """
+    thresholds = tuple(thresholds)
+    for name, value in (
+        ("samples", samples),
+        ("the ghost distance", ghost_distance),
+        *(("a threshold", t) for t in thresholds),
+    ):
+        if not (np.isfinite(value) and value > 0):
+            raise ConfigError(f"{name} is {value}; expected a positive number")
+    truth = Surface(reference, "the reference", points=points)
+    found = Surface(estimate, "the estimate", points=points)
+    part = truth if observed is None else Surface(observed, "the observed part of the reference", points=points)
+    to_truth = truth.distances(found.samples(samples, seed))
+    to_found = found.distances(part.samples(samples, seed + 1))
+    ghost_share = float(np.mean(to_truth > ghost_distance))
+    edges = np.linspace(0.0, HISTOGRAM_LARGEST, HISTOGRAM_BINS + 1)
+    return SurfaceResult(
+        accuracy=DistanceStatistics.of(to_truth),
+        completeness=DistanceStatistics.of(to_found),
+        scores=tuple(_score(to_truth, to_found, threshold) for threshold in thresholds),
+        area_m2=found.area,
+        reference_area_m2=part.area,
+        ghost_distance=ghost_distance,
+        ghost_area_m2=None if found.area is None else ghost_share * found.area,
+        ghost_share=ghost_share,
+        missing_share=float(np.mean(to_found > ghost_distance)),
+        histogram_edges=edges,
+        accuracy_histogram=_histogram(to_truth, edges),
+        completeness_histogram=_histogram(to_found, edges),
+        num_samples=samples,
+    )
+
+
+def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
+    """The estimate, each vertex coloured by its distance to the reference: blue 0, red ``largest`` metres and more.
+
+    Raises:
+        MapError: The reference has no faces (without ``points``) or holds NaN.
+        ConfigError: ``largest`` is not positive.
+    """
+    if not (np.isfinite(largest) and largest > 0):
+        raise ConfigError(f"the distance of the deepest colour is {largest}; expected a positive number")
+    distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)
+    return Mesh(estimate.vertices, estimate.faces, distance_colors(distances, largest), estimate.normals)
+
+
+def distance_colors(distances: Distances, largest: float) -> NDArray[np.uint8]:
+    """Colours (N, 3) from blue at 0 over green and yellow to red at ``largest`` and beyond."""
+    anchors = np.array([[40, 70, 200], [40, 170, 190], [90, 190, 70], [240, 210, 50], [210, 40, 30]], dtype=np.float64)
+    at = np.clip(np.nan_to_num(distances.astype(np.float64), nan=largest) / largest, 0, 1) * (len(anchors) - 1)
+    steps = np.arange(len(anchors))
+    return np.stack([np.interp(at, steps, anchors[:, k]) for k in range(3)], axis=1).round().astype(np.uint8)
+
+
+def _score(to_truth: Distances, to_found: Distances, distance: float) -> ThresholdScore:
+    precision, recall = float(np.mean(to_truth < distance)), float(np.mean(to_found < distance))
+    f_score = 2 * precision * recall / (precision + recall) if precision + recall > 0 else 0.0
+    return ThresholdScore(distance, precision, recall, f_score)
+
+
+def _histogram(distances: Distances, edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    counted, _ = np.histogram(np.minimum(distances, np.nextafter(edges[-1], 0)), bins=edges)
+    return counted / max(len(distances), 1)

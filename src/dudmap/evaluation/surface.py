@@ -1,0 +1,249 @@
+"""A surface that points are drawn on and measured to, and the rigid registration of two of them."""
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.errors import MapError
+from dudmap.mesh import Mesh
+
+if TYPE_CHECKING:
+    from scipy.spatial import cKDTree
+
+Points = NDArray[np.float32]
+
+CANDIDATES = 4
+"""Nearest anchors whose triangles are measured exactly."""
+ANCHORS = 400_000
+"""Large triangles are divided into about this many anchors over the whole surface."""
+BATCH = 200_000
+"""Points measured at a time: bounds the memory."""
+
+
+class Surface:
+    """A triangle mesh or, where allowed, a point cloud, ready for drawing points on it and measuring to it.
+
+    Args:
+        mesh: The mesh; faces without area are ignored.
+        name: What to call it in messages.
+        points: Accept a mesh without faces as a point cloud.
+
+    Attributes:
+        area: Square metres; None for a point cloud.
+
+    Raises:
+        MapError: The mesh is empty, holds NaN, or has no faces and ``points`` is not set.
+    """
+
+    def __init__(self, mesh: Mesh, name: str, *, points: bool = False) -> None:
+        if not len(mesh.vertices):
+            raise MapError(f"{name} holds no vertices; nothing can be compared")
+        if not np.all(np.isfinite(mesh.vertices)):
+            raise MapError(f"{name} holds vertices that are NaN or infinite; remove them")
+        if len(mesh.faces) and (mesh.faces.min() < 0 or mesh.faces.max() >= len(mesh.vertices)):
+            raise MapError(f"{name} has faces that name vertices it does not have; the file is damaged")
+        self._vertices = mesh.vertices.astype(np.float32)
+        corners = self._vertices[mesh.faces]  # (F, 3, 3)
+        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        areas = np.linalg.norm(cross, axis=1) / 2
+        real = areas > 0
+        if not real.any() and not points:
+            raise MapError(
+                f"{name} has {len(self._vertices)} vertices but no faces with an area; "
+                "give a triangle mesh, or say that it is a point cloud (--points)"
+            )
+        self._corners = corners[real]
+        self._areas = areas[real].astype(np.float64)
+        self._normals = cross[real] / (2 * areas[real, None])
+        self.area = float(self._areas.sum()) if real.any() else None
+
+    @property
+    def is_cloud(self) -> bool:
+        """Whether it has points only."""
+        return self.area is None
+
+    def samples(self, count: int, seed: int = 0) -> Points:
+        """Points (count, 3) spread uniformly over the area (Turk 1990); of a cloud, ``count`` of its points."""
+        return self.samples_with_normals(count, seed)[0]
+
+    def samples_with_normals(self, count: int, seed: int = 0) -> tuple[Points, Points]:
+        """The same points, and the unit normals (count, 3) of their triangles; zero for a cloud."""
+        random = np.random.default_rng(seed)
+        if self.is_cloud:
+            chosen = random.choice(len(self._vertices), count, replace=count > len(self._vertices))
+            return self._vertices[chosen], np.zeros((count, 3), np.float32)
+        cumulated = np.cumsum(self._areas)
+        steps = (np.arange(count) + random.random(count)) / count * cumulated[-1]  # stratified: one draw per equal area
+        face = np.minimum(np.searchsorted(cumulated, steps), len(cumulated) - 1)
+        return _inside(self._corners[face], random), self._normals[face].astype(np.float32)
+
+    def distances(self, points: Points) -> NDArray[np.float32]:
+        """Distances (N,) of points (N, 3) to the surface, metres.
+
+        Exact for the triangles of the nearest anchors: every triangle has one at its centre, and large ones more, at
+        the spacing that spreads ``ANCHORS`` of them over the surface. A nearer triangle is missed only where many
+        small ones crowd, and then by less than their size.
+        """
+        out = np.empty(len(points), np.float32)
+        for start in range(0, len(points), BATCH):
+            batch = points[start : start + BATCH]
+            if self.is_cloud:
+                out[start : start + BATCH] = self._tree.query(batch, workers=-1)[0]
+                continue
+            nearest = np.full(len(batch), np.inf, np.float32)
+            _, anchors = self._tree.query(batch, k=min(CANDIDATES, len(self._anchor_faces)), workers=-1)
+            for column in anchors.reshape(len(batch), -1).T:
+                nearest = np.minimum(
+                    nearest, point_triangle_distances(batch, self._corners[self._anchor_faces[column]])
+                )
+            out[start : start + BATCH] = nearest
+        return out
+
+    @cached_property
+    def _anchors(self) -> tuple[Points, NDArray[np.intp]]:
+        if self.is_cloud:
+            return self._vertices, np.arange(len(self._vertices))
+        spacing2 = self._areas.sum() / ANCHORS
+        extra = np.minimum(self._areas / spacing2, ANCHORS).astype(np.intp)  # beside the one in the middle
+        faces = np.repeat(np.arange(len(extra)), extra)
+        middle = self._corners.mean(axis=1)
+        spread = _inside(self._corners[faces], np.random.default_rng(0))
+        return np.concatenate([middle, spread]), np.concatenate([np.arange(len(extra)), faces])
+
+    @property
+    def _anchor_faces(self) -> NDArray[np.intp]:
+        return self._anchors[1]
+
+    @cached_property
+    def _tree(self) -> "cKDTree":
+        from scipy.spatial import cKDTree
+
+        return cKDTree(self._anchors[0], balanced_tree=False, compact_nodes=False)
+
+    def nearest_planes(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
+        """Distance (N,) to the nearest anchor, the anchor (N, 3) and the normal (N, 3) of its triangle."""
+        distance, nearest = self._tree.query(points, workers=-1)
+        anchors, faces = self._anchors
+        normals = self._normals[faces[nearest]] if not self.is_cloud else np.zeros_like(points)
+        return distance, anchors[nearest], normals.astype(np.float32)
+
+
+def _inside(corners: Points, random: np.random.Generator) -> Points:
+    """One point per triangle (N, 3, 3), uniform over its area (Turk 1990)."""
+    a, b = np.sqrt(random.random(len(corners), np.float32)), random.random(len(corners), np.float32)
+    weights = np.stack([1 - a, a * (1 - b), a * b], axis=1)
+    return np.einsum("nk,nkd->nd", weights, corners)
+
+
+def point_triangle_distances(points: Points, corners: Points) -> NDArray[np.float32]:
+    """Distance (N,) of each point (N, 3) to its triangle (N, 3, 3).
+
+    The foot of the perpendicular if it falls inside, else the nearest point of the three edges.
+    """
+    a = corners[:, 0]
+    ab, ac, ap = corners[:, 1] - a, corners[:, 2] - a, points - a
+    dot = lambda u, v: np.einsum("nd,nd->n", u, v)  # noqa: E731
+    bb, cc, bc, pb, pc = dot(ab, ab), dot(ac, ac), dot(ab, ac), dot(ap, ab), dot(ap, ac)
+    determinant = np.maximum(bb * cc - bc * bc, np.float32(1e-30))
+    v, w = (cc * pb - bc * pc) / determinant, (bb * pc - bc * pb) / determinant
+    inside = (v >= 0) & (w >= 0) & (v + w <= 1)
+    foot = ap - v[:, None] * ab - w[:, None] * ac
+    squared = dot(foot, foot)
+    beside = np.flatnonzero(~inside)
+    p, c = points[beside], corners[beside]
+    edges = np.full(len(beside), np.inf, np.float32)
+    for k in range(3):
+        start, along = c[:, k], c[:, (k + 1) % 3] - c[:, k]
+        share = dot(p - start, along) / np.maximum(dot(along, along), np.float32(1e-30))
+        away = p - start - np.clip(share, 0, 1)[:, None] * along
+        edges = np.minimum(edges, dot(away, away))
+    squared[beside] = edges
+    return np.sqrt(squared)
+
+
+@dataclass(frozen=True, eq=False)
+class Registration:
+    """Outcome of the registration of two surfaces.
+
+    Attributes:
+        T_reference_estimate: (4, 4) motion that brings the estimate onto the reference.
+        rmse: Root mean square of the point-to-plane distances that counted in the last step, metres.
+        num_iterations: Steps taken.
+        free_directions: Number of directions (of six) that the surfaces leave open; nothing moved along them.
+    """
+
+    T_reference_estimate: NDArray[np.float64]
+    rmse: float
+    num_iterations: int
+    free_directions: int
+
+
+def register(
+    estimate: Mesh,
+    reference: Mesh,
+    T_reference_estimate: NDArray[np.float64] | None = None,
+    *,
+    overlap: float = 0.8,
+    reach: float = 0.3,
+    samples: int = 30_000,
+    iterations: int = 60,
+) -> Registration:
+    """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
+
+    In every step the ``overlap`` share of the points with the smallest distances counts, so that ghosts and missing
+    parts do not pull; none is farther than ``reach``.
+
+    Args:
+        estimate: Mesh to be moved.
+        reference: Triangle mesh it is moved onto.
+        T_reference_estimate: Where to start; None = as they are.
+        overlap: Share of the estimate that has a counterpart.
+        reach: Largest distance of a pair, metres.
+        samples: Points drawn on the estimate.
+        iterations: Most steps.
+
+    Raises:
+        MapError: A mesh has no faces, or too few points lie within reach.
+    """
+    target = Surface(reference, "the reference")
+    points = Surface(estimate, "the estimate").samples(samples).astype(np.float64)
+    T = np.eye(4) if T_reference_estimate is None else T_reference_estimate.copy()
+    rmse, free, steps = float("nan"), 0, 0
+    while steps < iterations:
+        steps += 1
+        at = points @ T[:3, :3].T + T[:3, 3]
+        distance, anchor, normal = target.nearest_planes(at.astype(np.float32))
+        count = distance <= min(reach, float(np.quantile(distance, overlap)))
+        if np.count_nonzero(count) < 100:
+            raise MapError(
+                f"only {np.count_nonzero(count)} of {samples} points of the estimate lie within {reach:g} m of the "
+                "reference; the two meshes do not overlap where they start: bring them into one frame first"
+            )
+        p, n = at[count], normal[count].astype(np.float64)
+        center = p.mean(axis=0)
+        residual = np.einsum("nd,nd->n", p - anchor[count], n)
+        J = np.concatenate([n, np.cross(p - center, n)], axis=1)  # twist about the centre: well scaled
+        values, vectors = np.linalg.eigh(J.T @ J)
+        determined = values > 1e-5 * values[-1]
+        xi = -(vectors[:, determined] / values[determined]) @ (vectors[:, determined].T @ (J.T @ residual))
+        about = np.eye(4)
+        about[:3, 3] = center
+        T = about @ se3.exp(xi) @ se3.inverse(about) @ T
+        rmse, free = float(np.sqrt(np.mean(residual**2))), int(np.count_nonzero(~determined))
+        if np.linalg.norm(xi[:3]) < 1e-6 and np.linalg.norm(xi[3:]) < 1e-6:
+            break
+    return Registration(T, rmse, steps, free)
+
+
+def moved(mesh: Mesh, T: NDArray[np.float64]) -> Mesh:
+    """The mesh moved by ``T`` (4, 4)."""
+    return Mesh(
+        (mesh.vertices @ T[:3, :3].T + T[:3, 3]).astype(np.float32),
+        mesh.faces,
+        mesh.colors,
+        (mesh.normals @ T[:3, :3].T).astype(np.float32),
+    )
