@@ -70,10 +70,13 @@ def measure_sequence(
     """
     from dudmap.benchmark.score import score_mesh, score_trajectory
     from dudmap.mesh import Mesh
-    from dudmap.run import run
+    from dudmap.run import AHEAD, run
+    from dudmap.synthetic.recording import SyntheticSequence
 
+    ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would take the cores from the system
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
-        report = run(sequence, config, out or Path(temporary), max_frames=max_frames, progress=False)
+        folder = out or Path(temporary)
+        report = run(sequence, config, folder, max_frames=max_frames, progress=False, ahead=ahead)
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)
         truth = sequence.ground_truth

@@ -1,0 +1,157 @@
+"""The accuracy gate: a small fixed set of recordings must not be measured worse than what was recorded."""
+
+import tomllib
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from dudmap.benchmark.entries import Entry
+from dudmap.benchmark.measure import Row, measure_sequence
+from dudmap.benchmark.table import grid
+from dudmap.config import Config
+from dudmap.errors import ConfigError
+
+SMALL = (320, 240)
+WORLDS: dict[str, dict[str, Any]] = {
+    "room-person": {"frames": 60, "speed": 2.0},
+    "room-people-at-start": {"frames": 40, "situation": "people_at_start"},
+    "room-crowd": {"frames": 40, "coverage": 0.35, "start_dynamic": True},
+    "desk-fast-camera": {"frames": 40, "scene": "desk", "movers": (), "camera_path": "fast"},
+}
+EXCERPT = "freiburg1_xyz"
+"""Twelve real frames, in the folder of the test fixtures."""
+FIGURES: dict[str, str] = {
+    "lost": "<=",
+    "ate_rmse_m": "<=",
+    "rotation_rmse_deg": "<=",
+    "mask_iou_mean": ">=",
+    "mesh_accuracy_m": "<=",
+    "mesh_completeness": ">=",
+    "ghost_area_m2": "<=",
+}
+"""What is recorded, and whether a good figure is small or large."""
+MARGINS: dict[str, tuple[float, float]] = {
+    "lost": (0.0, 0.0),
+    "ate_rmse_m": (0.15, 0.001),
+    "rotation_rmse_deg": (0.15, 0.02),
+    "mask_iou_mean": (0.0, 0.03),
+    "mesh_accuracy_m": (0.10, 0.0003),
+    "mesh_completeness": (0.0, 0.01),
+    "ghost_area_m2": (0.20, 0.02),
+}
+"""Written into a new file: how much worse a figure may become, as a share of the recorded one plus an absolute part."""
+
+
+def gate_entries(fixtures: Path) -> list[Entry]:
+    """The recordings of the gate.
+
+    Args:
+        fixtures: Folder that holds the real excerpt.
+    """
+    worlds = [Entry(name, parameters={**parameters, "camera": SMALL}) for name, parameters in WORLDS.items()]
+    return [*worlds, Entry(EXCERPT, fixtures / EXCERPT)]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One figure against its recorded value.
+
+    Attributes:
+        sequence: Name of the recording.
+        figure: Key of the figure.
+        recorded: The reviewed value.
+        bound: The worst value that passes.
+        measured: What was measured, None if it could not be.
+    """
+
+    sequence: str
+    figure: str
+    recorded: float
+    bound: float
+    measured: float | None
+
+    @property
+    def passed(self) -> bool:
+        """Whether the measured figure is no worse than the bound."""
+        if self.measured is None:
+            return False
+        return self.measured <= self.bound if FIGURES[self.figure] == "<=" else self.measured >= self.bound
+
+
+def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
+    """Figures of every recording, in this process."""
+    rows = []
+    for entry in entries:
+        sequence = entry.open()
+        rows.append({"sequence": entry.name} | measure_sequence(sequence, config, entry.surfaces(sequence)))
+    return rows
+
+
+def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Check]:
+    """Every recorded figure of the measured recordings against what was measured.
+
+    Raises:
+        ConfigError: A recording, or the margin of a figure, is not recorded.
+    """
+    checks = []
+    for row in rows:
+        name = row["sequence"]
+        if name not in recorded["figures"]:
+            raise ConfigError(f"the gate has no recorded figures of {name}; record them with --record")
+        for figure, value in recorded["figures"][name].items():
+            if figure not in FIGURES or figure not in recorded["margins"]:
+                raise ConfigError(f"the gate knows no figure or margin {figure!r}; known are {', '.join(FIGURES)}")
+            margin = recorded["margins"][figure]
+            slack = margin["relative"] * abs(value) + margin["absolute"]
+            bound = value + slack if FIGURES[figure] == "<=" else value - slack
+            checks.append(Check(name, figure, value, bound, row.get(figure)))
+    return checks
+
+
+def load_figures(path: Path) -> dict[str, Any]:
+    """The reviewed file: ``margins`` by figure, ``figures`` by recording and figure.
+
+    Raises:
+        ConfigError: It is missing or not what is expected.
+    """
+    try:
+        content = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (OSError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(f"cannot read the gate's figures {path}: {error}; --record makes the file") from error
+    if not {"margins", "figures"} <= set(content):
+        raise ConfigError(f"{path} has no [margins] or no [figures]; --record makes the file anew")
+    return content
+
+
+def save_figures(path: Path, rows: list[Row], margins: Mapping[str, Any] | None = None) -> None:
+    """Write the measured figures as the recorded ones; margins given (those of the old file) are kept."""
+    lines = [
+        "# Recorded figures of the accuracy gate; written by `dudmap benchmark gate --record`, reviewed by a person.",
+        "# A figure may become worse by relative * recorded + absolute.",
+        "",
+        "[margins]",
+    ]
+    default = {figure: {"relative": relative, "absolute": part} for figure, (relative, part) in MARGINS.items()}
+    for figure, margin in {**default, **(margins or {})}.items():
+        lines.append(f"{figure} = {{ relative = {margin['relative']}, absolute = {margin['absolute']} }}")
+    for row in rows:
+        lines += ["", f"[figures.{row['sequence']}]"]
+        lines += [f"{figure} = {round(row[figure], 6)}" for figure in FIGURES if row.get(figure) is not None]
+    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def verdict(checks: list[Check]) -> str:
+    """The checks as a Markdown table."""
+    rows = [
+        [
+            check.sequence,
+            check.figure,
+            f"{check.recorded:.5g}",
+            f"{FIGURES[check.figure]} {check.bound:.5g}",
+            "nothing" if check.measured is None else f"{check.measured:.5g}",
+            "yes" if check.passed else "NO",
+        ]
+        for check in checks
+    ]
+    return grid(["sequence", "figure", "recorded", "allowed", "measured", "passed"], rows)

@@ -1,0 +1,143 @@
+"""The suites: which recordings they consist of and where a user can get them."""
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from dudmap.benchmark.entries import Entry, local_entries
+from dudmap.errors import ConfigError, DatasetError
+
+TUM = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download"
+BONN = "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/"
+ICL_NUIM = "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html"
+CORBS = "http://corbs.dfki.uni-kl.de/"
+VOLUMEDEFORM = "https://www.niessnerlab.org/projects/innmann2016deform.html"
+ICL_CAMERA = "481.2,480,319.5,239.5,640,480,5000"
+
+SUITES: dict[str, str] = {
+    "synthetic": "Analytic worlds with exact truth; needs no data.",
+    "thesis": "The recordings of tables 5.1 to 5.8 of the DUDMap thesis.",
+    "tum-dynamic": "The eight fr3 sitting and walking recordings of TUM RGB-D.",
+    "bonn": "The 24 dynamic and 2 static recordings of Bonn RGB-D Dynamic.",
+    "icl-nuim": "The ICL-NUIM living room, with and without sensor noise.",
+    "local": "Every recording in a folder.",
+}
+
+FR3 = [
+    f"rgbd_dataset_freiburg3_{pose}_{motion}"
+    for pose in ("sitting", "walking")
+    for motion in ("static", "xyz", "rpy", "halfsphere")
+]
+BONN_NAMES = (
+    "balloon balloon2 balloon_tracking balloon_tracking2 crowd crowd2 crowd3 kidnapping_box kidnapping_box2 "
+    "moving_nonobstructing_box moving_nonobstructing_box2 moving_obstructing_box moving_obstructing_box2 "
+    "person_tracking person_tracking2 placing_nonobstructing_box placing_nonobstructing_box2 "
+    "placing_nonobstructing_box3 placing_obstructing_box removing_nonobstructing_box removing_nonobstructing_box2 "
+    "removing_obstructing_box synchronous synchronous2 static static_close_far"
+).split()
+SYNTHETIC: dict[str, dict[str, object]] = {
+    "room-static": {"movers": ()},
+    "room-person": {},
+    "room-people-at-start": {"situation": "people_at_start"},
+    "room-crowd-50": {"coverage": 0.5, "frames": 150},
+    "room-follow": {"situation": "follow"},
+    "room-blocked": {"situation": "blocked"},
+    "room-kidnapped": {"situation": "kidnapped", "frames": 150},
+    "room-stops": {"situation": "stops", "frames": 150},
+    "room-starts": {"situation": "starts", "frames": 150},
+    "room-put-down": {"situation": "put_down", "frames": 150},
+    "room-taken-away": {"situation": "taken_away", "frames": 150},
+    "room-creeper": {"movers": ("creeper",)},
+    "room-fast-camera": {"camera_path": "fast"},
+    "room-blur-exposure": {"motion_blur": 0.5, "exposure_change": 0.15},
+    "corridor-person": {"scene": "corridor"},
+    "desk-ball": {"scene": "desk", "movers": ("ball",)},
+    "yard-people": {"scene": "yard", "movers": ("people",)},
+    "textureless-person": {"scene": "textureless"},
+    "plane-person": {"scene": "plane"},
+    "room-realsense": {"noise": "realsense"},
+}
+QUICK = ("room-static", "room-person", "room-people-at-start")
+
+
+@dataclass(frozen=True)
+class Suite:
+    """Recordings that are there, and those that are not.
+
+    Attributes:
+        name: Name of the suite.
+        entries: What can be measured.
+        missing: What cannot, with the address to get it from.
+    """
+
+    name: str
+    entries: list[Entry]
+    missing: list[Entry]
+
+    def names(self) -> list[str]:
+        """Names of all recordings of the suite, there or not."""
+        return [entry.name for entry in [*self.entries, *self.missing]]
+
+
+def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
+    """The recordings of a suite.
+
+    Args:
+        name: One of ``SUITES``.
+        data: Folder that is searched, two levels deep, for the recordings' folders; only ``synthetic`` needs none.
+        quick: Short: at most three synthetic worlds of 60 frames, at most 60 frames of every recording.
+
+    Raises:
+        ConfigError: There is no such suite, or it needs ``data``.
+        DatasetError: ``data`` is no folder, or holds nothing for the suite ``local``.
+    """
+    if name not in SUITES:
+        raise ConfigError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
+    if name == "synthetic":
+        chosen = [
+            Entry(key, parameters=parameters) for key, parameters in SYNTHETIC.items() if not quick or key in QUICK
+        ]
+        return Suite(name, [_short(entry) for entry in chosen] if quick else chosen, [])
+    if data is None:
+        raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")
+    if name == "local":
+        found, missing = local_entries(data), []
+    else:
+        if not data.is_dir():
+            raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
+        found, missing = _located(_entries(name), data)
+    return Suite(name, [_short(entry) for entry in found] if quick else found, missing)
+
+
+def _short(entry: Entry) -> Entry:
+    if entry.path is None:
+        return replace(entry, parameters={**entry.parameters, "frames": 60})
+    return replace(entry, max_frames=60)
+
+
+def _entries(suite: str) -> list[Entry]:
+    tum = [Entry(name, address=TUM) for name in FR3]
+    bonn = [Entry(f"rgbd_bonn_{name}", address=BONN) for name in BONN_NAMES]
+    rooms = [f"living_room_traj{number}{kind}_frei_png" for kind in ("n", "") for number in range(4)]
+    icl = [Entry(name, address=ICL_NUIM, camera=ICL_CAMERA) for name in rooms]
+    if suite == "tum-dynamic":
+        return tum
+    if suite == "bonn":
+        return bonn
+    if suite == "icl-nuim":
+        return icl
+    named = ("sitting_static", "sitting_xyz", "walking_static", "walking_xyz", "walking_halfsphere")
+    boxes = ("rgbd_bonn_balloon_tracking2", "rgbd_bonn_moving_obstructing_box")
+    return [
+        *(entry for entry in icl if entry.name == "living_room_traj2n_frei_png"),
+        *(Entry(name, address=CORBS) for name in ("D1", "E1")),
+        *(entry for entry in tum if entry.name.endswith(named)),
+        *(entry for entry in bonn if entry.name in boxes),
+        *(Entry(name, address=VOLUMEDEFORM) for name in ("boxing", "sunflower")),
+    ]
+
+
+def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
+    """Entries whose folder is found in ``data`` or one level further down, and the others."""
+    folders = {path.name: path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern)) if path.is_dir()}
+    found = [replace(entry, path=folders[entry.name]) for entry in entries if entry.name in folders]
+    return found, [entry for entry in entries if entry.name not in folders]

@@ -1,0 +1,97 @@
+"""``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, and speed."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from dudmap.benchmark.suites import SUITES
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=True,
+    help="Run a suite of recordings and print one table; check against recorded figures; find the limit of dynamics.",
+)
+
+SystemsOption = Annotated[
+    str,
+    typer.Option(
+        "--systems", help="Comma-separated: dudmap, thesis, threshold, none, em, or paths of .toml configurations."
+    ),
+]
+JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time; times per frame mean most with 1.")]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Less of everything, to see that it works.")]
+
+
+def suite_command(
+    context: typer.Context,
+    systems: SystemsOption = "dudmap",
+    out: Annotated[Path | None, typer.Option("--out", help="Default: runs/benchmark/<suite>.")] = None,
+    data: Annotated[
+        Path | None, typer.Option("--data", help="Folder that holds the recordings; nothing is downloaded.")
+    ] = None,
+    jobs: JobsOption = 1,
+    quick: QuickOption = False,
+    score: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--score",
+            metavar="NAME=FOLDER",
+            help="Score what another system computed: FOLDER/<sequence>/trajectory.txt and mesh.ply; may be repeated.",
+        ),
+    ] = None,
+) -> None:
+    """Measure every recording of the suite; write Markdown, CSV and JSON."""
+    from dudmap.benchmark.report import named_folders, run_suite
+    from dudmap.benchmark.suites import find_suite
+    from dudmap.benchmark.systems import systems as find_systems
+
+    name = str(context.info_name)
+    wanted, others = find_systems(systems), named_folders(score or [])
+    suite = find_suite(name, data, quick=quick)
+    out = out or Path("runs/benchmark") / name
+    typer.echo(run_suite(suite, wanted, others, out, workers=jobs, done=_say))
+    typer.echo(f"written to {out}")
+
+
+for _name, _help in SUITES.items():
+    app.command(_name, help=_help)(suite_command)
+
+
+def _say(row: dict[str, Any]) -> None:
+    outcome = row.get("error") or f"{row.get('tracked', row.get('frames'))} of {row.get('frames')} frames"
+    typer.echo(f"{row['sequence']}, {row['system']}: {outcome}", err=True)
+
+
+@app.command()
+def gate(
+    figures: Annotated[
+        Path, typer.Option("--figures", help="The reviewed file of recorded figures and margins.")
+    ] = Path("tests/gate.toml"),
+    fixtures: Annotated[
+        Path, typer.Option("--fixtures", help="Folder that holds the real excerpt freiburg1_xyz.")
+    ] = Path("tests/fixtures"),
+    record: Annotated[
+        bool, typer.Option("--record", help="Rewrite the figures with what is measured now; margins stay.")
+    ] = False,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a parameter; may be repeated.")
+    ] = None,
+) -> None:
+    """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
+    from dudmap.benchmark import gate as gates
+    from dudmap.config import Config
+
+    old = gates.load_figures(figures) if figures.is_file() or not record else None
+    rows = gates.measure_gate(gates.gate_entries(fixtures), Config().override(assignments or []))
+    if record:
+        gates.save_figures(figures, rows, old["margins"] if old else None)
+        typer.echo(f"recorded in {figures}; review the difference before committing it")
+        return
+    assert old is not None
+    checks = gates.compare(rows, old)
+    typer.echo(gates.verdict(checks))
+    failed = sum(not check.passed for check in checks)
+    if failed:
+        typer.echo(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
+        raise typer.Exit(1)
