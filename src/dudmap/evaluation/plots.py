@@ -1,0 +1,182 @@
+"""Pictures of trajectory, surface and mask errors. Each function writes one PNG."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError, DudmapError
+from dudmap.evaluation.reconstruction import SurfaceResult
+from dudmap.evaluation.segmentation import MaskResult
+from dudmap.evaluation.trajectory import AteResult, RpeResult
+from dudmap.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
+
+
+def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, result: AteResult) -> None:
+    """Aligned estimate over the reference, seen along the direction in which the camera moved least, and by axis."""
+    aligned = (result.T_reference_estimate @ estimate.Ts_world_camera)[:, :3, 3]
+    start, end = result.timestamps[0] - 0.1, result.timestamps[-1] + 0.1
+    during = (reference.timestamps >= start) & (reference.timestamps <= end)
+    true, t0 = reference.Ts_world_camera[during, :3, 3], result.timestamps[0]
+    across, up = np.sort(np.argsort(-np.ptp(true, axis=0), kind="stable")[:2])
+    figure, (view, by_time) = _figure(2, width=13)
+    view.plot(true[:, across], true[:, up], color=REFERENCE, linewidth=1.5, label="reference")
+    _line_with_gaps(view, estimate.timestamps, aligned[:, across], aligned[:, up], "estimate, aligned")
+    view.plot(*true[0, [across, up]], "o", color=REFERENCE, markersize=6, label="start")
+    view.set(xlabel=f"{'xyz'[across]}, m", ylabel=f"{'xyz'[up]}, m", title=f"ATE RMSE {1000 * result.rmse:.1f} mm")
+    view.set_aspect("equal", adjustable="datalim")
+    view.legend()
+    for axis, color in enumerate(("#b03a2e", "#2e8b57", "#2f6fb5")):
+        offset = true[0, axis]
+        by_time.plot(reference.timestamps[during] - t0, true[:, axis] - offset, color=color, alpha=0.45, linewidth=2.5)
+        by_time.plot(
+            estimate.timestamps - t0, aligned[:, axis] - offset, ".", color=color, markersize=2.5, label="xyz"[axis]
+        )
+    by_time.set(xlabel="time, s", ylabel="position from the start, m", title="band: reference; dots: estimate")
+    by_time.legend(markerscale=4)
+    _save(figure, path)
+
+
+def plot_error(path: Path, result: AteResult) -> None:
+    """Distance and angle to the true pose over time."""
+    figure, (translation, rotation) = _figure(2, rows=True)
+    t = result.timestamps - result.timestamps[0]
+    translation.plot(t, 1000 * result.errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
+    _rules(translation, {"RMSE": 1000 * result.rmse, "median": 1000 * result.median})
+    translation.set(ylabel="position error, mm", title=f"absolute error, alignment: {result.alignment}")
+    rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
+    _rules(rotation, {"RMSE": result.rot_rmse_deg, "median": result.rot_median_deg})
+    rotation.set(xlabel="time, s", ylabel="orientation error, deg")
+    _save(figure, path)
+
+
+def plot_rpe(path: Path, result: RpeResult) -> None:
+    """Relative error over time."""
+    figure, (translation, rotation) = _figure(2, rows=True)
+    t = result.timestamps - result.timestamps[0]
+    per = f"over {result.delta:g} {result.unit}"
+    translation.plot(t, 1000 * result.trans_errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
+    _rules(translation, {"RMSE": 1000 * result.trans_rmse, "median": 1000 * result.trans_median})
+    translation.set(ylabel=f"translation, mm {per}", title=f"relative pose error {per}")
+    rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
+    _rules(rotation, {"RMSE": result.rot_rmse_deg, "median": result.rot_median_deg})
+    rotation.set(xlabel="time of the first pose, s", ylabel=f"rotation, deg {per}")
+    _save(figure, path)
+
+
+def plot_residuals(path: Path, residuals: Path) -> None:
+    """Histogram of the registration residuals with the fitted mixture.
+
+    Args:
+        path: The picture.
+        residuals: NPZ file with ``edges`` (B + 1,) in standard deviations of the reading, ``counts`` (B,), and of the
+            fitted mixture of two half-normal densities (static, dynamic) ``prior`` (2,) and ``sigma`` (2,).
+
+    Raises:
+        DatasetError: The file does not hold these.
+    """
+    try:
+        with np.load(residuals) as data:
+            edges, counts, prior, sigma = (data[key].astype(float) for key in ("edges", "counts", "prior", "sigma"))
+    except (OSError, ValueError, KeyError) as error:
+        raise DatasetError(f"{residuals} does not hold edges, counts, prior and sigma of residuals: {error}") from error
+    figure, (axes,) = _figure(1)
+    widths, r = np.diff(edges), np.linspace(edges[0], edges[-1], 600)
+    axes.bar(
+        edges[:-1], counts / max(counts.sum(), 1) / widths, widths, align="edge", color="#b9c4d0", label="residuals"
+    )
+    parts = [p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2) for p, s in zip(prior, sigma, strict=True)]
+    for part, name, color, p, s in zip(parts, ("static", "dynamic"), (SECOND, ESTIMATE), prior, sigma, strict=True):
+        axes.plot(r, part, color=color, label=f"{name}: {100 * p:.1f} %, sigma {s:.2f}")
+    axes.plot(r, sum(parts), color=REFERENCE, linewidth=1, linestyle="--", label="mixture")
+    axes.set(xlabel="residual, standard deviations of the reading", ylabel="density", yscale="log")
+    low = counts[counts > 0].min() / counts.sum() / widths.max() if counts.any() else 1e-6
+    axes.set_ylim(bottom=low / 2)
+    axes.set_title("residuals of the registration and the fitted mixture")
+    axes.legend()
+    _save(figure, path)
+
+
+def plot_surface(path: Path, result: SurfaceResult) -> None:
+    """Histograms of both distances, and the share of surface within a distance."""
+    figure, (histogram, cumulated) = _figure(2, width=13)
+    edges, width = 1000 * result.histogram_edges, 1000 * float(np.diff(result.histogram_edges[:2])[0])
+    rows = (
+        ("estimate to reference (accuracy)", result.accuracy_histogram, result.accuracy, ESTIMATE),
+        ("reference to estimate (completeness)", result.completeness_histogram, result.completeness, SECOND),
+    )
+    for name, shares, statistics, color in rows:
+        label = f"{name}\nmean {1000 * statistics.mean:.1f}, median {1000 * statistics.median:.1f} mm"
+        histogram.stairs(100 * shares, edges, color=color, label=label, fill=False, linewidth=1.5)
+        cumulated.plot(edges[1:-1], 100 * np.cumsum(shares)[:-1], color=color, label=name)
+    histogram.set(xlabel=f"distance, mm (last bin: {edges[-2]:.0f} and more)", yscale="log")
+    histogram.set_ylabel(f"% of the surface per {width:.0f} mm")
+    histogram.legend()
+    for score in result.scores:
+        cumulated.axvline(1000 * score.distance, color="#999999", linewidth=0.8)
+        at = f"{1000 * score.distance:g} mm\nF {score.f_score:.3f}"
+        cumulated.annotate(at, (1000 * score.distance, 2), xytext=(3, 0), textcoords="offset points", fontsize=8)
+    area = "" if result.ghost_area_m2 is None else f" ({result.ghost_area_m2:.2f} m2)"
+    beyond = f"{100 * result.ghost_share:.2f} %{area} farther than {1000 * result.ghost_distance:g} mm"
+    cumulated.set(xlabel="distance, mm", ylabel="% of the surface within", ylim=(0, 101), title=f"ghosts: {beyond}")
+    cumulated.legend(loc="center right")
+    _save(figure, path)
+
+
+def plot_masks(path: Path, result: MaskResult) -> None:
+    """Intersection over union, and the true and found shares of the image, over time."""
+    figure, (quality, shares) = _figure(2, rows=True)
+    t = result.timestamps - result.timestamps[0]
+    scored = result.coverage > result.scored_coverage
+    quality.plot(t[scored], result.iou[scored], ".", color=ESTIMATE, markersize=4, label="IoU")
+    quality.plot(t[scored], result.recall[scored], color=SECOND, linewidth=0.8, label="recall")
+    quality.plot(t[scored], result.precision[scored], color="#2e8b57", linewidth=0.8, label="precision")
+    quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * result.scored_coverage:g} % moving")
+    quality.set_title(f"mean IoU {result.mean_iou:.3f} over {result.num_scored} frames")
+    quality.legend(loc="lower left")
+    shares.fill_between(t, 100 * result.coverage, color="#b9c4d0", label="truly moves")
+    shares.plot(t, 100 * result.found_share, color=ESTIMATE, linewidth=1, label="found to move")
+    shares.set(xlabel="time, s", ylabel="% of the image")
+    shares.legend()
+    _save(figure, path)
+
+
+def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Figure, NDArray[np.object_]]":
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, 6.5 if rows else 5.5), dpi=110, layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(count, 1, sharex=True, squeeze=False) if rows else figure.subplots(1, count, squeeze=False)
+    for one in axes.ravel():
+        one.grid(alpha=0.25)
+    return figure, axes.ravel()
+
+
+def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, label: str) -> None:
+    """A line that is broken where frames are missing."""
+    x, y = x.copy(), y.copy()
+    steps = np.diff(stamps)
+    breaks = np.flatnonzero(steps > 3 * np.median(steps)) + 1 if len(steps) else np.array([], dtype=int)
+    axes.plot(np.insert(x, breaks, np.nan), np.insert(y, breaks, np.nan), color=ESTIMATE, linewidth=1.2, label=label)
+
+
+def _rules(axes: "Axes", levels: dict[str, float]) -> None:
+    for style, (name, level) in zip(("--", ":"), levels.items(), strict=True):
+        axes.axhline(level, color=REFERENCE, linestyle=style, linewidth=1, label=f"{name} {level:.3g}")
+    axes.set_ylim(bottom=0)
+    axes.legend()
+
+
+def _save(figure: "Figure", path: Path) -> None:
+    try:
+        figure.savefig(path)
+    except OSError as error:
+        raise DudmapError(f"cannot write the picture {path}: {error.strerror or error}") from error
