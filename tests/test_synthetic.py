@@ -242,10 +242,13 @@ def test_velocity_is_the_motion_of_the_mover():
     assert np.allclose(now.velocity, moved, atol=0.01)
 
 
-@pytest.mark.parametrize("share", [0.1, 0.5, 0.8])
-def test_coverage_is_met(share):
-    recording = synthetic.sequence(camera=TINY, frames=40, coverage=share, start_dynamic=True, noise="none")
-    assert np.mean([recording.mask(k).mean() for k in range(0, 40, 3)]) == pytest.approx(share, abs=0.12)
+@pytest.mark.parametrize(("share", "speed"), [(0.1, None), (0.5, 0.05), (0.9, 3.0)])
+def test_coverage_is_met(share, speed):
+    recording = synthetic.sequence(camera=TINY, frames=120, coverage=share, speed=speed, noise="none")
+    assert not recording.mask(10).any()
+    assert np.mean([recording.mask(k).mean() for k in range(85, 120, 3)]) == pytest.approx(share, abs=0.05)
+    speeds = [np.linalg.norm(state.velocity) for state in recording.movers(110)]
+    assert np.allclose(speeds, speed or 1.0, rtol=0.02)
 
 
 @pytest.mark.parametrize(("path", "speed", "turn"), [("handheld", 0.2, 10), ("slow", 0.06, 3), ("fast", 0.6, 45)])
@@ -344,6 +347,7 @@ def test_folder_opens_again_as_the_same_recording(tmp_path):
         ({"camera_path": "zigzag"}, "camera path 'zigzag' is neither a trajectory file nor one of handheld"),
         ({"situation": "fog"}, "unknown situation 'fog'; known situations: people_at_start"),
         ({"coverage": 1.5}, "coverage is 1.5"),
+        ({"coverage": 0.8, "scene": "desk"}, "the densest crowd in scene 'desk' hides"),
         ({"coverage": 0.5, "movers": ("ball",)}, "coverage is made of people"),
         ({"frames": 0}, "frames is 0"),
         ({"fps": 0.0}, "fps is 0.0"),

@@ -11,7 +11,6 @@ from dudmap.synthetic.render import Renderer
 from dudmap.synthetic.scene import pose
 
 ENTRY_SPEED = 3.0  # m/s, so that also the slowest crowd is soon in view
-STEADY = 2.7  # seconds after which the crowd fills the view (when it is not there from the start)
 
 
 class Crowd:
@@ -25,7 +24,7 @@ class Crowd:
     def __init__(self, staging: Staging, density: float) -> None:
         scene, size = staging.scene, staging.scene.mover_scale
         self.speed = staging.pace(1.0)
-        self.spacing = size * float(np.exp((1 - density) * np.log(6.0) + density * np.log(0.34)))
+        self.spacing = size * float(np.exp((1 - density) * np.log(6.0) + density * np.log(0.11)))
         self.distance = size * (2.3 - 1.6 * density**0.7)
         home = scene.home
         forward = np.array([home[0, 2], home[1, 2]]) / np.hypot(home[0, 2], home[1, 2])
@@ -60,7 +59,7 @@ class Crowd:
 
     def _person(self, number: int) -> Mover:
         figure, ground = self.figures[number % len(self.figures)], self.staging.scene.ground
-        side = 0.05 * self.staging.scene.mover_scale * ((number * 7) % 5 - 2)  # not all in one line
+        side = 0.10 * self.staging.scene.mover_scale * ((number * 7) % 5 - 2)  # not all in one line
         yaw = float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))
         across = np.array([-self.direction[1], self.direction[0]])
 
@@ -77,39 +76,56 @@ class Crowd:
         return Mover("person", figure.primitives, parts, reference, lambda t: way(t) >= 0, settles=False)
 
 
-def _coverage(crowd: Crowd) -> float:
-    """Mean share of the image that the crowd hides from the scene's home pose once it is there."""
+def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]) -> float:
+    """Mean share of the image that the crowd hides in frames at ``times`` (N,) with poses (N, 4, 4)."""
     scene, movers = crowd.staging.scene, crowd.movers()
     camera = Camera(66.0, 66.0, 39.5, 29.5, 80, 60)
     renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
-    start, shares = crowd.steady_from(), []
-    for k in range(6):  # one passing of the gap between two people
-        t = start + k / 6 * crowd.spacing / crowd.speed
+    shares = []
+    for t, T in zip(times, Ts_world_camera, strict=True):
         Ts = np.concatenate([m.parts(t) @ np.array([p.T_body_primitive for p in m.primitives]) for m in movers])
-        image = renderer.render(camera, scene.home, Ts, np.ones(len(Ts), dtype=bool), with_color=False)
+        present = np.concatenate([np.full(len(m.primitives), m.present(t)) for m in movers])
+        image = renderer.render(camera, T, Ts, present, with_color=False)
         shares.append(float((image.primitive >= len(scene.primitives)).mean()))
     return float(np.mean(shares))
 
 
-def crowd_of(coverage: float, staging: Staging) -> Crowd:
-    """The crowd that hides ``coverage`` of the image on average, seen from the scene's home pose.
+def crowd_of(
+    coverage: float, staging: Staging, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]
+) -> Crowd:
+    """The crowd that hides ``coverage`` of the image, on average over the frames once it is there.
+
+    Args:
+        coverage: Share of the image.
+        staging: Scene, chance, speed, duration, and whether it is there at the first frame.
+        times: (N,) seconds of the frames.
+        Ts_world_camera: (N, 4, 4) their poses.
 
     Raises:
-        ConfigError: The share is not between 0.02 and 0.95.
+        ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene hides so much.
     """
     if not 0.02 <= coverage <= 0.95:
         raise ConfigError(f"coverage is {coverage}; expected a share of the image from 0.02 to 0.95")
-    low, high = 0.0, 1.0
     seed = int(staging.rng.integers(2**32))
 
-    def attempt(density: float) -> Crowd:
+    def attempt(density: float) -> tuple[Crowd, float]:
         rng = np.random.default_rng(seed)
-        return Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
+        crowd = Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
+        there = np.flatnonzero(times >= min(crowd.steady_from(), 0.75 * times[-1]))
+        chosen = there[np.unique(np.linspace(0, len(there) - 1, 8).astype(int))]
+        return crowd, _coverage(crowd, times[chosen], Ts_world_camera[chosen])
 
-    for _ in range(9):
+    low, high = 0.0, 1.0
+    best, reached = attempt(high)
+    if reached < coverage - 0.02:
+        raise ConfigError(
+            f"coverage is {coverage}, but the densest crowd in scene {staging.scene.name!r} hides {reached:.2f} of the "
+            "image; ask for less or take another scene"
+        )
+    for _ in range(8):
         middle = (low + high) / 2
-        if _coverage(attempt(middle)) < coverage:
-            low = middle
-        else:
-            high = middle
-    return attempt(high)
+        crowd, share = attempt(middle)
+        if abs(share - coverage) < abs(reached - coverage):
+            best, reached = crowd, share
+        low, high = (middle, high) if share < coverage else (low, middle)
+    return best

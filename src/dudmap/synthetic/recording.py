@@ -16,7 +16,7 @@ from dudmap.frame import Frame
 from dudmap.mesh import Mesh
 from dudmap.synthetic.crowd import crowd_of
 from dudmap.synthetic.movers import MOVING_SPEED, Mover, Staging, build_movers
-from dudmap.synthetic.paths import camera_poses
+from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.rooms import build_scene
 from dudmap.synthetic.scene import Scene
@@ -271,7 +271,10 @@ def make_sequence(
         if movers is not None and set(names) - {"person", "people"}:
             raise ConfigError(f"coverage is made of people, but the movers are {', '.join(names)}; drop one of the two")
         names = ("crowd",)
-        actors = crowd_of(coverage, staging).movers()
+        alone = (
+            PATHS["still"](world, staging.rng, times) if path == FOLLOW else camera_poses(path, world, times, seed, [])
+        )
+        actors = crowd_of(coverage, staging, times, alone).movers()
     else:
         names = names if coverage is None else ()
         actors = build_movers(names, staging)
