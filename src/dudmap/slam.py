@@ -14,6 +14,7 @@ from dudmap.camera import Camera
 from dudmap.config import Config
 from dudmap.dynamics import DynamicDetector, Labels, full_mask, grown_mask
 from dudmap.frame import Frame
+from dudmap.health import TrackingHealth
 from dudmap.motion import MotionModel
 from dudmap.preprocess import Observation, Preprocessor, pyramid
 from dudmap.similarity import SimilarityTest
@@ -72,6 +73,7 @@ class Slam:
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
+        self.health = TrackingHealth()
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
 
@@ -96,11 +98,17 @@ class Slam:
         if self.volume.is_empty:
             return self._start(frame, observation, clock)
         tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), clock)
-        reason = tracked.reason or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
+        reason = (
+            tracked.reason
+            or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
+            or self.health.doubt(tracked)
+        )
         if reason:
             self.motion.lost()
+            self.health.lost()
             return self._result(frame, observation, clock, levels, labels, tracked, reason, fused=False)
         self.motion.update(frame.timestamp, tracked.T_world_camera)
+        self.health.tracked(tracked)
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)

@@ -1,0 +1,46 @@
+"""Is a registration as good as those before it? Catches wrong minima that pass every absolute check."""
+
+from collections import deque
+
+import numpy as np
+
+from dudmap.tracker import TrackingResult
+
+MEMORY = 30
+"""Tracked frames that are remembered."""
+
+
+class TrackingHealth:
+    """Compares a registration's residual and share of readings on the map with the recent ones.
+
+    A registration that slid into a wrong minimum explains the frame much worse than its predecessors were explained,
+    though still well enough for any fixed threshold. After a loss the first guess is poor and such minima are common,
+    so that the comparison is stricter until tracking has been found again.
+    """
+
+    def __init__(self) -> None:
+        self._residuals: deque[float] = deque(maxlen=MEMORY)
+        self._shares: deque[float] = deque(maxlen=MEMORY)
+        self.recovering = False
+
+    def doubt(self, tracked: TrackingResult) -> str:
+        """Sentence on what is much worse than before, empty if nothing is."""
+        if len(self._residuals) < 5:
+            return ""
+        residual, share = float(np.median(self._residuals)), float(np.median(self._shares))
+        worse, fewer = (1.6, 0.7) if self.recovering else (4.0, 0.3)
+        if tracked.residual > worse * residual:
+            return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
+        if tracked.inlier_share < fewer * share:
+            return f"only {tracked.inlier_share:.0%} of the readings fall on the map, {share:.0%} were usual"
+        return ""
+
+    def tracked(self, tracked: TrackingResult) -> None:
+        """Take over a registration that passed."""
+        self._residuals.append(tracked.residual)
+        self._shares.append(tracked.inlier_share)
+        self.recovering = False
+
+    def lost(self) -> None:
+        """From here on, until a frame is tracked, only registrations like those before the loss are believed."""
+        self.recovering = True
