@@ -1,10 +1,8 @@
 """From a scene, its movers and a camera pose to exact depth, colour and the visible primitive of every pixel."""
 
-import os
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,22 +10,14 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.camera import Camera
 from dudmap.kernels import scenes as kernels
+from dudmap.kernels.threads import bands, run_bands
 from dudmap.synthetic.scene import Primitive, Scene
 from dudmap.synthetic.textures import TEXTURES, build_atlas
 
 
-@lru_cache(maxsize=1)
-def workers() -> ThreadPoolExecutor:
-    """The threads that share an image's rows: as many as there are processors."""
-    return ThreadPoolExecutor(os.cpu_count() or 1, thread_name_prefix="scene")
-
-
-def over_rows(count: int, work, *arguments: object) -> None:  # noqa: ANN001 - a compiled kernel
-    """Run ``work(row_from, row_to, *arguments)`` over bands of rows on all threads."""
-    bands = min(count, 4 * (os.cpu_count() or 1))
-    edges = np.linspace(0, count, bands + 1).astype(int)
-    for job in [workers().submit(work, a, b, *arguments) for a, b in pairwise(edges)]:
-        job.result()
+def over_rows(count: int, work: Callable[..., None], *arguments: object) -> None:
+    """Run the kernel ``work(row_from, row_to, *arguments)`` over all rows, in bands on all threads."""
+    run_bands(lambda start, stop: work(start, stop, *arguments), bands(count, max(count // 10, 1)))
 
 
 @dataclass(frozen=True, eq=False)
