@@ -82,6 +82,7 @@ class Mesh:
             MapError: The file is missing, unreadable or empty.
         """
         import trimesh
+        from trimesh.visual import ColorVisuals, TextureVisuals
 
         path = Path(path)
         try:
@@ -95,9 +96,8 @@ class Mesh:
             raise MapError(f"the mesh {path} holds no vertices")
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int32).reshape(-1, 3)
         if isinstance(loaded, trimesh.Trimesh):
-            visual = loaded.visual
-            if not isinstance(visual, trimesh.visual.ColorVisuals):
-                visual = visual.to_color()
+            visual = loaded.visual.to_color() if isinstance(loaded.visual, TextureVisuals) else loaded.visual
+            assert isinstance(visual, ColorVisuals)
             colors = np.asarray(visual.vertex_colors, dtype=np.uint8)[:, :3]
             normals = np.asarray(loaded.vertex_normals, dtype=np.float32)
         else:
