@@ -28,11 +28,10 @@ class TrackingHealth:
         if len(self._residuals) < 5:
             return ""
         residual, share = float(np.median(self._residuals)), float(np.median(self._shares))
-        worse, fewer = (1.6, 0.7) if self.recovering else (4.0, 0.3)
-        if tracked.residual > worse * residual:
+        if tracked.residual > (1.6 if self.recovering else 4.0) * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
-        if tracked.inlier_share < fewer * share:
-            return f"only {tracked.inlier_share:.0%} of the readings fall on the map, {share:.0%} were usual"
+        if self.recovering and tracked.inlier_share < 0.6 * share:
+            return f"only {tracked.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
         return ""
 
     def tracked(self, tracked: TrackingResult) -> None:

@@ -31,7 +31,7 @@ class LinearSystem:
         b: (6,) float64, gradient of the cost.
         cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
         num_inliers: Readings on the map.
-        num_readings: Readings.
+        readings: Sum of the static weights of all readings.
         weight: Sum of the static weights of the readings on the map.
         chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
         residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
@@ -41,7 +41,7 @@ class LinearSystem:
     b: NDArray[np.float64]
     cost: float
     num_inliers: int
-    num_readings: int
+    readings: float
     weight: float
     chi_square: float
     residuals: NDArray[np.float32]
@@ -56,7 +56,7 @@ class TrackingResult:
         exposure: Gain and offset that make the frame's intensities those of the map.
         converged: Whether all checks passed.
         reason: The failed check, empty if none.
-        inlier_share: Share of the readings that fall on the map.
+        inlier_share: Share of the static readings that fall on the map.
         residual: Root mean square distance residual, metres at one metre depth.
         condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
         iterations: Linearisations over all levels.
@@ -175,7 +175,7 @@ class Tracker:
         H[np.triu_indices(6)] = total[:21]
         H = H + np.triu(H, 1).T
         return LinearSystem(
-            H, total[21:27], float(total[27]), int(total[28]), int(total[29]), float(total[30]), float(total[31]),
+            H, total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]), float(total[31]),
             residuals,
         )  # fmt: skip
 
@@ -184,13 +184,13 @@ class Tracker:
     ) -> TrackingResult:
         """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
         config = self.config
-        share = system.num_inliers / max(system.num_readings, 1)
+        share = system.weight / max(system.readings, 1.0)
         residual = float(np.sqrt(system.chi_square / max(system.weight, 1e-9)))
         scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
         if share < config.min_inliers or system.weight < 100:
-            reason = f"only {share:.0%} of the readings fall on the map"
+            reason = f"only {share:.0%} of the static readings fall on the map"
         elif residual > config.max_residual * (self.sensor.sigma_base + self.sensor.sigma_scale):
             reason = f"readings lie {1000 * residual:.1f} mm off the map"
         elif condition < config.min_condition:

@@ -10,7 +10,7 @@ import numpy as np
 from dudmap.kernels.threads import kernel
 
 NUM_SUMS = 32
-"""21 of H, 6 of b, cost, pixels on the map, pixels with a reading, sum of the weights, sum of squared normal residuals."""
+"""21 of H, 6 of b, cost, pixels on the map, weight of all readings, weight of those on the map, weighted squares."""
 
 
 @kernel
@@ -197,7 +197,7 @@ def linearize(
             cost += used * (geometric_cost + color_weight * color_cost)
             cost += missing * (worst + color_weight * worst_color)
             on_map += one if valid else zero
-            readings += one if z > zero else zero
+            readings += static if z > zero else zero
             total_weight += used
             chi += used * robust * rn * rn
 
