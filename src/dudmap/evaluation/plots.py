@@ -119,10 +119,11 @@ def plot_surface(path: Path, result: SurfaceResult) -> None:
     histogram.set(xlabel=f"distance, mm (last bin: {edges[-2]:.0f} and more)", yscale="log")
     histogram.set_ylabel(f"% of the surface per {width:.0f} mm")
     histogram.legend()
-    for score in result.scores:
+    for row, score in enumerate(result.scores):
         cumulated.axvline(1000 * score.distance, color="#999999", linewidth=0.8)
-        at = f"{1000 * score.distance:g} mm\nF {score.f_score:.3f}"
-        cumulated.annotate(at, (1000 * score.distance, 2), xytext=(3, 0), textcoords="offset points", fontsize=8)
+        text = f"{1000 * score.distance:g} mm: F {score.f_score:.3f}"
+        at = (1000 * score.distance, 3 + 6 * (row % 6))
+        cumulated.annotate(text, at, xytext=(4, 0), textcoords="offset points", fontsize=9)
     area = "" if result.ghost_area_m2 is None else f" ({result.ghost_area_m2:.2f} m2)"
     beyond = f"{100 * result.ghost_share:.2f} %{area} farther than {1000 * result.ghost_distance:g} mm"
     cumulated.set(xlabel="distance, mm", ylabel="% of the surface within", ylim=(0, 101), title=f"ghosts: {beyond}")

@@ -85,8 +85,8 @@ class Surface:
         """Distances (N,) of points (N, 3) to the surface, metres.
 
         Exact for the triangles of the nearest anchors: every triangle has one at its centre, and large ones more, at
-        the spacing that spreads ``ANCHORS`` of them over the surface. A nearer triangle is missed only where many
-        small ones crowd, and then by less than their size.
+        the spacing that spreads ``ANCHORS`` of them over the surface. A nearer triangle is missed only where all the
+        anchors near a point lie on its neighbours, and then by less than the anchors' spacing.
         """
         out = np.empty(len(points), np.float32)
         for start in range(0, len(points), BATCH):

@@ -1,0 +1,166 @@
+"""dudmap evaluate: the three forms, their JSON, their files, and one sentence for every mistake."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dudmap import se3
+from dudmap.cli import app
+from dudmap.mesh import Mesh
+from dudmap.trajectory import Trajectory
+
+
+def evaluate(*arguments):
+    return CliRunner().invoke(app, ["evaluate", *(str(argument) for argument in arguments)])
+
+
+def figures(*arguments):
+    outcome = evaluate(*arguments, "--json")
+    assert outcome.exit_code == 0, outcome.output
+    assert len(outcome.stdout.splitlines()) == 1
+    return json.loads(outcome.stdout)
+
+
+def tetrahedron(shift=0.0):
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32) + np.float32(shift)
+    faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]], np.int32)
+    return Mesh(vertices, faces, np.full((4, 3), 90, np.uint8), np.eye(4, 3, dtype=np.float32))
+
+
+@pytest.fixture
+def folders(tmp_path):
+    """A run of 50 of 60 frames and its recording: 1 cm of noise, another world frame, masks and meshes."""
+    random = np.random.default_rng(2)
+    stamps = np.arange(60) / 30
+    waves = np.stack([np.sin((1 + 0.2 * k) * stamps + k) for k in range(6)], axis=1)
+    true = Trajectory(stamps, np.array([se3.exp(0.6 * xi) for xi in waves]))
+    first = se3.inverse(true.Ts_world_camera[0])
+    noise = np.zeros((60, 4, 4))
+    noise[1:, :3, 3] = random.normal(0, 0.01, (59, 3))
+    run, recording = tmp_path / "run", tmp_path / "recording"
+    (run / "masks").mkdir(parents=True)
+    (recording / "mask").mkdir(parents=True)
+    true.save(recording / "groundtruth.txt")
+    Trajectory(stamps[:50], (first @ true.Ts_world_camera + noise)[:50]).save(run / "trajectory.txt")
+    (recording / "depth.txt").write_text("".join(f"{t:.6f} depth/{t}.png\n" for t in stamps))
+    tetrahedron().save(recording / "surface.ply")
+    mesh = tetrahedron()
+    Mesh(
+        (mesh.vertices @ first[:3, :3].T + first[:3, 3]).astype(np.float32), mesh.faces, mesh.colors, mesh.normals
+    ).save(run / "mesh.ply")
+    mask = np.zeros((12, 16), np.uint8)
+    mask[:6] = 255
+    for t in stamps[:50]:
+        cv2.imwrite(str(run / f"masks/{t:.6f}.png"), mask)
+        cv2.imwrite(str(recording / f"mask/{t:.6f}.png"), 255 - mask if t > 1 else mask)
+    (recording / "mask.txt").write_text("".join(f"{t:.6f} mask/{t:.6f}.png\n" for t in stamps[:50]))
+    return run, recording
+
+
+def test_trajectory_of_a_run(folders):
+    run, recording = folders
+    out = figures(run, "--reference", recording)
+    assert out["ate_rmse_m"] == pytest.approx(0.01 * np.sqrt(3), rel=0.15)
+    assert out["ate_mean_m"] < out["ate_rmse_m"] < out["ate_max_m"]
+    assert out["rpe_trans_rmse_m_per_s"] == pytest.approx(0.01 * np.sqrt(6), rel=0.25)
+    assert out["rpe_rot_rmse_deg_per_s"] < 1e-3
+    assert out["rpe_trans_rmse_m_per_m"] is not None
+    assert out["tracked_share"] == pytest.approx(50 / 60, abs=1e-5)
+    assert out["alignment"] == "se3"
+    assert json.loads((run / "evaluation.json").read_text()) == out
+    (run / "metrics.json").write_text('{"frames": 100}')
+    assert figures(run / "../run", "--reference", recording / "groundtruth.txt")["tracked_share"] == 0.5
+
+
+def test_options_may_come_first_and_files_do(folders, tmp_path):
+    run, recording = folders
+    out = figures("--reference", recording, "--align", "origin", "--out", tmp_path / "scores", run / "trajectory.txt")
+    assert out["alignment"] == "origin"
+    assert out["ate_rmse_m"] == out["drift_rmse_m"]
+    assert (tmp_path / "scores" / "trajectory.evaluation.json").is_file()
+
+
+def test_without_a_reference_only_the_path_is_told(folders):
+    run, recording = folders
+    out = figures(run)
+    assert out["reference"] is None
+    assert out["tracked_share"] is None
+    assert out["poses"] == 50
+    assert "ate_rmse_m" not in out
+    (run / "groundtruth.txt").write_text((recording / "groundtruth.txt").read_text())
+    assert figures(run)["ate_rmse_m"] > 0
+
+
+def test_mesh_of_a_run_is_moved_into_the_true_world(folders):
+    run, recording = folders
+    out = figures("mesh", run, recording, "--samples", 2000)
+    assert out["accuracy_rmse_m"] < 1e-3
+    assert out["f_score_10mm"] == 1
+    assert out["ghost_area_m2"] == 0
+    assert len(out["histogram"]["accuracy"]) + 1 == len(out["histogram"]["edges_m"])
+    assert len(Mesh.load(run / "mesh_error.ply").faces) == 4
+    apart = figures("mesh", run / "mesh.ply", recording / "surface.ply", "--samples", 2000, "--no-error-mesh")
+    assert apart["accuracy_rmse_m"] > 0.1
+    aligned = figures("mesh", run, recording, "--align", "--samples", 2000, "--distances", "0.002")
+    assert aligned["icp_rmse_m"] < 1e-3
+    assert aligned["precision_2mm"] > 0.99
+
+
+def test_masks_of_a_run(folders):
+    run, recording = folders
+    out = figures("masks", run, recording, "--per-frame")
+    right = 31  # 0 to 1 s
+    assert out["mean_iou"] == pytest.approx(right / 50)
+    assert out["overall_iou"] == pytest.approx(right / (50 + 50 - right))
+    assert out["scored_frames"] == 50
+    assert len(out["per_frame"]["iou"]) == 50
+    assert json.loads((run / "masks.evaluation.json").read_text()) == out
+
+
+def test_pictures(folders):
+    run, recording = folders
+    edges = np.linspace(0, 16, 129)
+    np.savez(run / "residuals.npz", edges=edges, counts=np.arange(128)[::-1], prior=[0.8, 0.2], sigma=[1.0, 6.0])
+    outcome = evaluate(run, "--reference", recording, "--plots")
+    assert outcome.exit_code == 0, outcome.output
+    assert "ate_rmse_m" in outcome.stdout
+    assert evaluate("mesh", run, recording, "--plots", "--samples", 2000).exit_code == 0
+    assert evaluate("masks", run, recording, "--plots").exit_code == 0
+    for name in ("trajectory", "error", "rpe", "residuals", "mesh_error", "masks"):
+        image = cv2.imread(str(run / f"{name}.png"))
+        assert image is not None, name
+        assert image.std() > 10, name
+
+
+def test_mistakes_are_one_sentence(folders, tmp_path):
+    run, recording = folders
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "nan.txt").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
+    (tmp_path / "broken.npz").write_bytes(b"x")
+    cases = [
+        ((tmp_path / "empty", "--reference", recording), "holds no trajectory.txt"),
+        ((tmp_path / "none.txt", "--reference", recording), "cannot read the trajectory"),
+        ((tmp_path / "nan.txt", "--reference", recording), "line 2: expected eight finite numbers"),
+        ((run, "--reference", tmp_path / "empty"), "there is no true trajectory"),
+        ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
+        ((run, "--plots"), "name one with --reference"),
+        (("mesh", tmp_path / "empty", recording), "there is no mesh"),
+        (("mesh", run, recording, "--distances", "1cm"), "expected metres with commas"),
+        (("mesh", run, recording, "--ghost-distance", "0"), "expected a positive number"),
+        (("masks", tmp_path / "empty", recording), "run with --save-masks"),
+    ]
+    for arguments, sentence in cases:
+        outcome = evaluate(*arguments)
+        assert outcome.exit_code == 1, arguments
+        assert sentence in outcome.stderr, arguments
+        assert outcome.stderr.startswith("dudmap: ")
+        assert len(outcome.stderr.strip().splitlines()) == 1
+
+
+def test_help_names_all_three():
+    for name in ("trajectory", "mesh", "masks"):
+        assert name in evaluate("--help").stdout
+        assert "--json" in evaluate(name, "--help").stdout
