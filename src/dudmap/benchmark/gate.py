@@ -14,9 +14,8 @@ from dudmap.errors import ConfigError
 
 SMALL = (320, 240)
 WORLDS: dict[str, dict[str, Any]] = {
-    "room-person": {"frames": 60, "speed": 2.0},
     "room-people-at-start": {"frames": 40, "situation": "people_at_start"},
-    "room-crowd": {"frames": 40, "coverage": 0.35, "start_dynamic": True},
+    "room-crowd": {"frames": 64, "coverage": 0.35},
     "desk-fast-camera": {"frames": 40, "scene": "desk", "movers": (), "camera_path": "fast"},
 }
 EXCERPT = "freiburg1_xyz"
