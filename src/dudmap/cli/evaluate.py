@@ -134,8 +134,9 @@ def mesh(
     found, true = _mesh(file), _mesh(true_file)
     observed_file = reference / "surface_observed.ply"
     observed = _mesh(observed_file) if reference.is_dir() and observed_file.is_file() else None
-    T, figures = _start(estimate, reference), {"estimate": str(file), "reference": str(true_file)}
+    figures: Figures = {"estimate": str(file), "reference": str(true_file)}
     figures["observed"] = str(observed_file) if observed is not None else None
+    T = _start(estimate, reference)
     if align:
         registration = register(found, true, T)
         T = registration.T_reference_estimate

@@ -98,7 +98,8 @@ def plot_residuals(path: Path, residuals: Path) -> None:
     axes.plot(r, sum(parts), color=REFERENCE, linewidth=1, linestyle="--", label="mixture")
     axes.set(xlabel="residual, standard deviations of the reading", ylabel="density", yscale="log")
     low = counts[counts > 0].min() / counts.sum() / widths.max() if counts.any() else 1e-6
-    axes.set_ylim(bottom=low / 2)
+    highest = counts.max() / max(counts.sum(), 1) / widths.min()
+    axes.set_ylim(low / 2, 3 * max(highest, low))
     axes.set_title("residuals of the registration and the fitted mixture")
     axes.legend()
     _save(figure, path)

@@ -12,7 +12,7 @@ from dudmap.errors import MapError
 from dudmap.mesh import Mesh
 
 if TYPE_CHECKING:
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
 Points = NDArray[np.float32]
 
@@ -119,10 +119,10 @@ class Surface:
         return self._anchors[1]
 
     @cached_property
-    def _tree(self) -> "cKDTree":
-        from scipy.spatial import cKDTree
+    def _tree(self) -> "KDTree":
+        from scipy.spatial import KDTree
 
-        return cKDTree(self._anchors[0], balanced_tree=False, compact_nodes=False)
+        return KDTree(self._anchors[0], balanced_tree=False, compact_nodes=False)
 
     def nearest_planes(self, points: Points) -> tuple[NDArray[np.float64], Points, Points]:
         """Distance (N,) to the nearest anchor, the anchor (N, 3) and the normal (N, 3) of its triangle."""
