@@ -85,9 +85,9 @@ class VolumeConfig(Part):
     """Band behind a surface that is stored, voxels."""
     truncation_noise: float = Field(default=3.0, ge=0)
     """The band is at least this many standard deviations of the depth reading wide; 0 keeps it fixed."""
-    max_weight: int = Field(default=100, ge=1, le=255)
+    max_weight: int = Field(default=255, ge=1, le=255)
     """Cap of the running average (eq. 4.19)."""
-    weighting: Literal["constant", "angle"] = "constant"
+    weighting: Literal["constant", "angle"] = "angle"
     """Weight of one observation: 1, or cos(theta) / err(z) (eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
     """Observations a voxel needs before the mesh and the views trust it."""

@@ -184,7 +184,7 @@ class TsdfVolume:
             frame: Depth (m) and colour of the volume's camera.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            weights: (H, W) uint8 weight of each reading; None weighs all alike.
+            weights: (H, W) uint8 weight of each reading; None takes what the configuration says.
 
         Raises:
             MapError: The images do not have the camera's size.
@@ -315,7 +315,7 @@ class TsdfVolume:
             np.append(depth.reshape(-1), np.float32(0)),
             np.append(nearest_reading(depth).reshape(-1), np.float32(0)),
             np.append(packed(color).reshape(-1), np.int32(0)),
-            np.append(np.ones(depth.size, np.uint8) if weights is None else weights.reshape(-1), np.uint8(0)),
+            np.append((self._weights(depth) if weights is None else weights).reshape(-1), np.uint8(0)),
         )
         state = np.empty((count, 2), dtype=np.int32)
         run_bands(
@@ -327,6 +327,19 @@ class TsdfVolume:
         )  # fmt: skip
         if self.config.carving:
             self._release(visible[(state[:, 0] == 0) & (state[:, 1] == BLOCK**3)])
+
+    def _weights(self, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
+        """Weights (H, W) of the readings: all alike, or by the angle of sight and the sensor's noise (eq. 4.20)."""
+        weights = np.ones(depth.shape, dtype=np.uint8)
+        if self.config.weighting == "angle":
+            run_bands(
+                lambda start, stop: integration.observation_weights(
+                    start, stop, depth, self._intrinsics(), np.float32(self.sensor.sigma_base),
+                    np.float32(self.sensor.sigma_scale), np.float32(4), weights,
+                ),
+                bands(depth.shape[0], 60),
+            )  # fmt: skip
+        return weights
 
     def _release(self, slots: NDArray[np.int32]) -> None:
         """Take the voxels from blocks that hold no surface any more; they become known free space."""

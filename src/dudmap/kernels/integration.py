@@ -428,3 +428,42 @@ def sample_map(
             distance[v, u] = sdf / total * unit
             difference[v, u] = shade / total / np.float32(255) - intensity[v, u]
             place[v, u] = 1
+
+
+@kernel
+def observation_weights(row_start, row_stop, depth, intrinsics, sigma_base, sigma_scale, best, out):
+    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal reading at one metre gets ``best``.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (H, W) float32, metres, 0 = none.
+        intrinsics: (4,) float32.
+        sigma_base, sigma_scale: err(z) = sigma_base + sigma_scale z^2, metres.
+        best: Weight of a frontal reading at one metre.
+        out: (H, W) uint8 out, at least 1 where there is a reading.
+    """
+    h, w = depth.shape
+    err_one = sigma_base + sigma_scale
+    for v in range(row_start, row_stop):
+        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
+        up, down = max(v - 1, 0), min(v + 1, h - 1)
+        for u in range(w):
+            z = depth[v, u]
+            out[v, u] = 0
+            if z <= 0:
+                continue
+            left, right = max(u - 1, 0), min(u + 1, w - 1)
+            zl, zr, zu, zd = depth[v, left], depth[v, right], depth[up, u], depth[down, u]
+            cosine = np.float32(0.3)  # at a depth edge the angle is not known: taken as slanted
+            edge = np.float32(0.03) * z
+            if min(min(zl, zr), min(zu, zd)) > 0 and abs(zl - zr) < edge and abs(zu - zd) < edge:
+                x = (np.float32(u) - intrinsics[2]) / intrinsics[0]
+                # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..))
+                gu = intrinsics[0] * (zr - zl) / np.float32(max(right - left, 1))
+                gv = intrinsics[1] * (zd - zu) / np.float32(max(down - up, 1))
+                nz = -(z + x * gu + y * gv)
+                normal = np.sqrt(gu * gu + gv * gv + nz * nz)
+                ray = np.sqrt(x * x + y * y + np.float32(1))
+                cosine = abs(x * gu + y * gv + nz) / (normal * ray)
+            weight = best * cosine * err_one / (sigma_base + sigma_scale * z * z)
+            out[v, u] = np.uint8(min(max(weight + np.float32(0.5), np.float32(1)), np.float32(16)))
