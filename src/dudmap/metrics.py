@@ -33,12 +33,14 @@ class RunRecord:
         lost: Timestamp and reason of every frame that was not tracked.
         unreadable: One sentence per frame that could not be read.
         mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
+        residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
     lost: list[dict[str, Any]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     mask_ious: list[float] = field(default_factory=list)
+    residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     fused: int = 0
     skipped_similar: int = 0
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -61,6 +63,8 @@ class RunRecord:
         self.skipped_similar += result.skipped_similar
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
+        if result.labels is not None:
+            self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             union = np.count_nonzero(mask | result.dynamic_mask)
             self.mask_ious.append(np.count_nonzero(mask & result.dynamic_mask) / union)
@@ -72,6 +76,20 @@ class RunRecord:
             writer = csv.DictWriter(file, columns, restval=0)
             writer.writeheader()
             writer.writerows(self.rows)
+
+    def save_residuals(self, path: Path) -> None:
+        """NPZ with the histogram of all residuals and the mixture fitted to it; nothing if there are none.
+
+        ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
+        (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
+        """
+        from dudmap.dynamics import BINS, LARGEST, fit_mixture
+
+        if not self.residuals.any():
+            return
+        edges = np.linspace(0, LARGEST, BINS + 1)
+        mixture = fit_mixture(self.residuals, edges)
+        np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
         """Counts and times of the whole run."""

@@ -26,7 +26,10 @@ if TYPE_CHECKING:
 
 AHEAD = 4
 """Frames of a recording on disk that are read while an earlier one is processed."""
-FILES = ("trajectory.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv")
+FILES = (
+    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
+    "residuals.npz",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +75,10 @@ def run(
     """Run the system over a recording and write a run folder.
 
     The folder gets trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
-    metrics.json, timings.csv and, if asked for, masks/<timestamp>.png (255 = dynamic). Results of an earlier run in
-    the same folder are removed first. If anything stops the run, what was computed so far is written all the same.
+    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), the true
+    trajectory as groundtruth.txt where it is known and, if asked for, masks/<timestamp>.png (255 = dynamic). Results
+    of an earlier run in the same folder are removed first. If anything stops the run, what was computed so far is
+    written all the same.
 
     Args:
         sequence: The recording; its ground truth and masks are used for scoring only.
@@ -234,7 +239,11 @@ def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", con
         lambda: trajectory.save(out / "trajectory.txt"),
         lambda: config.save(out / "config.toml"),
         lambda: record.save_timings(out / "timings.csv"),
+        lambda: record.save_residuals(out / "residuals.npz"),
     ]
+    if sequence.ground_truth is not None:
+        truth = sequence.ground_truth
+        steps.append(lambda: truth.save(out / "groundtruth.txt"))
     if not slam.volume.is_empty:
         steps += [lambda: slam.volume.save(out / "map.npz"), save_mesh]
     problems = []
