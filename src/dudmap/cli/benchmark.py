@@ -95,3 +95,37 @@ def gate(
     if failed:
         typer.echo(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
         raise typer.Exit(1)
+
+
+@app.command()
+def limits(
+    systems: SystemsOption = "dudmap,none,threshold,em",
+    out: Annotated[Path, typer.Option("--out", help="Folder for heat maps and figures.")] = Path(
+        "runs/benchmark/limits"
+    ),
+    jobs: JobsOption = 1,
+    quick: QuickOption = False,
+) -> None:
+    """Find how much may move, how fast and from when on, before tracking and mapping break down.
+
+    Writes heat maps (PNG) of ATE, mask IoU, ghost area and the share of frames lost, and limits.md, .csv and .json.
+    """
+    from dudmap.benchmark import limits as sweeping
+    from dudmap.benchmark.heatmaps import limits_table, save_heat_maps
+    from dudmap.benchmark.systems import systems as find_systems
+    from dudmap.benchmark.table import save
+    from dudmap.metrics import machine, versions
+
+    wanted = find_systems(systems)
+    sweeps = sweeping.QUICK_SWEEPS if quick else sweeping.SWEEPS
+    cells = sweeping.conditions(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
+    out.mkdir(parents=True, exist_ok=True)
+    with typer.progressbar(length=len(cells), label="conditions") as bar:
+        rows = sweeping.measure_conditions(cells, wanted, jobs, lambda condition: bar.update(1))
+    for sweep in sweeps:
+        save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
+    text = "Largest share of the image that may move, ATE RMSE at most 2 cm and no frame lost:\n"
+    text += limits_table(rows, sweeps, list(wanted))
+    save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
+    typer.echo(text)
+    typer.echo(f"written to {out}")
