@@ -127,6 +127,24 @@ def test_relative_error_is_that_of_the_definition(delta, unit):
     assert result.trans_rmse == pytest.approx(np.sqrt(np.mean(np.square(translations))))
 
 
+def test_on_a_recording_without_gaps_the_rule_of_the_tum_script_gives_the_same():
+    """Nearest pose one second on, nearest true pose of each, and no pair that ends at the last pose."""
+    reference = hand_held(600, 100.0)
+    true = Trajectory(reference.timestamps[::3], reference.Ts_world_camera[::3])
+    estimate = disturbed(true)
+    t, errors = estimate.timestamps, []
+    for i in range(len(t)):
+        j = int(np.argmin(np.abs(t - (t[i] + 1.0))))
+        if j == len(t) - 1:
+            continue
+        a, b = (reference.Ts_world_camera[np.argmin(np.abs(reference.timestamps - t[k]))] for k in (i, j))
+        moved = np.linalg.inv(estimate.Ts_world_camera[i]) @ estimate.Ts_world_camera[j]
+        errors.append(np.linalg.norm((np.linalg.inv(moved) @ np.linalg.inv(a) @ b)[:3, 3]))
+    result = rpe(estimate, reference)
+    np.testing.assert_allclose(result.trans_errors[: len(errors)], errors, atol=1e-9)
+    assert result.num_pairs - len(errors) in (0, 1)
+
+
 def test_constant_drift_per_second_and_no_pair_across_a_gap():
     """1 cm/s of drift along a straight path gives 1 cm for every second, with or without 3 s of lost frames."""
     t = np.arange(300) / 30

@@ -180,10 +180,10 @@ def rpe(
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
     Every pose i that has a partner j ``delta`` further on gives one error, as in the TUM script with ``--fixed_delta``:
-    j is the pose nearest to that distance. Unlike there, a j that is not really ``delta`` away (the tail of the
-    trajectory, and gaps where tracking was lost) gives none: off by more than half the usual time between two poses
-    (at least ``max_difference``) for ``s``, by more than a tenth for ``m``. Metres are counted along the reference's
-    path; ``frames`` counts poses that have a partner in the reference.
+    j is the pose nearest to that distance. A j that is not really ``delta`` away gives none: off by more than half the
+    usual time between two poses (at least ``max_difference``) for ``s``, by more than a tenth for ``m``. (The script
+    pairs across gaps where tracking was lost, and drops the tail by leaving out all pairs that end at the last pose.)
+    Metres are counted along the reference's path; ``frames`` counts poses that have a partner in the reference.
 
     Args:
         estimate: Estimated poses, camera to world.
