@@ -139,7 +139,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
     run, recording = folders
     (tmp_path / "empty").mkdir()
     (tmp_path / "nan.txt").write_text("0 0 0 0 0 0 0 1\n1 nan 0 0 0 0 0 1\n")
-    (tmp_path / "broken.npz").write_bytes(b"x")
+    (tmp_path / "broken.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\n")
     cases = [
         ((tmp_path / "empty", "--reference", recording), "holds no trajectory.txt"),
         ((tmp_path / "none.txt", "--reference", recording), "cannot read the trajectory"),
@@ -148,6 +148,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
         ((run, "--reference", recording, "--align", "sim3"), "expected one of se3, origin, none"),
         ((run, "--plots"), "name one with --reference"),
         (("mesh", tmp_path / "empty", recording), "there is no mesh"),
+        (("mesh", tmp_path / "broken.ply", recording), "cannot read the mesh"),
         (("mesh", run, recording, "--distances", "1cm"), "expected metres with commas"),
         (("mesh", run, recording, "--ghost-distance", "0"), "expected a positive number"),
         (("masks", tmp_path / "empty", recording), "run with --save-masks"),

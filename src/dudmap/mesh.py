@@ -87,7 +87,7 @@ class Mesh:
         path = Path(path)
         try:
             loaded = trimesh.load(path, process=False, force=None)
-        except (OSError, ValueError, NotImplementedError) as error:
+        except (OSError, ValueError, NotImplementedError, LookupError, TypeError) as error:  # trimesh on broken headers
             raise MapError(f"cannot read the mesh {path}: {error}") from error
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
