@@ -19,6 +19,9 @@ from dudmap.mesh import Mesh
 BLOCK = 8
 """Voxels along the edge of a block."""
 FORMAT = "dudmap map 1"
+STEEPEST = 5.0
+"""Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
+one over the cosine of the angle of sight; what is steeper is the edge between a band and the free space beside it."""
 NOTHING, SURFACE, FREE = 0, 1, 2
 """What the map says of a point: unknown, near a surface, in confirmed free space."""
 
@@ -431,6 +434,7 @@ class TsdfVolume:
         vertices, faces, colors, normals = meshing.extract(
             self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
             self.sdf_unit, self.config.min_weight if min_weight is None else min_weight,
+            STEEPEST * self.voxel_size,
         )  # fmt: skip
         return Mesh(vertices, faces, colors, normals)
 

@@ -36,8 +36,11 @@ def _corner_words(geometry, near, row, words):
 
 
 @kernel
-def _classify(start, stop, geometry, near, min_weight, triangle_count, cases):
+def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
     """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or a trusted corner keep their 0.
+
+    A cell across which the distance jumps by more than ``max_jump`` steps is an occlusion boundary, where the band
+    behind one thing meets the free space beside it, and holds no surface.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -70,6 +73,12 @@ def _classify(start, stop, geometry, near, min_weight, triangle_count, cases):
                         bad |= unsure[n + np.uintp(10)] | unsure[n + np.uintp(81)] | unsure[n + np.uintp(82)]
                         bad |= unsure[n + np.uintp(90)] | unsure[n + np.uintp(91)]
                         case = 0 if bad != 0 or case == 255 else case
+                        if case != 0:
+                            low, high = np.int32(32767), np.int32(-32768)
+                            for m in range(8):
+                                corner = n + np.uintp(81 * (m >> 2) + 9 * ((m >> 1) & 1) + (m & 1))
+                                low, high = min(low, flat[corner] >> 16), max(high, flat[corner] >> 16)
+                            case = 0 if high - low > max_jump else case
                         cases[row, (i * 8 + j) * 8 + k] = case
                         total += np.int64(triangle_count[case])
         count[row - start] = total
@@ -304,7 +313,7 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
     first_vertex[len(begin) - 1] = total
 
 
-def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight):
+def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump=np.inf):
     """Triangles of the zero level of the given blocks; the vertex position does not depend on ``sdf_unit``.
 
     Args:
@@ -316,15 +325,20 @@ def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, m
         voxel_size: Metres.
         sdf_unit: Metres per step of the stored distance.
         min_weight: Cells with a corner of less weight are left out (at least 1).
+        max_jump: Cells across which the distance changes by more than this hold no surface, metres.
 
     Returns:
         vertices (V, 3) float32 metres, faces (F, 3) int32 counter-clockwise seen from free space, colors (V, 3) uint8,
         normals (V, 3) float32 unit length, pointing to free space. No vertex occurs twice or without a triangle.
     """
-    return _surface(geometry, colors, slots, coords, neighbours, voxel_size, min_weight, len(slots))[:4]
+    return _surface(
+        geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump, len(slots)
+    )[:4]
 
 
-def extract_chunks(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, chunks):
+def extract_chunks(
+    geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, chunks, max_jump=np.inf
+):
     """Meshes of groups of blocks that share no vertices, so that each can be replaced when its blocks change.
 
     Args:
@@ -339,7 +353,16 @@ def extract_chunks(geometry, colors, slots, coords, neighbours, voxel_size, sdf_
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
     vertices, faces, vertex_colors, normals, first_face = _surface(
-        geometry, colors, slots[order], coords, neighbours[order], voxel_size, min_weight, int(per_chunk.sum())
+        geometry,
+        colors,
+        slots[order],
+        coords,
+        neighbours[order],
+        voxel_size,
+        sdf_unit,
+        min_weight,
+        max_jump,
+        int(per_chunk.sum()),
     )
     begin = first_face[_begins([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
@@ -352,7 +375,7 @@ def extract_chunks(geometry, colors, slots, coords, neighbours, voxel_size, sdf_
     return out
 
 
-def _surface(geometry, colors, slots, coords, neighbours, voxel_size, min_weight, num_meshed):
+def _surface(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump, num_meshed):
     """``extract`` for the cells of the first ``num_meshed`` blocks; and the first face (n + 1,) of each block."""
     n = len(slots)
     slots = np.ascontiguousarray(slots, dtype=np.int32)
@@ -366,8 +389,9 @@ def _surface(geometry, colors, slots, coords, neighbours, voxel_size, min_weight
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.empty((n, 512), dtype=np.uint8)
     least = max(int(min_weight), 1)
+    jump = int(min(max_jump / sdf_unit, 1 << 20))
     triangles = run_bands(
-        lambda start, stop: _classify(start, stop, geometry, near, least, TRIANGLE_COUNT, cases),
+        lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
     owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
