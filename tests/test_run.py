@@ -35,6 +35,7 @@ class Result:
     T_world_camera: np.ndarray | None = None
     fused: bool = True
     skipped_similar: bool = False
+    relocalized: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None

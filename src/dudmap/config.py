@@ -169,6 +169,37 @@ class DynamicsConfig(Part):
     """Pixels around a moving region that are not fused either."""
 
 
+class RelocalizationConfig(Part):
+    """Finding a known place again after tracking was lost: keyframes, SIFT features, 3D-3D RANSAC."""
+
+    enabled: bool = True
+    """Remember keyframes, and try to recognise one of them in every lost frame."""
+    keyframe_distance: float = Field(default=0.25, gt=0)
+    """A keyframe is made where the camera is farther than this from all others, metres,"""
+    keyframe_angle_deg: float = Field(default=15.0, gt=0)
+    """or turned by more than this, degrees."""
+    keyframe_gap: int = Field(default=10, ge=0)
+    """Tracked frames between two keyframes at least."""
+    max_keyframes: int = Field(default=200, ge=2)
+    """Most keyframes that are kept; the one nearest to another goes first."""
+    max_features: int = Field(default=400, ge=50)
+    """Most features of a keyframe."""
+    image_width: int = Field(default=320, ge=80)
+    """Width of the image the features are found in, pixels."""
+    ratio: float = Field(default=0.85, gt=0, lt=1)
+    """Lowe's ratio test: best over second best descriptor distance."""
+    min_inliers: int = Field(default=15, ge=4)
+    """Matches that must agree on a pose."""
+    min_share: float = Field(default=0.25, ge=0, le=1)
+    """Share of all matches with the keyframe that must agree on it."""
+    min_on_map: float = Field(default=0.4, ge=0, le=1)
+    """Share of a frame's readings that must be static and fall on the map for the pose to be believed."""
+    max_distance: float = Field(default=0.06, gt=0)
+    """Farthest that the registration may move the pose of the features, metres,"""
+    max_angle_deg: float = Field(default=3.0, gt=0)
+    """or turn it, degrees."""
+
+
 class Config(Part):
     """All parameters of the system."""
 
@@ -180,6 +211,7 @@ class Config(Part):
     volume: VolumeConfig = VolumeConfig()
     tracker: TrackerConfig = TrackerConfig()
     dynamics: DynamicsConfig = DynamicsConfig()
+    relocalization: RelocalizationConfig = RelocalizationConfig()
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":
@@ -260,6 +292,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "similarity": {"threshold": 0.84},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False},
+        "relocalization": {"enabled": False},
     },
 }
 

@@ -43,6 +43,7 @@ class RunRecord:
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     fused: int = 0
     skipped_similar: int = 0
+    relocalized: int = 0
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
 
@@ -61,6 +62,7 @@ class RunRecord:
         )
         self.fused += result.fused
         self.skipped_similar += result.skipped_similar
+        self.relocalized += result.relocalized
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.labels is not None:
@@ -101,6 +103,7 @@ class RunRecord:
             "fused": self.fused,
             "skipped_similar": self.skipped_similar,
             "lost": len(self.lost),
+            "relocalized": self.relocalized,
             "unreadable": len(self.unreadable),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),

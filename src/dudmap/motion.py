@@ -34,6 +34,11 @@ class MotionModel:
         """Forget the velocity; the next frames are tried from the last good pose."""
         self._velocity = np.zeros(6)
 
+    def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
+        """Take over the pose of a frame whose place was recognised; what lies before it says nothing of its motion."""
+        self._known, self._velocity = False, np.zeros(6)
+        self.update(timestamp, T_world_camera)
+
     def implausible(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
         """Sentence on a jump that no camera makes, empty if there is none."""
         motion = se3.inverse(self._T_world_camera) @ T_world_camera

@@ -17,6 +17,7 @@ from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
 from dudmap.motion import MotionModel
 from dudmap.preprocess import Observation, Preprocessor, pyramid
+from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
 from dudmap.tracker import Level, Tracker, TrackingResult
 from dudmap.trajectory import Trajectory
@@ -34,6 +35,7 @@ class FrameResult:
         T_world_camera: (4, 4), None if lost.
         fused: Whether the frame changed the map.
         skipped_similar: Whether it was left out of the fusion as a redundant view.
+        relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
         dynamic_mask: (H, W) bool.
         dynamic_share: Share of the readings that lie in the mask.
         residuals: (h, w) float32 signed distance to the map in metres at the label resolution, NaN off the map.
@@ -54,6 +56,7 @@ class FrameResult:
     labels: Labels | None
     tracking: TrackingResult | None
     timings: dict[str, float] = field(default_factory=dict)
+    relocalized: bool = False
 
 
 class Slam:
@@ -74,6 +77,7 @@ class Slam:
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
         self.health = TrackingHealth()
+        self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
 
@@ -103,6 +107,10 @@ class Slam:
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
             or self.health.doubt(tracked)
         )
+        recognised = self._recognise(observation, levels, clock) if reason else None
+        if recognised is not None:
+            (tracked, labels), reason = recognised, ""
+            self.motion.restart(frame.timestamp, tracked.T_world_camera)
         if reason:
             self.motion.lost()
             self.health.lost()
@@ -112,7 +120,10 @@ class Slam:
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
-        result = self._result(frame, observation, clock, levels, labels, tracked, "", fused=not redundant)
+        result = self._result(
+            frame, observation, clock, levels, labels, tracked, "", fused=not redundant, relocalized=bool(recognised)
+        )
+        self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
         if not redundant:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
@@ -127,6 +138,7 @@ class Slam:
         if not reason:
             self.motion.update(frame.timestamp, T)
             self._poses.append((frame.timestamp, T))
+            self._remember(observation, T, nothing, clock)
             with clock("integrate"):
                 self._integrate(observation, T, nothing)
         return FrameResult(
@@ -161,6 +173,45 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _remember(
+        self,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+        dynamic_mask: NDArray[np.bool_],
+        clock: "Clock",
+    ) -> None:
+        """Keep the frame as a keyframe if the camera has been nowhere near."""
+        if self.config.relocalization.enabled:
+            with clock("keyframe"):
+                self.keyframes.add(observation, T_world_camera, ~dynamic_mask)
+
+    def _recognise(
+        self, observation: Observation, levels: dict[int, Level], clock: "Clock"
+    ) -> tuple[TrackingResult, Labels | None] | None:
+        """Registration of a lost frame from the pose of a place it shows; None where nothing is beyond doubt.
+
+        Features and map must agree: the registration passes all checks at the stricter limits that hold after a loss,
+        enough of the frame lies on the map, and the pose stays where the features put it.
+        """
+        config = self.config.relocalization
+        if not config.enabled:
+            return None
+        self.health.lost()
+        readings = max(np.count_nonzero(levels[self._level(self.config.dynamics.width)].depth), 1)
+        with clock("recognise"):
+            candidates = self.keyframes.find(observation)
+        for T_world_camera in candidates:
+            tracked, labels = self._register(levels, T_world_camera, clock)
+            static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
+            if (
+                tracked.converged
+                and not self.health.doubt(tracked)
+                and static * tracked.inlier_share >= config.min_on_map
+                and agree(tracked.T_world_camera, T_world_camera, config.max_distance, config.max_angle_deg)
+            ):
+                return tracked, labels
+        return None
 
     def _levels(self, observation: Observation) -> dict[int, Level]:
         """Image pyramid by number of halvings."""
@@ -230,6 +281,7 @@ class Slam:
         reason: str,
         *,
         fused: bool,
+        relocalized: bool = False,
     ) -> FrameResult:
         with clock("label"):
             if labels is None:
@@ -243,7 +295,7 @@ class Slam:
             share = np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1)
         return FrameResult(
             frame.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
-            fused, not fused and not reason, mask, float(share), residuals, labels, tracked, clock.timings,
+            fused, not fused and not reason, mask, float(share), residuals, labels, tracked, clock.timings, relocalized,
         )  # fmt: skip
 
 
