@@ -112,7 +112,7 @@ class TrackerConfig(Part):
     """First Levenberg-Marquardt damping, relative to the diagonal of J^T J (eq. 4.42)."""
     color_weight: float = Field(default=0.1325, ge=0)
     """Weight of the squared intensity residual (0..1) against the squared distance residual (m), eq. 4.32."""
-    color_huber: float = Field(default=0.1, gt=0)
+    color_huber: float = Field(default=0.07, gt=0)
     """Huber constant of the intensity residual."""
     exposure: bool = True
     """Fit gain and offset of the image's intensities to the map's before each level."""
@@ -285,6 +285,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "huber": 0.01,
             "damping": 0.02,
             "color_weight": 0.1325,
+            "color_huber": 0.1,
             "noise_weighting": False,
             "exposure": False,
             "stop": 1e-3,
