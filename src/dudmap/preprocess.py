@@ -88,6 +88,24 @@ class Preprocessor:
         filtering.pack_colors(0, self.camera.height, rgb, intensity, color)
         return Observation(frame.timestamp, self.camera, smooth, raw_depth, intensity, color, rgb)
 
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (H, W) bool of a frame as a lens without distortion sees it.
+
+        Raises:
+            DatasetError: It does not have the camera's size, or is not boolean.
+        """
+        if mask.shape != self.camera.shape or mask.dtype != np.bool_:
+            h, w = self.camera.shape
+            raise DatasetError(
+                f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
+                "the size of the camera's image"
+            )
+        if self._maps is None:
+            return mask
+        import cv2
+
+        return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
+
     def _check(self, frame: Frame) -> None:
         h, w = self.camera.shape
         if frame.depth.shape != (h, w) or frame.color.shape != (h, w, 3):

@@ -3,7 +3,7 @@
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -80,17 +80,20 @@ class Slam:
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
+        self._untested = 0  # frames that are still fused without the similarity test
 
     @property
     def trajectory(self) -> Trajectory:
         """Poses of all frames tracked so far."""
         return Trajectory.from_poses(self._poses)
 
-    def process(self, frame: Frame) -> FrameResult:
+    def process(self, frame: Frame, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
 
         Args:
             frame: Depth and colour with a timestamp later than all before.
+            dynamic_mask: (H, W) bool, pixels of the frame that are known to move, e.g. of a segmentation network;
+                they count as moving from the first registration on, whatever is found besides.
 
         Raises:
             DatasetError: The images do not fit the camera or each other.
@@ -99,29 +102,30 @@ class Slam:
         with clock("preprocess"):
             observation = self.preprocess(frame)
             levels = self._levels(observation)
+            known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.volume.is_empty:
-            return self._start(frame, observation, clock)
-        tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), clock)
+            return self._start(frame, observation, known, clock)
+        tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), known, clock)
         reason = (
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
             or self.health.doubt(tracked)
         )
-        recognised = self._recognise(observation, levels, clock) if reason else None
+        recognised = self._recognise(observation, levels, known, clock) if reason else None
         if recognised is not None:
             (tracked, labels), reason = recognised, ""
             self.motion.restart(frame.timestamp, tracked.T_world_camera)
         if reason:
             self.motion.lost()
             self.health.lost()
-            return self._result(frame, observation, clock, levels, labels, tracked, reason, fused=False)
+            return self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
         self.motion.update(frame.timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
         result = self._result(
-            frame, observation, clock, levels, labels, tracked, "", fused=not redundant, relocalized=bool(recognised)
+            observation, clock, levels, labels, known, tracked, "", fused=not redundant, relocalized=bool(recognised)
         )
         self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
         if not redundant:
@@ -129,10 +133,12 @@ class Slam:
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
         return result
 
-    def _start(self, frame: Frame, observation: Observation, clock: "Clock") -> FrameResult:
-        """The first frame with readings is the world: identity pose, everything taken as static."""
-        readings = np.count_nonzero(observation.depth)
-        nothing = np.zeros(observation.depth.shape, dtype=bool)
+    def _start(
+        self, frame: Frame, observation: Observation, known: NDArray[np.bool_] | None, clock: "Clock"
+    ) -> FrameResult:
+        """The first frame with readings is the world: identity pose, everything not known to move taken as static."""
+        nothing = np.zeros(observation.depth.shape, dtype=bool) if known is None else known
+        readings = np.count_nonzero(observation.depth[~nothing])
         reason = "" if readings >= 0.02 * observation.depth.size else "the depth image holds hardly any readings"
         T = np.eye(4)
         if not reason:
@@ -143,25 +149,28 @@ class Slam:
                 self._integrate(observation, T, nothing)
         return FrameResult(
             frame.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
-            nothing, 0.0, np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
+            nothing, _share(nothing, observation), np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
         )  # fmt: skip
 
     def _register(
-        self, levels: dict[int, Level], T_init: NDArray[np.float64], clock: "Clock"
+        self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> tuple[TrackingResult, Labels | None]:
         """Register without labels, find what moves, register again without that (thesis algorithm 4).
 
         The coarse levels bring the pose near enough to tell what moves, the fine ones make it exact.
         """
         tracked_levels = self._tracked(levels)
+        unmasked = None if known is None else [(~_reduced(known, level)).astype(np.float32) for level in tracked_levels]
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
-                tracked = self.tracker.align(self.volume, tracked_levels, T_init)
-            return tracked, None if self.config.dynamics.method == "none" else self._detect(levels, tracked, clock)
+                tracked = self.tracker.align(self.volume, tracked_levels, T_init, unmasked)
+            if self.config.dynamics.method == "none":
+                return tracked, None
+            return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
-            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, first_level=0)
-        labels = self._detect(levels, tracked, clock)
+            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, unmasked)
+        labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             again = tracked_levels[split - 1 :]
             tracked = self.tracker.align(
@@ -187,7 +196,7 @@ class Slam:
                 self.keyframes.add(observation, T_world_camera, ~dynamic_mask)
 
     def _recognise(
-        self, observation: Observation, levels: dict[int, Level], clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> tuple[TrackingResult, Labels | None] | None:
         """Registration of a lost frame from the pose of a place it shows; None where nothing is beyond doubt.
 
@@ -200,9 +209,9 @@ class Slam:
         self.health.lost()
         readings = max(np.count_nonzero(levels[self._level(self.config.dynamics.width)].depth), 1)
         with clock("recognise"):
-            candidates = self.keyframes.find(observation)
+            candidates = self.keyframes.find(observation, None if known is None else ~known)
         for T_world_camera in candidates:
-            tracked, labels = self._register(levels, T_world_camera, clock)
+            tracked, labels = self._register(levels, T_world_camera, known, clock)
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
                 tracked.converged
@@ -229,10 +238,17 @@ class Slam:
     def _tracked(self, levels: dict[int, Level]) -> list[Level]:
         return [levels[self._level(width)] for width in self.config.tracker.widths]
 
-    def _detect(self, levels: dict[int, Level], tracked: TrackingResult, clock: "Clock") -> Labels:
+    def _detect(
+        self, levels: dict[int, Level], tracked: TrackingResult, known: NDArray[np.bool_] | None, clock: "Clock"
+    ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            return self.detector.detect(self.volume, level, tracked.T_world_camera)
+            labels = self.detector.detect(self.volume, level, tracked.T_world_camera)
+            if known is None:
+                return labels
+            masked = _reduced(known, level)
+            static_probability = np.where(masked, np.float32(0), labels.static_probability)
+            return replace(labels, dynamic=labels.dynamic | masked, static_probability=static_probability)
 
     def _weights(self, labels: Labels, levels: list[Level]) -> list[NDArray[np.float32]]:
         """Static weights of the second registration at every level."""
@@ -254,7 +270,12 @@ class Slam:
             or np.degrees(se3.rotation_angle(moved)) > config.max_rotation_deg
         ):
             return False
-        return self.similarity.redundant(observation.rgb)
+        if self._untested > 0:
+            self._untested -= 1
+            return False
+        redundant = self.similarity.redundant(observation.rgb)
+        self._untested = 0 if redundant else config.patience
+        return redundant
 
     def _integrate(
         self,
@@ -272,11 +293,11 @@ class Slam:
 
     def _result(
         self,
-        frame: Frame,
         observation: Observation,
         clock: "Clock",
         levels: dict[int, Level],
         labels: Labels | None,
+        known: NDArray[np.bool_] | None,
         tracked: TrackingResult,
         reason: str,
         *,
@@ -291,12 +312,27 @@ class Slam:
                 level = levels[self._level(self.config.dynamics.width)]
                 mask = full_mask(labels, level, observation.depth)
                 residuals = labels.sample.distance
-            readings = observation.depth > 0
-            share = np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1)
+            if known is not None:
+                mask = mask | known
         return FrameResult(
-            frame.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
-            fused, not fused and not reason, mask, float(share), residuals, labels, tracked, clock.timings, relocalized,
+            observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
+            fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
+            clock.timings, relocalized,
         )  # fmt: skip
+
+
+def _reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
+    """Mask (H, W) at the size of a level: pixels any part of which lies in it."""
+    import cv2
+
+    size = level.depth.shape[::-1]
+    return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
+
+
+def _share(mask: NDArray[np.bool_], observation: Observation) -> float:
+    """Share of the readings that lie in a mask."""
+    readings = observation.depth > 0
+    return float(np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1))
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
