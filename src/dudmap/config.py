@@ -72,6 +72,8 @@ class SimilarityConfig(Part):
     """A camera that moved more than this since the last fused frame is not tested, metres; 0 tests all frames."""
     max_rotation_deg: float = Field(default=0.3, ge=0)
     """A camera that turned more than this since the last fused frame is not tested, degrees."""
+    patience: int = Field(default=5, ge=0)
+    """Frames that are fused untested after a test that found nothing redundant: the test costs as much as the rest."""
 
 
 class VolumeConfig(Part):
@@ -290,7 +292,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "exposure": False,
             "stop": 1e-3,
         },
-        "similarity": {"threshold": 0.84},
+        "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False},
         "relocalization": {"enabled": False},
