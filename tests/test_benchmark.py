@@ -1,0 +1,216 @@
+"""Suites, published values, tables, scoring of other systems, and the limit of dynamics, on made-up figures."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dudmap import se3
+from dudmap.benchmark import limits, measure, report
+from dudmap.benchmark.entries import Entry
+from dudmap.benchmark.heatmaps import limits_table, save_heat_maps, values
+from dudmap.benchmark.published import published
+from dudmap.benchmark.suites import SUITES, find_suite
+from dudmap.benchmark.systems import systems
+from dudmap.benchmark.table import markdown
+from dudmap.cli import app
+from dudmap.errors import ConfigError, DatasetError
+from dudmap.trajectory import Trajectory
+from recordings import write_recording
+
+PUBLIC = ("thesis", "tum-dynamic", "bonn", "icl-nuim")
+
+
+def benchmark(*arguments):
+    return CliRunner().invoke(app, ["benchmark", *(str(argument) for argument in arguments)])
+
+
+@pytest.fixture
+def data(tmp_path):
+    """A folder with one of the thesis' recordings, whose true camera moves along a curve."""
+    folder = tmp_path / "data"
+    recording = write_recording(folder / "tum" / "rgbd_dataset_freiburg3_walking_xyz", 12)
+    stamps = 100 + 0.1 * np.arange(12)
+    Ts = [se3.exp(np.array([0.1 * np.sin(k), 0.02 * k, 0.05 * np.cos(k), 0, 0.01 * k, 0])) for k in range(12)]
+    Trajectory(stamps, np.array(Ts)).save(recording / "groundtruth.txt")
+    return folder
+
+
+def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
+    counts = {"thesis": 12, "tum-dynamic": 8, "bonn": 26, "icl-nuim": 8}
+    for name, count in counts.items():
+        suite = find_suite(name, tmp_path)
+        assert not suite.entries
+        assert len(suite.missing) == count
+        assert all(entry.address.startswith("http") for entry in suite.missing)
+        assert len(set(suite.names())) == count
+    assert len(find_suite("synthetic", None).entries) >= 15
+    assert len(find_suite("synthetic", None, quick=True).entries) == 3
+    assert set(SUITES) == {*counts, "synthetic", "local"}
+
+
+def test_recordings_are_found_one_folder_down(data):
+    suite = find_suite("thesis", data)
+    assert [entry.name for entry in suite.entries] == ["rgbd_dataset_freiburg3_walking_xyz"]
+    assert len(suite.missing) == 11
+    assert len(find_suite("local", data / "tum").entries) == 1
+    assert find_suite("tum-dynamic", data, quick=True).entries[0].max_frames == 60
+
+
+def test_published_figures_belong_to_recordings_of_the_suites_and_name_their_source(tmp_path):
+    known = {name for suite in PUBLIC for name in find_suite(suite, tmp_path).names()}
+    figures = published()
+    assert {figure.sequence for figure in figures} <= known
+    assert all(len(figure.source) > 10 for figure in figures)
+    assert all(np.isfinite(figure.value) and figure.value > 0 for figure in figures)
+    printed = {(figure.sequence, figure.system, figure.metric, figure.source[:10]): figure.value for figure in figures}
+    assert len(printed) == len(figures)
+    xyz = {f.system: f.value for f in published(["rgbd_dataset_freiburg3_walking_xyz"]) if f.metric == "ate_rmse_m"}
+    assert xyz["DUDMap (thesis)"] == pytest.approx(0.074)
+    assert xyz["ReFusion"] == pytest.approx(0.099)
+    crowd3 = {figure.system: figure.value for figure in published(["rgbd_bonn_crowd3"])}
+    assert crowd3["StaticFusion"] == pytest.approx(0.168)
+    lr2 = {f.metric: f.value for f in published(["living_room_traj2n_frei_png"]) if f.system.startswith("DUDMap")}
+    assert lr2 == {
+        "ate_rmse_m": 0.004, "rpe_trans_rmse_m_per_s": 0.007, "rpe_rot_rmse_deg_per_s": 0.149, "mesh_accuracy_m": 0.004
+    }  # fmt: skip
+
+
+def test_systems_are_configurations(tmp_path):
+    found = systems("dudmap,none,threshold,em,thesis")
+    assert found["none"].dynamics.method == "none"
+    assert found["threshold"].dynamics.method == "threshold"
+    assert not found["em"].dynamics.free_space
+    assert found["thesis"].preset == "thesis"
+    (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.05\n")
+    assert systems(str(tmp_path / "mine.toml"))["mine"].tracker.huber == 0.05
+    for text in ("", "dudmapp", "none,none"):
+        with pytest.raises(ConfigError):
+            systems(text)
+
+
+def test_what_another_system_computed_stands_in_the_same_table(data, tmp_path, monkeypatch):
+    name = "rgbd_dataset_freiburg3_walking_xyz"
+    monkeypatch.setattr(
+        report, "measure_all", lambda jobs, workers, done: [
+            {"sequence": job.entry.name, "system": job.system, "frames": 12, "lost": 1, "ate_rmse_m": 0.0123}
+            for job in jobs
+        ]
+    )  # fmt: skip
+    peer = tmp_path / "peer" / name
+    peer.mkdir(parents=True)
+    truth = Trajectory.load(data / "tum" / name / "groundtruth.txt")
+    world = se3.exp(np.array([1, 2, 3, 0.4, 0.5, 0.6]))
+    Trajectory(truth.timestamps[:10], world @ truth.Ts_world_camera[:10]).save(peer / "trajectory.txt")
+    outcome = benchmark(
+        "thesis", "--data", data, "--out", tmp_path / "out", "--systems", "dudmap,none", "--score",
+        f"peer={tmp_path / 'peer'}",
+    )  # fmt: skip
+    assert outcome.exit_code == 0, outcome.output
+    text = (tmp_path / "out" / "thesis.md").read_text()
+    assert text.strip() in outcome.stdout
+    assert "| **dudmap** | measured here | 1.23 |" in text
+    assert "| ReFusion | [" in text
+    assert "rgbd_bonn_balloon_tracking2: https://" in text
+    rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "thesis.json").read_text())["rows"]}
+    assert set(rows) == {"dudmap", "none", "peer"}
+    assert rows["peer"]["ate_rmse_m"] == pytest.approx(0, abs=1e-6)
+    assert rows["peer"]["drift_rmse_m"] == pytest.approx(0, abs=1e-6)
+    assert rows["peer"]["lost"] == 2
+    with (tmp_path / "out" / "thesis.csv").open() as file:
+        assert [row["system"] for row in csv.DictReader(file)] == ["dudmap", "none", "peer"]
+
+
+def test_a_recording_that_fails_is_a_line_not_the_end():
+    good = {"sequence": "a", "system": "x", "ate_rmse_m": 0.01, "lost": 0}
+    text = markdown([good, {"sequence": "b", "system": "x", "error": "its depth is missing"}])
+    assert "| a | x | 0 | 1.00 |" in text
+    assert "- b, x: its depth is missing" in text
+    assert "mask IoU" not in text
+
+
+def test_a_run_in_its_own_process_reports_an_unusable_recording(tmp_path):
+    (tmp_path / "empty").mkdir()
+    job = measure.Job(Entry("empty", tmp_path / "empty"), "dudmap", systems("dudmap")["dudmap"])
+    (row,) = measure.measure_all([job], 1)
+    assert row["sequence"] == "empty"
+    assert "is empty" in row["error"]
+
+
+# -- the limit of dynamics --------------------------------------------------------------------------------------------
+
+
+SWEEP = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.1, 0.3, 0.5))
+
+
+def made_up(system, x, coverage, ate):
+    return {
+        "sweep": "speed", "system": system, "x": x, "coverage": coverage, "ate_rmse_m": ate, "lost": 0,
+        "lost_share": 0.0, "copes": ate is not None and ate <= limits.LARGEST_ATE,
+    }  # fmt: skip
+
+
+@pytest.fixture
+def rows():
+    ates = {0.1: (0.005, 0.03, 0.01), 1.0: (0.005, 0.006, 0.01)}
+    return [made_up("dudmap", x, c, a) for x, line in ates.items() for c, a in zip(SWEEP.coverages, line, strict=True)]
+
+
+def test_the_limit_is_the_largest_coverage_below_the_first_failure(rows):
+    assert limits.limit(rows, "speed", "dudmap", 0.1) == 0.1
+    assert limits.limit(rows, "speed", "dudmap", 1.0) == 0.5
+    assert limits.limit(rows, "speed", "none", 1.0) is None
+    rows[0]["copes"] = False
+    assert limits.limit(rows, "speed", "dudmap", 0.1) is None
+    assert "| 0.1 | none |" in limits_table(rows, [SWEEP], ["dudmap"])
+    assert "| 1.0 | 50 % |" in limits_table(rows, [SWEEP], ["dudmap"])
+
+
+def test_heat_maps_show_every_cell(rows, tmp_path):
+    import cv2
+
+    grid = values(rows, SWEEP, "dudmap", "ate_rmse_m")
+    np.testing.assert_allclose(grid, [[0.005, 0.005], [0.03, 0.006], [0.01, 0.01]])
+    assert np.isnan(values(rows, SWEEP, "none", "ate_rmse_m")).all()
+    save_heat_maps(rows, SWEEP, ["dudmap", "none"], tmp_path / "limits.png")
+    assert cv2.imread(str(tmp_path / "limits.png")).std() > 10
+
+
+def test_the_grids_hold_what_is_asked_for():
+    cells = limits.conditions(limits.SWEEPS, 120)
+    assert len(set(cells)) == len(cells)
+    speeds = {cell.speed for cell in cells if cell.sweep == "speed"}
+    assert min(speeds) <= 0.02
+    assert max(speeds) >= 3
+    assert {0.0, 0.9} <= {cell.coverage for cell in cells if cell.sweep == "speed"}
+    assert {cell.camera_path for cell in cells if cell.sweep == "camera"} >= {"still", "fast"}
+
+
+def test_people_who_leave_are_gone_afterwards():
+    sequence = limits.Condition("start", 0.5, 0.3, start_share=0.5, frames=6).sequence()
+    assert len(sequence) == 6
+    assert sequence.mask(2).mean() > 0.05
+    assert not sequence.mask(3).any()
+    twin = sequence[3]
+    assert twin.timestamp == sequence.timestamps[3]
+
+
+def test_mistakes_are_one_sentence(tmp_path):
+    cases = [
+        (("bonn",), "name their folder with --data"),
+        (("bonn", "--data", tmp_path / "none"), "there is no folder"),
+        (("local", "--data", tmp_path), "no recording found"),
+        (("synthetic", "--systems", "best"), "unknown system 'best'"),
+        (("synthetic", "--score", "peer"), "expected NAME=FOLDER"),
+    ]
+    for arguments, sentence in cases:
+        outcome = benchmark(*arguments)
+        assert outcome.exit_code == 1, arguments
+        assert sentence in outcome.stderr
+        assert len(outcome.stderr.strip().splitlines()) == 1
+    with pytest.raises(DatasetError):
+        Entry("x", tmp_path / "none").open()
+    with pytest.raises(ConfigError, match="known suites"):
+        find_suite("all", tmp_path)
