@@ -33,6 +33,7 @@ class RunRecord:
         lost: Timestamp and reason of every frame that was not tracked.
         unreadable: One sentence per frame that could not be read.
         mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
+        masked: Frames that had a mask from outside, None if none were given.
         residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
     """
 
@@ -44,6 +45,7 @@ class RunRecord:
     fused: int = 0
     skipped_similar: int = 0
     relocalized: int = 0
+    masked: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
 
@@ -114,11 +116,15 @@ class RunRecord:
             "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
             "lost_frames": self.lost,
             "unreadable_frames": self.unreadable,
-        } | (
-            {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
-            if self.mask_ious
-            else {}
-        )
+        } | self._of_masks()
+
+    def _of_masks(self) -> dict[str, Any]:
+        out: dict[str, Any] = {}
+        if self.masked is not None:
+            out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
+        if self.mask_ious:
+            out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
+        return out
 
 
 def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:

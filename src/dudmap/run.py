@@ -22,6 +22,7 @@ from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from dudmap.sequences import Sequence
+    from dudmap.sequences.masks import MaskFolder
     from dudmap.slam import FrameResult, Slam
 
 AHEAD = 4
@@ -54,11 +55,13 @@ class Reading(NamedTuple):
         frame: The frame, or why there is none.
         mask: (H, W) its true dynamic mask, None if not known, or why it cannot be read.
         ms: Reading time of the frame.
+        known: (H, W) what a mask from outside says moves, None if there is none, or why it cannot be read.
     """
 
     frame: Frame | FrameError
     mask: NDArray[np.bool_] | FrameError | None
     ms: float
+    known: NDArray[np.bool_] | FrameError | None = None
 
 
 def run(
@@ -68,6 +71,7 @@ def run(
     *,
     max_frames: int | None = None,
     save_masks: bool = False,
+    masks: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
     observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
@@ -86,6 +90,8 @@ def run(
         out: The run folder; made if needed.
         max_frames: Stop after this many frames.
         save_masks: Write the dynamic mask of every frame.
+        masks: Folder of masks from outside, <timestamp>.png with 255 = moves; they are added to what is found. Frames
+            without one are counted.
         progress: Show a progress bar on a terminal.
         ahead: Frames that are read while an earlier one is processed; 0 where reading is work for all cores, as with
             rendered frames, and would disturb the times. The result does not depend on it.
@@ -103,12 +109,13 @@ def run(
         raise DatasetError(
             f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
         )
-    slam, record = Slam(sequence.camera, config), RunRecord()
+    known = None if masks is None else _open_masks(masks, sequence)
+    slam, record = Slam(sequence.camera, config), RunRecord(masked=None if masks is None else 0)
     _prepare(out, save_masks=save_masks)
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:
-            with closing(read_ahead(sequence, count, ahead)) as readings:
+            with closing(read_ahead(sequence, count, ahead, known)) as readings:
                 for index, reading in enumerate(readings):
                     _process(index, reading, slam, record, display, out if save_masks else None, observe)
         except KeyboardInterrupt:
@@ -130,31 +137,43 @@ def run(
     return report
 
 
-def read_ahead(sequence: "Sequence", count: int, ahead: int = AHEAD) -> "Generator[Reading]":
+def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
+    from dudmap.sequences.masks import MaskFolder
+
+    return MaskFolder(folder, sequence.timestamps, sequence.camera)
+
+
+def read_ahead(
+    sequence: "Sequence", count: int, ahead: int = AHEAD, known: "MaskFolder | None" = None
+) -> "Generator[Reading]":
     """The first ``count`` frames in order, read by one thread up to ``ahead`` frames ahead."""
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
     pending: deque[Future[Reading]] = deque()
     try:
         for index in range(count + ahead):
             if index < count:
-                pending.append(reader.submit(_read, sequence, index))
+                pending.append(reader.submit(_read, sequence, index, known))
             if index >= ahead:
                 yield pending.popleft().result()
     finally:
         reader.shutdown(cancel_futures=True)
 
 
-def _read(sequence: "Sequence", index: int) -> Reading:
+def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None) -> Reading:
     start = time.perf_counter()
     try:
         frame: Frame | FrameError = sequence[index]
     except FrameError as error:
         return Reading(error, None, 1000 * (time.perf_counter() - start))
     ms = 1000 * (time.perf_counter() - start)
+    return Reading(frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index))
+
+
+def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:
     try:
-        return Reading(frame, sequence.mask(index), ms)
+        return read(index)
     except FrameError as error:
-        return Reading(frame, error, ms)
+        return error
 
 
 def _process(
@@ -174,8 +193,14 @@ def _process(
     if isinstance(truth, FrameError):
         display.note(f"frame {index}: its mask is not scored, {truth}")
         truth = None
+    known = reading.known
+    if isinstance(known, FrameError):
+        display.note(f"frame {index}: its mask is left out, {known}")
+        known = None
+    if record.masked is not None:
+        record.masked += known is not None
     start = time.perf_counter()
-    result = slam.process(reading.frame)
+    result = slam.process(reading.frame) if known is None else slam.process(reading.frame, known)
     record.add(result, 1000 * (time.perf_counter() - start), reading.ms, truth)
     if out_of_masks is not None:
         _save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)

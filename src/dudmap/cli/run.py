@@ -37,6 +37,9 @@ def run(
     camera: CameraOption = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
+    masks: Annotated[
+        Path | None, typer.Option("--masks", help="Folder of masks of what moves, <timestamp>.png with 255 = moves.")
+    ] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -50,7 +53,10 @@ def run(
     parameters = read_config(config, preset, assignments or [])
     recording = open_sequence(sequence, camera)
     out = out or free_folder(Path("runs") / recording.name)
-    report = run_sequence(recording, parameters, out, max_frames=max_frames, save_masks=save_masks, progress=not quiet)
+    report = run_sequence(
+        recording, parameters, out,
+        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet,
+    )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 
 
