@@ -84,7 +84,7 @@ class Camera:
         u = (np.arange(depth.shape[1], dtype=np.float32) - np.float32(self.cx)) / np.float32(self.fx)
         v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
         z = depth.astype(np.float32)
-        return np.stack([z * u[None, :], z * v[:, None], z], axis=-1)
+        return np.stack([z * u[None, :], z * v[:, None], z], axis=-1).astype(np.float32, copy=False)
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixel coordinates (..., 2) of points (..., 3) in the camera frame; points with z <= 0 give NaN (eq. 4.4)."""

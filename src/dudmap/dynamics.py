@@ -98,7 +98,7 @@ class DynamicDetector:
         """Labels of a frame that has been registered to ``volume`` at a pose."""
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume)
-        tolerance = 3 * self._sigma(level.depth, volume) + np.float32(0.02) * level.depth
+        tolerance = np.asarray(3 * self._sigma(level.depth, volume) + np.float32(0.02) * level.depth, np.float32)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
         histogram, edges = np.histogram(np.minimum(counted, LARGEST - 1e-3), bins=BINS, range=(0, LARGEST))

@@ -128,7 +128,7 @@ class Tracker:
             if not diagonal.max() > 0:
                 break
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-            step = -np.linalg.solve(damped, system.b)
+            step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
             T_trial = moved(T, step)
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1

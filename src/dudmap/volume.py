@@ -195,7 +195,8 @@ class TsdfVolume:
         if frame.depth.shape != self.camera.shape or frame.color.shape[:2] != self.camera.shape:
             raise MapError(
                 f"the volume's camera is {self.camera.width}x{self.camera.height}, but depth is "
-                f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour {frame.color.shape[1]}x{frame.color.shape[0]}"
+                f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour "
+                f"{frame.color.shape[1]}x{frame.color.shape[0]}"
             )
         depth = frame.depth.astype(np.float32)
         depth[~((depth > 0) & (depth <= self.depth_max))] = 0

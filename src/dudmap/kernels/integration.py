@@ -369,7 +369,21 @@ def observe_free(
 
 @kernel
 def sample_map(
-    row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, unit, free_count, free_after, distance, difference, place
+    row_start,
+    row_stop,
+    depth,
+    intensity,
+    intrinsics,
+    T,
+    window,
+    shape,
+    geometry,
+    unit,
+    free_count,
+    free_after,
+    distance,
+    difference,
+    place,
 ):
     """What the map says at the points of a depth image.
 
@@ -432,7 +446,7 @@ def sample_map(
 
 @kernel
 def observation_weights(row_start, row_stop, depth, intrinsics, sigma_base, sigma_scale, best, out):
-    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal reading at one metre gets ``best``.
+    """Weight of each reading: cos(theta) / err(z) (eq. 4.20), scaled so that a frontal one at 1 m gets ``best``.
 
     Args:
         row_start, row_stop: Rows of the band.

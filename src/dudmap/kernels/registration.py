@@ -64,7 +64,7 @@ def linearize(
         residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
         sums: (NUM_SUMS,) float64, see there. Twist (v, omega) about the camera's centre, world axes.
     """
-    h, w = depth.shape
+    w = depth.shape[1]
     corners = np.empty((8, w), np.int32)
     ix = np.empty(w, np.int32)
     iy = np.empty(w, np.int32)

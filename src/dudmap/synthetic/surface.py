@@ -124,7 +124,8 @@ def _colors(primitive: Primitive, local: Points, normals: Points, detail: float,
     start = sum((SIZE >> finer) ** 2 for finer in range(level))
     texel = np.floor(v * size).astype(int) % size * size + np.floor(u * size).astype(int) % size
     packed = atlas[TEXTURES.index(material.texture), start + texel]
-    return np.stack([packed & 255, packed >> 8 & 255, packed >> 16 & 255], axis=1) * np.asarray(material.tint)
+    rgb = np.stack([packed & 255, packed >> 8 & 255, packed >> 16 & 255], axis=1).astype(np.float64)
+    return rgb * np.asarray(material.tint)
 
 
 def tessellate(
