@@ -264,7 +264,8 @@ class TsdfVolume:
             self._slot_of = _grown(self._slot_of, capacity, -1)
             self._free_count = _grown(self._free_count, capacity, 0)
         if 2 * needed > len(self._table):
-            self._table = np.full(4 * len(self._table), hashing.EMPTY, dtype=np.int32)
+            size = 1 << int(4 * needed - 1).bit_length()  # a full table would be searched for ever
+            self._table = np.full(size, hashing.EMPTY, dtype=np.int32)
             hashing.rebuild(self._table, self._coords, self._num_entries)
         entries, self._num_entries = hashing.insert_all(
             self._table, self._coords, self._num_entries, coords.astype(np.int32)
