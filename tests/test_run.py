@@ -39,6 +39,7 @@ class Result:
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None
+    movers: tuple = ()
     timings: dict = field(default_factory=lambda: {"track": 2.0})
 
 
@@ -111,7 +112,7 @@ def test_the_run_folder(slam, recording, tmp_path):
     out = tmp_path / "deep" / "out"
     report = go(recording, out)
     assert sorted(path.name for path in out.iterdir()) == [
-        "config.toml", "map.npz", "mesh.ply", "metrics.json", "timings.csv", "trajectory.txt"
+        "config.toml", "map.npz", "mesh.ply", "metrics.json", "movers.jsonl", "timings.csv", "trajectory.txt"
     ]  # fmt: skip
     metrics = metrics_of(out)
     assert metrics == json.loads(json.dumps(report.metrics))

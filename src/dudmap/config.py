@@ -202,6 +202,23 @@ class RelocalizationConfig(Part):
     """or turn it, degrees."""
 
 
+class MoversConfig(Part):
+    """Moving bodies with identity and velocity, as a result; they never influence the pose."""
+
+    enabled: bool = True
+    """Report the bodies that move."""
+    min_area: float = Field(default=0.03, ge=0)
+    """Smallest visible surface of a body, square metres."""
+    merge_distance: float = Field(default=0.3, ge=0)
+    """A small region nearer than this to a larger one is a part of it, metres."""
+    max_jump: float = Field(default=0.4, gt=0)
+    """Farthest from where it was expected that a body is still the same, metres; overlapping boxes count too."""
+    memory: float = Field(default=0.7, ge=0)
+    """A body that comes back into view within this time keeps its number, seconds."""
+    velocity_window: float = Field(default=0.3, gt=0)
+    """The velocity is the mean over this time, seconds."""
+
+
 class Config(Part):
     """All parameters of the system."""
 
@@ -214,6 +231,7 @@ class Config(Part):
     tracker: TrackerConfig = TrackerConfig()
     dynamics: DynamicsConfig = DynamicsConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
+    movers: MoversConfig = MoversConfig()
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":
@@ -296,6 +314,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False},
         "relocalization": {"enabled": False},
+        "movers": {"enabled": False},
     },
 }
 

@@ -1,6 +1,7 @@
 """The figures of a run: counted frame by frame, summed up once."""
 
 import csv
+import json
 import os
 import platform
 import sys
@@ -18,6 +19,7 @@ from dudmap.errors import DatasetError
 from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from dudmap.movers import Mover
     from dudmap.slam import FrameResult
 
 SCORED_COVERAGE = 0.05
@@ -34,6 +36,7 @@ class RunRecord:
         unreadable: One sentence per frame that could not be read.
         mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
         masked: Frames that had a mask from outside, None if none were given.
+        movers: One object per frame with moving bodies, as written to movers.jsonl.
         residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
     """
 
@@ -41,6 +44,7 @@ class RunRecord:
     lost: list[dict[str, Any]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
     mask_ious: list[float] = field(default_factory=list)
+    movers: list[dict[str, Any]] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     fused: int = 0
     skipped_similar: int = 0
@@ -67,6 +71,8 @@ class RunRecord:
         self.relocalized += result.relocalized
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
+        if result.movers:
+            self.movers.append({"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]})
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
@@ -80,6 +86,10 @@ class RunRecord:
             writer = csv.DictWriter(file, columns, restval=0)
             writer.writeheader()
             writer.writerows(self.rows)
+
+    def save_movers(self, path: Path) -> None:
+        """JSON lines, one per frame with moving bodies."""
+        path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
 
     def save_residuals(self, path: Path) -> None:
         """NPZ with the histogram of all residuals and the mixture fitted to it; nothing if there are none.
@@ -177,6 +187,19 @@ def machine() -> dict[str, Any]:
         cpu = names[0].partition(":")[2].strip() if names else cpu
     usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
     return {"cpu": cpu, "cores": os.cpu_count(), "cores_usable": usable, "os": platform.platform()}
+
+
+def _row(mover: "Mover") -> dict[str, Any]:
+    """A moving body as JSON can hold it: metres, m/s, world frame."""
+    return {
+        "id": mover.id,
+        "centroid": mover.centroid.round(4).tolist(),
+        "box": mover.box.round(4).tolist(),
+        "velocity": mover.velocity.round(4).tolist(),
+        "speed": round(mover.speed, 4),
+        "age": round(mover.age, 4),
+        "pixels": int(np.count_nonzero(mover.mask)),
+    }
 
 
 def _number(value: float | np.floating, digits: int = 3) -> float | None:

@@ -29,7 +29,7 @@ AHEAD = 4
 """Frames of a recording on disk that are read while an earlier one is processed."""
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz",
+    "residuals.npz", "movers.jsonl",
 )  # fmt: skip
 
 
@@ -79,10 +79,11 @@ def run(
     """Run the system over a recording and write a run folder.
 
     The folder gets trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
-    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), the true
-    trajectory as groundtruth.txt where it is known and, if asked for, masks/<timestamp>.png (255 = dynamic). Results
-    of an earlier run in the same folder are removed first. If anything stops the run, what was computed so far is
-    written all the same.
+    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it),
+    movers.jsonl (one JSON object per frame with moving bodies: timestamp and, of each body, id, centroid, box,
+    velocity, speed and pixels; metres, m/s, world frame), the true trajectory as groundtruth.txt where it is known
+    and, if asked for, masks/<timestamp>.png (255 = dynamic). Results of an earlier run in the same folder are removed
+    first. If anything stops the run, what was computed so far is written all the same.
 
     Args:
         sequence: The recording; its ground truth and masks are used for scoring only.
@@ -265,6 +266,7 @@ def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", con
         lambda: config.save(out / "config.toml"),
         lambda: record.save_timings(out / "timings.csv"),
         lambda: record.save_residuals(out / "residuals.npz"),
+        lambda: record.save_movers(out / "movers.jsonl"),
     ]
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth

@@ -16,6 +16,7 @@ from dudmap.dynamics import DynamicDetector, Labels, full_mask, grown_mask
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
 from dudmap.motion import MotionModel
+from dudmap.movers import Mover, MoverTracker
 from dudmap.preprocess import Observation, Preprocessor, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
@@ -42,6 +43,7 @@ class FrameResult:
         labels: The label step's full outcome, None where it did not run.
         tracking: The registration's full outcome, None for the first frame.
         timings: Milliseconds per stage.
+        movers: The moving bodies, by number; none in a lost frame.
     """
 
     timestamp: float
@@ -57,6 +59,7 @@ class FrameResult:
     tracking: TrackingResult | None
     timings: dict[str, float] = field(default_factory=dict)
     relocalized: bool = False
+    movers: tuple[Mover, ...] = ()
 
 
 class Slam:
@@ -78,6 +81,7 @@ class Slam:
         self.motion = MotionModel(self.config.tracker)
         self.health = TrackingHealth()
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
+        self.movers = MoverTracker(self.config.movers)
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
         self._untested = 0  # frames that are still fused without the similarity test
@@ -254,8 +258,9 @@ class Slam:
         """Static weights of the second registration at every level."""
         import cv2
 
+        static = labels.static_probability
         return [
-            cv2.resize(labels.static_probability, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
+            np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
             for level in levels
         ]
 
@@ -314,10 +319,15 @@ class Slam:
                 residuals = labels.sample.distance
             if known is not None:
                 mask = mask | known
+        movers: tuple[Mover, ...] = ()
+        if self.config.movers.enabled and labels is not None and not reason:
+            with clock("movers"):
+                level = levels[self._level(self.config.dynamics.width)]
+                movers = tuple(self.movers.update(observation.timestamp, labels.dynamic, level, tracked.T_world_camera))
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
-            clock.timings, relocalized,
+            clock.timings, relocalized, movers,
         )  # fmt: skip
 
 
@@ -340,7 +350,7 @@ def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDAr
     import cv2
 
     gain, offset = exposure
-    return rgb if exposure == (1.0, 0.0) else cv2.LUT(rgb, _curve(gain, offset))
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
 
 
 def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
