@@ -4,7 +4,6 @@ No classifier: a body is what the labels call moving and what hangs together in 
 """
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +12,18 @@ from dudmap.config import MoversConfig
 from dudmap.kernels import labeling
 from dudmap.tracker import Level
 
-SAMPLES = 120
+SAMPLES = 60
 """Points per region that measure the gap to another region."""
 MOST_REGIONS = 24
 """Larger regions that are looked at; the rest is noise."""
-FEWEST_PIXELS = 20
+PAIRED_PIXELS = 150
+"""Pixels of a body that are looked for in the last frame."""
+FEWEST_PIXELS = 15
 """Pixels with a known motion that make a velocity."""
+WINDOW = 9
+"""Width of the patch that is looked for, pixels."""
+SPECK = 8
+"""Regions of fewer pixels are noise."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,8 +81,8 @@ class MoverTracker:
     """Bodies of a frame, matched to those of the frames before.
 
     A body's velocity is the mean of its motions during the last ``velocity_window`` seconds. The motion from one frame
-    to the next is the median displacement in the world of its pixels, paired by dense optical flow (Kroeger et al.
-    2016), because the centroid of the visible part also moves when more or less of the body comes into view. Where
+    to the next is the median displacement in the world of its pixels, paired by optical flow there and back (Lucas and
+    Kanade 1981), because the centroid of the visible part also moves when more or less of the body comes into view. Where
     too few pixels can be paired, the centroid's motion is taken.
 
     Args:
@@ -89,7 +94,6 @@ class MoverTracker:
         self._tracks: list[_Track] = []
         self._last: _Seen | None = None
         self._next_id = 1
-        self._flow: Any = None
 
     def update(
         self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]
@@ -111,17 +115,16 @@ class MoverTracker:
         points = level.camera.backproject(level.depth) @ T[:3, :3].T + T[:3, 3]
         ids = np.zeros(dynamic.shape, dtype=np.int32)
         seen = _Seen(timestamp, np.clip(255 * level.intensity, 0, 255).astype(np.uint8), points, ids)
-        flow = self._flow_to_last(seen)
         movers = []
         for mask, track in self._matched(timestamp, bodies, points):
             ids[mask] = track.id
             body = points[mask]
             centroid = body.mean(axis=0, dtype=np.float64)
-            way = self._way(mask, track, seen, flow)
+            way = self._way(mask, track, seen)
             if way is None and track.last_seen < timestamp:
                 way = centroid - track.centroid
             if way is not None:
-                self._take_step(track, timestamp, way, flow)
+                self._take_step(track, timestamp, way)
             track.centroid, track.last_seen = centroid, timestamp
             track.box = _box(body)
             age = timestamp - track.first_seen
@@ -138,6 +141,7 @@ class MoverTracker:
         count = labeling.grow(moving, moving, level.depth, np.float32(0.02) + np.float32(0.02) * level.depth, regions)
         pixel = level.depth.astype(np.float64) ** 2 / (level.camera.fx * level.camera.fy)
         areas = np.bincount(regions.reshape(-1), pixel.reshape(-1), minlength=count + 1).astype(np.float64)
+        areas[np.bincount(regions.reshape(-1), minlength=count + 1) < SPECK] = 0
         areas[0] = 0
         kept = [int(number) for number in np.argsort(-areas, kind="stable")[:MOST_REGIONS] if areas[number] > 0]
         points = level.camera.backproject(level.depth)
@@ -183,40 +187,33 @@ class MoverTracker:
                 self._next_id += 1
         return [(bodies[i], tracks[i]) for i in range(len(bodies))]
 
-    def _flow_to_last(self, seen: _Seen) -> NDArray[np.float32] | None:
-        """Where (h, w, 2) each pixel's content was in the last frame, pixels; None without a last frame."""
+    def _way(self, mask: NDArray[np.bool_], track: _Track, seen: _Seen) -> NDArray[np.float64] | None:
+        """Median displacement (3,) of a body's pixels since the last frame, metres; None if too few can be paired."""
         last = self._last
-        if last is None or last.grey.shape != seen.grey.shape or seen.timestamp - last.timestamp > self.config.memory:
+        if last is None or track.last_seen != last.timestamp or last.grey.shape != seen.grey.shape:
             return None
         import cv2
 
-        if self._flow is None:
-            self._flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_MEDIUM)
-            self._flow.setFinestScale(0)
-        flow = np.asarray(self._flow.calc(seen.grey, last.grey, None), dtype=np.float32)
-        v, u = np.indices(seen.grey.shape, dtype=np.float32)
-        return flow + np.stack([u, v], axis=-1)
-
-    def _way(
-        self, mask: NDArray[np.bool_], track: _Track, seen: _Seen, flow: NDArray[np.float32] | None
-    ) -> NDArray[np.float64] | None:
-        """Median displacement (3,) of a body's pixels since the last frame, metres; None if too few can be paired."""
-        if flow is None or self._last is None or track.last_seen != self._last.timestamp:
+        inner = np.argwhere(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)))[:, ::-1]
+        now = inner[:: max(1, len(inner) // PAIRED_PIXELS)].astype(np.float32)
+        if len(now) < FEWEST_PIXELS:
             return None
-        then = np.rint(flow[mask]).astype(np.int64)
+        parameters = {"winSize": (WINDOW, WINDOW), "maxLevel": 2, "minEigThreshold": 1e-4}
+        then, found, _ = cv2.calcOpticalFlowPyrLK(seen.grey, last.grey, now, None, **parameters)
+        back, again, _ = cv2.calcOpticalFlowPyrLK(last.grey, seen.grey, then, None, **parameters)
         h, w = mask.shape
-        inside = (then >= 0).all(axis=1) & (then[:, 0] < w) & (then[:, 1] < h)
-        u, v = then[inside].T
-        same = self._last.ids[v, u] == track.id
-        way = seen.points[mask][inside][same] - self._last.points[v[same], u[same]]
+        u, v = np.rint(then).astype(np.int64).T
+        good = (found[:, 0] > 0) & (again[:, 0] > 0) & (np.abs(back - now).max(axis=1) < 0.5)
+        good &= (u >= 0) & (v >= 0) & (u < w) & (v < h)
+        good[good] = last.ids[v[good], u[good]] == track.id
+        u_now, v_now = now[good].astype(np.int64).T
+        way = seen.points[v_now, u_now] - _between(last.points, then[good])
         way = way[np.linalg.norm(way, axis=1) < self.config.max_jump]
         if len(way) < FEWEST_PIXELS:
             return None
         return np.median(way, axis=0).astype(np.float64)
 
-    def _take_step(
-        self, track: _Track, timestamp: float, way: NDArray[np.float64], flow: NDArray[np.float32] | None
-    ) -> None:
+    def _take_step(self, track: _Track, timestamp: float, way: NDArray[np.float64]) -> None:
         track.steps = [step for step in track.steps if timestamp - step[0] < self.config.velocity_window]
         track.steps.append((timestamp, timestamp - track.last_seen, way))
         durations = np.array([step[1] for step in track.steps])
@@ -228,6 +225,16 @@ def _box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     order = np.sort(points, axis=0)
     cut = len(points) // 100
     return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)
+
+
+def _between(points: NDArray[np.float32], pixels: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Points (n, 3) of an image (h, w, 3) at places (n, 2) between its pixels; bilinear within one surface."""
+    h, w = points.shape[:2]
+    u0 = np.clip(np.floor(pixels[:, 0]).astype(np.int64), 0, w - 2)
+    v0 = np.clip(np.floor(pixels[:, 1]).astype(np.int64), 0, h - 2)
+    du, dv = (pixels - np.stack([u0, v0], axis=1)).T[:, :, None]
+    corners = points[v0, u0], points[v0, u0 + 1], points[v0 + 1, u0], points[v0 + 1, u0 + 1]
+    return (1 - dv) * ((1 - du) * corners[0] + du * corners[1]) + dv * ((1 - du) * corners[2] + du * corners[3])
 
 
 def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
