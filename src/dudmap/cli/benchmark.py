@@ -129,3 +129,32 @@ def limits(
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     typer.echo(text)
     typer.echo(f"written to {out}")
+
+
+@app.command()
+def speed(
+    out: Annotated[Path, typer.Option("--out", help="Folder for speed.md and speed.json.")] = Path(
+        "runs/benchmark/speed"
+    ),
+    long: Annotated[
+        bool, typer.Option("--long", help="Also walk through new space for 2000 frames: does the time grow?")
+    ] = False,
+    quick: QuickOption = False,
+) -> None:
+    """Measure time and memory on this machine; leave it alone meanwhile."""
+    import json
+
+    from dudmap.benchmark import speed as timing
+    from dudmap.metrics import machine, versions
+
+    frames, long_frames = (20, 60) if quick else (120, 2000)
+    figures = timing.speed_figures(
+        frames, long_frames if long else 0, lambda what: typer.echo(f"measuring {what}", err=True)
+    )
+    text = timing.markdown(figures)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "speed.md").write_text(text, encoding="utf-8")
+    content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
+    (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    typer.echo(text)
+    typer.echo(f"written to {out}")

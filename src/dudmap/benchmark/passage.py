@@ -1,0 +1,59 @@
+"""A long passage that a camera walks through: space that is always new."""
+
+import numpy as np
+
+from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.synthetic.scene import Light, Material, Scene, box, cylinder, look_at, pose
+from dudmap.trajectory import Trajectory
+
+SPEED, FPS = 0.3, 30.0  # m/s, frames per second
+BEYOND = 4.0  # metres of passage beyond the last camera position
+
+
+def passage(frames: int) -> SyntheticSequence:
+    """A recording of ``frames`` frames in which the camera walks straight on, looking at one wall, then at the other.
+
+    The passage is 3 m wide and as long as the walk; pilasters, boxes and columns stand along both walls.
+    """
+    times = np.arange(frames) / FPS
+    length = SPEED * float(times[-1]) + BEYOND
+    poses = np.array([_pose(t) for t in times])
+    return SyntheticSequence(
+        _scene(length), [], Trajectory(times, poses), DEFAULT_CAMERA, noise="kinect", seed=0, fps=FPS
+    )
+
+
+def _pose(t: float) -> np.ndarray:
+    x, y, z = 0.1 * np.sin(1.3 * t), SPEED * t, 1.4 + 0.05 * np.sin(0.9 * t)
+    aside = 0.9 * np.sin(0.35 * t)
+    return look_at((x, y, z), (x + aside, y + 1.6, 1.0))
+
+
+def _scene(length: float) -> Scene:
+    middle = length / 2 - 1.0
+    solids = [
+        box((0, middle, -0.1), (3.4, length + 2, 0.2), Material("checks", (0.4, 0.4))),
+        box((0, middle, 2.6), (3.4, length + 2, 0.2), Material("plaster", (0.5, 0.5))),
+        box((0, length, 1.25), (3.4, 0.2, 2.5), Material("brick", (0.6, 0.6))),
+    ]
+    for side, texture in ((-1, "wallpaper"), (1, "brick")):
+        solids.append(box((side * 1.6, middle, 1.25), (0.2, length + 2, 2.5), Material(texture, (0.5, 0.5))))
+        for number, y in enumerate(np.arange(0.8 + 0.4 * side, length, 2.6)):
+            height = 0.4 + 0.25 * (number % 4)
+            solids.append(box((side * 1.25, y, height / 2), (0.5, 0.6, height), Material("wood", (0.6, 0.6))))
+            solids.append(box((side * 1.45, y + 1.3, 1.25), (0.2, 0.3, 2.5), Material("plaster", (0.8, 0.8))))
+            if number % 2:
+                top, bottom = (side * 1.1, y + 0.7, 0.9), (side * 1.1, y + 0.7, 0.0)
+                solids.append(cylinder(bottom, top, 0.12, Material("stripes", (3, 3))))
+    return Scene(
+        name="passage",
+        primitives=solids,
+        home=look_at((0.0, 0.0, 1.4), (0.0, 2.0, 1.0)),
+        target=(0.0, 2.0, 1.0),
+        space=((-1.0, -0.5, 0.8), (1.0, length, 2.1)),
+        extent=((-1.5, -1.0, 0.0), (1.5, length, 2.5)),
+        walk_line=((-1.0, 2.0), (1.0, 2.0)),
+        rest=pose((0.4, 2.0, 0.0)),
+        hinge=pose(),
+        lights=tuple(Light((0.0, float(y), 2.4)) for y in np.arange(1.0, length, 4.0)),
+    )

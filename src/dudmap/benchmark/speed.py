@@ -1,0 +1,239 @@
+"""Speed and memory on this machine, beside what they should be."""
+
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+
+from dudmap.benchmark.entries import Entry
+from dudmap.benchmark.measure import Row, in_own_process
+from dudmap.benchmark.table import grid
+from dudmap.config import Config
+from dudmap.errors import DudmapError
+
+if TYPE_CHECKING:
+    from dudmap.slam import Slam
+
+WARM_UP = 10
+"""First frames of a run that are not timed."""
+
+
+class Figure(NamedTuple):
+    """One line of the table: what was measured, in which unit, at most how much is wanted, and what came out."""
+
+    what: str
+    unit: str
+    target: float
+    measured: float | None
+    remark: str = ""
+
+
+def speed_figures(frames: int, long_frames: int = 0, say: Callable[[str], None] = lambda text: None) -> list[Figure]:
+    """All figures, each measured in a fresh process.
+
+    Args:
+        frames: Length of the recordings that are timed.
+        long_frames: Length of the walk through new space that shows whether time per frame grows; 0 leaves it out.
+        say: Called with what is measured next.
+
+    Raises:
+        DudmapError: A measurement failed.
+    """
+    figures: list[Figure] = []
+    say("frames at 1, 2 and 0.5 cm voxels")
+    for voxel, median, p95 in ((0.01, 33.0, 50.0), (0.02, 20.0, None), (0.005, 70.0, None)):
+        row = _ask(_time_frames, (voxel, frames))
+        name = f"frame, {100 * voxel:g} cm voxels"
+        figures.append(Figure(f"{name}, median", "ms", median, row["median"]))
+        if p95 is not None:
+            figures.append(Figure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
+            figures.append(Figure("map memory per occupied block", "KB", 4.2, row["bytes_per_block"] / 1000))
+            figures.append(
+                Figure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles")
+            )
+            figures.append(Figure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
+    say("one registration iteration on one thread")
+    with _environment(DUDMAP_THREADS="1"):
+        row = _ask(_time_iteration, 40)
+    figures.append(Figure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
+    say("starting")
+    figures += _start_times()
+    if long_frames:
+        say(f"{long_frames} frames through new space")
+        row = _ask(_time_walk, long_frames)
+        remark = f"{long_frames} frames, {row['first_ms']:.1f} to {row['last_ms']:.1f} ms"
+        figures.append(Figure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
+    return figures
+
+
+def markdown(figures: list[Figure]) -> str:
+    """The figures as a Markdown table."""
+    body = [
+        [
+            figure.what,
+            f"<= {figure.target:g} {figure.unit}",
+            "nothing" if figure.measured is None else f"{figure.measured:.3g} {figure.unit}",
+            "yes" if figure.measured is not None and figure.measured <= figure.target else "NO",
+            figure.remark,
+        ]
+        for figure in figures
+    ]
+    return grid(["what", "target", "measured", "reached", "remark"], body, words=1)
+
+
+def _ask(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
+    row = in_own_process(function, argument)
+    if "error" in row:
+        raise DudmapError(f"the speed could not be measured: {row['error']}")
+    return row
+
+
+@contextmanager
+def _environment(**variables: str) -> Iterator[None]:
+    """Environment variables for the processes started within."""
+    old = {name: os.environ.get(name) for name in variables}
+    os.environ.update(variables)
+    try:
+        yield
+    finally:
+        for name, value in old.items():
+            os.environ.pop(name)
+            if value is not None:
+                os.environ[name] = value
+
+
+def _processed(config: Config, frames: int) -> "Iterator[tuple[Slam, float]]":
+    """The system and the milliseconds of every frame of a room with a person; rendering is not timed."""
+    from dudmap.slam import Slam
+
+    sequence = Entry("room-person", parameters={"frames": frames, "start_dynamic": False}).open()
+    slam = Slam(sequence.camera, config)
+    for index in range(frames):
+        frame = sequence[index]
+        start = time.perf_counter()
+        slam.process(frame)
+        yield slam, 1000 * (time.perf_counter() - start)
+
+
+def _time_frames(job: tuple[float, int]) -> Row:
+    """Frames, then mesh and view of the map they left; every time is the best of what a warm program gives."""
+    voxel, frames = job
+    slam, times = None, []
+    for slam, ms in _processed(Config().override([f"volume.voxel_size={voxel}"]), frames):  # noqa: B007
+        times.append(ms)
+    assert slam is not None
+    timed = np.array(times[WARM_UP:] or times)
+    row: Row = {"median": float(np.median(timed)), "p95": float(np.percentile(timed, 95))}
+    row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
+    pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
+    seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
+    row |= {"triangles": len(mesh.faces), "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
+    row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
+    return row
+
+
+def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
+    """Median duration after one call that warms up, and the last result."""
+    result, seconds = action(), []
+    for _ in range(times):
+        start = time.perf_counter()
+        result = action()
+        seconds.append(time.perf_counter() - start)
+    return statistics.median(seconds), result
+
+
+def _time_iteration(frames: int) -> Row:
+    """One linearisation of the level that is 320 pixels wide, against the map of a few frames."""
+    from dudmap.preprocess import pyramid
+    from dudmap.tracker import Level
+
+    sequence = Entry("room-person", parameters={"frames": frames}).open()
+    slam = None
+    for slam, _ in _processed(Config(), frames):  # noqa: B007
+        pass
+    assert slam is not None
+    halvings = round(np.log2(slam.camera.width / 320))
+    depth, intensity = pyramid(slam.preprocess(sequence[frames - 1]), halvings)
+    level = Level(slam.camera.scaled(halvings), depth, intensity)
+    pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
+    slam.volume.look_at(pose)
+    seconds, _ = _median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
+    return {"iteration_ms": 1000 * seconds}
+
+
+def _time_walk(frames: int) -> Row:
+    """Median time of the first and the last tenth of a walk through space that is always new."""
+    from dudmap.benchmark.passage import passage
+    from dudmap.slam import Slam
+
+    sequence = passage(frames)
+    slam, times = Slam(sequence.camera, Config()), []
+    for index in range(frames):
+        frame = sequence[index]
+        start = time.perf_counter()
+        slam.process(frame)
+        times.append(1000 * (time.perf_counter() - start))
+    timed = times[min(60, frames // 4) :]
+    tenth = max(len(timed) // 10, 1)
+    first, last = statistics.median(timed[:tenth]), statistics.median(timed[-tenth:])
+    return {"first_ms": first, "last_ms": last, "growth": last / first}
+
+
+FIRST_POSE = """
+import os, sys
+from pathlib import Path
+from dudmap.config import Config
+from dudmap.run import run
+from dudmap.sequences import open_sequence
+
+def first(index, reading, result):
+    if index == 1:
+        print("pose", flush=True)
+        os._exit(0)
+
+run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False, observe=first)
+"""
+"""The first pose that had to be computed is the second frame's: the first one's is the identity."""
+
+
+def _start_times() -> list[Figure]:
+    """Time of import, help, and from the start of the program to the first computed pose."""
+    from dudmap.synthetic.folder import write_folder
+
+    figures = [
+        Figure("import dudmap", "s", 0.15, _of_program(["-c", "import dudmap"]) - _of_program(["-c", ""])),
+        Figure("dudmap --help", "s", 0.4, _of_program(["-m", "dudmap", "--help"])),
+    ]
+    with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
+        recording = Path(temporary) / "recording"
+        write_folder(Entry("room-person", parameters={"frames": 3}).open(), recording, surface=False)  # type: ignore[arg-type]
+        first_pose = ["-c", FIRST_POSE, str(recording)]
+        _of_program(first_pose, 1)
+        figures.append(Figure("to the first pose, kernels cached", "s", 1.5, _of_program(first_pose, 3)))
+        with _environment(NUMBA_CACHE_DIR=str(Path(temporary) / "cache")):
+            figures.append(Figure("to the first pose, nothing cached", "s", 20.0, _of_program(first_pose, 1)))
+    return figures
+
+
+def _of_program(arguments: list[str], times: int = 5) -> float:
+    """Median duration of a Python program, seconds.
+
+    Raises:
+        DudmapError: It fails.
+    """
+    seconds = []
+    for _ in range(times):
+        start = time.perf_counter()
+        done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, check=False)
+        seconds.append(time.perf_counter() - start)
+        if done.returncode:
+            raise DudmapError(f"a program that should be timed failed: {done.stderr.strip().splitlines()[-1]}")
+    return statistics.median(seconds)
