@@ -487,7 +487,7 @@ class TsdfVolume:
         import zipfile
 
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
                 if str(data["format"]) != FORMAT:
                     raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
                 fx, fy, cx, cy = (float(value) for value in data["camera"])

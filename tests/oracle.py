@@ -1,0 +1,59 @@
+"""Slow plain-NumPy restatements of the formulas, written from the thesis' equations and not from the kernels."""
+
+import numpy as np
+
+from dudmap.camera import Camera
+
+
+def fuse(frames, T_camera_world_of, camera: Camera, points, truncation, behind, max_weight):
+    """Running average (eq. 4.18-4.23) of projective distances at world points (N, 3), constant weight, no carving.
+
+    Returns distance (N,) with NaN where never seen, weight (N,), colour (N, 3) float.
+    """
+    distance, weight, color = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
+    for frame, T in zip(frames, T_camera_world_of, strict=True):
+        p = points @ T[:3, :3].T + T[:3, 3]
+        for n, (x, y, z) in enumerate(p):
+            if z <= 0.05:
+                continue
+            u = int(np.floor(x / z * camera.fx + camera.cx + 0.5))
+            v = int(np.floor(y / z * camera.fy + camera.cy + 0.5))
+            if not (0 <= u < camera.width and 0 <= v < camera.height) or frame.depth[v, u] <= 0:
+                continue
+            s = frame.depth[v, u] - z
+            if s < -behind:
+                continue
+            if s >= truncation:  # seen empty: the voxel is free, its colour stays
+                near = frame.depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
+                if near[near > 0].min() - z <= truncation:
+                    continue
+                s = truncation
+                paint = 0.0
+            else:
+                paint = 1.0 / (weight[n] + 1)
+            color[n] += (frame.color[v, u] - color[n]) * paint
+            distance[n] = (distance[n] * weight[n] + s) / (weight[n] + 1)
+            weight[n] = min(weight[n] + 1, max_weight)
+    return np.where(weight > 0, distance, np.nan), weight, color
+
+
+def trilinear(grid, point):
+    """Value at a point (3,) in lattice units of a callable ``grid(i, j, k)``; NaN if a corner is NaN."""
+    base = np.floor(point).astype(int)
+    a = point - base
+    total = 0.0
+    for corner in np.ndindex(2, 2, 2):
+        share = np.prod([a[axis] if corner[axis] else 1 - a[axis] for axis in range(3)])
+        total += share * grid(*(base + corner))
+    return total
+
+
+def half_normal_mixture_em(samples, iterations=300):
+    """Maximum likelihood of two half-normal densities by EM on the samples themselves (eq. 4.52-4.56)."""
+    prior, sigma = np.array([0.8, 0.2]), np.array([1.0, 6.0])
+    for _ in range(iterations):
+        density = prior * np.sqrt(2 / np.pi) / sigma * np.exp(-(samples[:, None] ** 2) / (2 * sigma**2))
+        share = density / density.sum(axis=1, keepdims=True)
+        prior = share.mean(axis=0)
+        sigma = np.sqrt((share * samples[:, None] ** 2).sum(axis=0) / share.sum(axis=0))
+    return prior, sigma

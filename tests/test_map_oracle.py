@@ -1,0 +1,214 @@
+"""The map's kernels against plain NumPy: fusion, sampling, hashing, windows, free space, files."""
+
+import numpy as np
+import pytest
+from oracle import fuse, trilinear
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.errors import MapError
+from dudmap.frame import Frame
+from dudmap.kernels import hashing
+from dudmap.volume import FREE, TsdfVolume
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant", carve_rate=1)
+
+
+def wall(distance: float, seed: int = 0, bump: float = 0.1) -> Frame:
+    """A wavy wall in front of the camera with random colours."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    depth = distance + bump * np.sin(u / 9.0) * np.cos(v / 7.0)
+    return Frame(float(seed), depth.astype(np.float32), rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8))
+
+
+def poses(count: int) -> list[np.ndarray]:
+    rng = np.random.default_rng(1)
+    return [se3.exp(rng.normal(0, 0.03, 6)) for _ in range(count)]
+
+
+def voxels_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """World points, distances, weights and colours of all voxels of a volume."""
+    slots = volume.active_slots
+    words, colors = volume._geometry[slots].reshape(-1), volume._colors[slots].reshape(-1)
+    local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+    points = (volume._slot_coords[slots][:, None, :] * 8 + local[None]).reshape(-1, 3) * volume.voxel_size
+    rgb = np.stack([(colors >> 20) & 1023, (colors >> 10) & 1023, colors & 1023], axis=1) / 4
+    return points, (words >> 16) * volume.sdf_unit, (words >> 8) & 255, rgb
+
+
+def test_integrate_equals_the_running_average_of_the_thesis():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
+    frames, Ts = [wall(1.5, seed) for seed in range(3)], poses(3)
+    for frame, T in zip(frames, Ts, strict=True):
+        volume.integrate(frame, T)
+    points, distance, weight, color = voxels_of(volume)
+    chosen = np.random.default_rng(2).choice(np.flatnonzero(weight == 3), 1500, replace=False)
+    expected, weights, colors = fuse(
+        frames, [se3.inverse(T) for T in Ts], CAMERA, points[chosen], volume.truncation, volume.truncation_behind, 255
+    )
+    same_pixel = weights == 3  # float32 and float64 may round a projection to neighbouring pixels
+    assert same_pixel.mean() > 0.98
+    error = np.abs(distance[chosen] - expected)[same_pixel]
+    assert np.mean(error < 2 * volume.sdf_unit + 1e-6) > 0.98
+    band = same_pixel & (np.abs(expected) < 0.9 * volume.truncation)
+    assert np.mean(np.abs(color[chosen] - colors)[band].max(axis=1) < 1.0) > 0.97
+
+
+def test_the_order_of_frames_does_not_matter_below_the_weight_cap():
+    frames, Ts = [wall(1.5, seed) for seed in range(4)], poses(4)
+    maps = []
+    for order in ([0, 1, 2, 3], [3, 1, 0, 2]):
+        volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"carving": False}), depth_max=4.0)
+        volume.integrate(frames[0], Ts[0])  # the same blocks exist before either order begins
+        volume.integrate(frames[3], Ts[3])
+        for index in order:
+            volume.integrate(frames[index], Ts[index])
+        points, distance, weight, _ = voxels_of(volume)
+        keys = map(tuple, np.round(points / volume.voxel_size).astype(int))
+        maps.append({key: (d, w) for key, d, w in zip(keys, distance, weight, strict=True) if w >= 4})
+    shared = maps[0].keys() & maps[1].keys()
+    assert len(shared) > 2000
+    assert max(abs(maps[0][key][0] - maps[1][key][0]) for key in shared) < 1e-3
+
+
+def test_weights_stop_at_the_cap():
+    volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"max_weight": 3}), depth_max=4.0)
+    for _ in range(6):
+        volume.integrate(wall(1.5), np.eye(4))
+    assert voxels_of(volume)[2].max() == 3
+
+
+def test_sample_is_trilinear_interpolation():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
+    volume.integrate(wall(1.5), np.eye(4))
+    points, distance, weight, _ = voxels_of(volume)
+    field = {
+        tuple(key): d if w else np.nan
+        for key, d, w in zip(np.round(points / volume.voxel_size).astype(int), distance, weight, strict=True)
+    }
+    T = se3.exp(np.array([0.01, -0.02, 0.01, 0.01, 0.0, 0.02]))
+    volume.look_at(T)
+    depth = wall(1.5).depth
+    sample = volume.sample(depth, np.zeros_like(depth), CAMERA, T)
+    checked = 0
+    for v, u in np.random.default_rng(3).integers(0, (48, 64), (300, 2)):
+        z = depth[v, u]
+        p = T[:3, :3] @ [(u - CAMERA.cx) / CAMERA.fx * z, (v - CAMERA.cy) / CAMERA.fy * z, z] + T[:3, 3]
+        expected = trilinear(lambda *key: field.get(key, np.nan), p / volume.voxel_size)
+        if np.isfinite(expected):
+            assert sample.distance[v, u] == pytest.approx(expected, abs=2e-4)
+            checked += 1
+    assert checked > 200
+
+
+def test_hash_table_agrees_with_a_dictionary():
+    rng = np.random.default_rng(4)
+    wanted = rng.integers(-50, 50, (5000, 3)).astype(np.int32)
+    table, coords = np.full(1 << 14, hashing.EMPTY, np.int32), np.empty((5000, 3), np.int32)
+    entries, count = hashing.insert_all(table, coords, 0, wanted)
+    expected: dict[tuple[int, ...], int] = {}
+    for row in wanted:
+        expected.setdefault(tuple(row), len(expected))
+    assert count == len(expected)
+    assert [expected[tuple(row)] for row in wanted] == entries.tolist()
+    others = rng.integers(-60, 60, (3000, 3)).astype(np.int32)
+    found = hashing.find_all(table, coords, others)
+    assert found.tolist() == [expected.get(tuple(row), -1) for row in others]
+
+
+def test_a_far_journey_leaves_the_map_intact():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
+    for _ in range(4):
+        volume.integrate(wall(1.5), np.eye(4))
+    before = volume.extract_mesh()
+    away = np.eye(4)
+    away[0, 3] = 40.0
+    volume.integrate(wall(1.5, 1), away)
+    volume.look_at(np.eye(4))
+    view = volume.raycast(np.eye(4))
+    assert np.median(np.abs(view.depth - wall(1.5).depth)[view.depth > 0]) < 0.01
+    after = volume.extract_mesh()
+    assert np.count_nonzero(after.vertices[:, 0] < 20) == len(before.vertices)
+
+
+def box_before_wall() -> Frame:
+    frame = wall(3.0, bump=0.0)
+    frame.depth[15:35, 20:45] = 1.2
+    return frame
+
+
+def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
+    volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"carve_rate": 4, "voxel_size": 0.02}), depth_max=4.0)
+    for _ in range(15):
+        volume.integrate(box_before_wall(), np.eye(4))
+    assert np.any(np.abs(volume.extract_mesh().vertices[:, 2] - 1.2) < 0.03)
+    for _ in range(25):
+        volume.integrate(wall(3.0, bump=0.0), np.eye(4))
+    mesh = volume.extract_mesh()
+    inside = (np.abs(mesh.vertices[:, 0]) < 0.15) & (np.abs(mesh.vertices[:, 1]) < 0.1)
+    assert not np.any(inside & (mesh.vertices[:, 2] < 2.5))
+    assert volume.num_free_blocks > 0
+    seen = volume.sample(box_before_wall().depth, np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
+    empty = (seen.place == FREE) | (seen.distance > 0.8 * volume.truncation)
+    assert np.mean(empty[18:32, 24:41]) > 0.9
+
+
+def test_masked_pixels_change_nothing():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
+    static = np.ones(CAMERA.shape, dtype=bool)
+    static[:, 32:] = False
+    volume.integrate(wall(1.5), np.eye(4), static)
+    points, _, weight, _ = voxels_of(volume)
+    u = points[:, 0] / points[:, 2] * CAMERA.fx + CAMERA.cx
+    assert not np.any(weight[u > 33] > 0)
+
+
+def test_save_and_load_give_an_equal_map(tmp_path):
+    volume = TsdfVolume(CAMERA, CONSTANT, SensorConfig(sigma_scale=0.003), depth_max=3.5)
+    for index in range(4):
+        volume.integrate(wall(1.5, index), np.eye(4))
+    volume.save(tmp_path / "map.npz")
+    loaded = TsdfVolume.load(tmp_path / "map.npz")
+    a, b = volume.extract_mesh(), loaded.extract_mesh()
+    assert np.array_equal(a.vertices, b.vertices)
+    assert np.array_equal(a.faces, b.faces)
+    assert (loaded.config, loaded.sensor, loaded.depth_max) == (volume.config, volume.sensor, volume.depth_max)
+    assert loaded.num_free_blocks == volume.num_free_blocks
+    loaded.integrate(wall(1.5, 5), np.eye(4))
+    volume.integrate(wall(1.5, 5), np.eye(4))
+    assert np.array_equal(volume.extract_mesh().vertices, loaded.extract_mesh().vertices)
+
+
+def test_what_is_no_map_is_refused(tmp_path):
+    (tmp_path / "broken.npz").write_bytes(b"PK\x03\x04 not really")
+    with pytest.raises(MapError, match="not a readable map"):
+        TsdfVolume.load(tmp_path / "broken.npz")
+    np.savez(tmp_path / "other.npz", a=np.zeros(3))
+    with pytest.raises(MapError, match="not a readable map"):
+        TsdfVolume.load(tmp_path / "other.npz")
+    with pytest.raises(MapError, match="empty"):
+        TsdfVolume(CAMERA, CONSTANT).extract_mesh()
+
+
+def test_voxels_too_small_for_the_range_are_refused():
+    with pytest.raises(MapError, match="depth_max"):
+        TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.001), depth_max=6.0)
+
+
+def test_images_of_another_size_are_refused():
+    frame = Frame(0.0, np.ones((10, 10), np.float32), np.zeros((10, 10, 3), np.uint8))
+    with pytest.raises(MapError, match="64x48"):
+        TsdfVolume(CAMERA, CONSTANT).integrate(frame, np.eye(4))
+
+
+def test_space_that_was_seen_empty_costs_a_byte_not_a_block():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
+    for _ in range(12):
+        volume.integrate(wall(3.5), np.eye(4))
+    assert volume.num_free_blocks > 20
+    per_block = 2 * 512 * 4
+    assert volume._coords.itemsize * 3 + 4 + 1 < 0.01 * per_block
+    assert volume.num_bytes - volume._table.nbytes <= 4200 * volume.num_blocks + 20 * volume._num_entries
