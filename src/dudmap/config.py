@@ -207,7 +207,7 @@ class MoversConfig(Part):
 
     enabled: bool = True
     """Report the bodies that move."""
-    min_area: float = Field(default=0.03, ge=0)
+    min_area: float = Field(default=0.015, ge=0)
     """Smallest visible surface of a body, square metres."""
     merge_distance: float = Field(default=0.3, ge=0)
     """A small region nearer than this to a larger one is a part of it, metres."""
@@ -215,8 +215,8 @@ class MoversConfig(Part):
     """Farthest from where it was expected that a body is still the same, metres; overlapping boxes count too."""
     memory: float = Field(default=0.7, ge=0)
     """A body that comes back into view within this time keeps its number, seconds."""
-    velocity_window: float = Field(default=0.3, gt=0)
-    """The velocity is the mean over this time, seconds."""
+    velocity_window: float = Field(default=0.2, gt=0)
+    """The velocity is the median over this time, seconds."""
 
 
 class Config(Part):

@@ -12,7 +12,7 @@ from dudmap.config import MoversConfig
 from dudmap.kernels import labeling
 from dudmap.tracker import Level
 
-SAMPLES = 60
+SAMPLES = 150
 """Points per region that measure the gap to another region."""
 MOST_REGIONS = 24
 """Larger regions that are looked at; the rest is noise."""
@@ -22,6 +22,8 @@ FEWEST_PIXELS = 15
 """Pixels with a known motion that make a velocity."""
 WINDOW = 9
 """Width of the patch that is looked for, pixels."""
+HIDES = 0.1
+"""What is nearer than a body's border by more than this hides a part of it, metres."""
 SPECK = 8
 """Regions of fewer pixels are noise."""
 
@@ -63,6 +65,7 @@ class _Track:
     last_seen: float
     centroid: NDArray[np.float64]
     box: NDArray[np.float64]
+    whole: bool = False
     velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
     steps: list[tuple[float, float, NDArray[np.float64]]] = field(default_factory=list)  # time, duration, way
 
@@ -77,13 +80,25 @@ class _Seen:
     ids: NDArray[np.int32]
 
 
+@dataclass(frozen=True, eq=False)
+class _Part:
+    """A connected region: visible surface in m^2, whose it was in the last frame (0 = none), points, their box."""
+
+    area: float
+    before: int
+    sample: NDArray[np.float32]
+    box: NDArray[np.float32]
+
+
 class MoverTracker:
     """Bodies of a frame, matched to those of the frames before.
 
-    A body's velocity is the mean of its motions during the last ``velocity_window`` seconds. The motion from one frame
-    to the next is the median displacement in the world of its pixels, paired by optical flow there and back (Lucas and
-    Kanade 1981), because the centroid of the visible part also moves when more or less of the body comes into view. Where
-    too few pixels can be paired, the centroid's motion is taken.
+    A body's velocity is the median of its motions during the last ``velocity_window`` seconds. The motion from one
+    frame to the next is the median displacement in the world of its pixels, paired by optical flow there and back
+    (Lucas and Kanade 1981). While the body is wholly in view, the motions of its centroid and of its box's middle are
+    asked too and the median of the three counts: the surface of a rolling ball does not move like the ball. A body that
+    is cut off by the image's border or by something nearer has no such middle, nor has one with too few paired pixels
+    more than its centroid.
 
     Args:
         config: Sizes and times.
@@ -119,16 +134,17 @@ class MoverTracker:
         for mask, track in self._matched(timestamp, bodies, points):
             ids[mask] = track.id
             body = points[mask]
-            centroid = body.mean(axis=0, dtype=np.float64)
-            way = self._way(mask, track, seen)
-            if way is None and track.last_seen < timestamp:
-                way = centroid - track.centroid
-            if way is not None:
-                self._take_step(track, timestamp, way)
-            track.centroid, track.last_seen = centroid, timestamp
-            track.box = _box(body)
+            centroid, box = body.mean(axis=0, dtype=np.float64), _box(body)
+            whole = _is_whole(mask, level.depth)
+            if track.last_seen < timestamp:
+                ways = [centroid - track.centroid, (box - track.box).mean(axis=0)]
+                way = self._way(mask, track, seen)
+                if way is not None:
+                    ways = [way, *ways] if whole and track.whole else [way]
+                self._take_step(track, timestamp, np.median(ways, axis=0))
+            track.centroid, track.box, track.whole, track.last_seen = centroid, box, whole, timestamp
             age = timestamp - track.first_seen
-            movers.append(Mover(track.id, mask, body, centroid, track.box, track.velocity.copy(), age))
+            movers.append(Mover(track.id, mask, body, centroid, box, track.velocity.copy(), age))
         self._last = seen
         return sorted(movers, key=lambda mover: mover.id)
 
@@ -145,21 +161,29 @@ class MoverTracker:
         areas[0] = 0
         kept = [int(number) for number in np.argsort(-areas, kind="stable")[:MOST_REGIONS] if areas[number] > 0]
         points = level.camera.backproject(level.depth)
-        samples = {number: _thinned(points[regions == number]) for number in kept}
+        parts = {number: self._part(regions == number, areas[number], points) for number in kept}
         bodies: list[list[int]] = []
         for number in kept:  # the largest first
-            near = [body for body in bodies if self._belongs(number, body, areas, samples)]
+            near = [body for body in bodies if self._belongs(parts[number], [parts[other] for other in body])]
             near[0].append(number) if near else bodies.append([number])
         masks = [np.isin(regions, body) for body in bodies if areas[body].sum() >= self.config.min_area]
         return masks
 
-    def _belongs(
-        self, number: int, body: list[int], areas: NDArray[np.float64], samples: dict[int, NDArray[np.float32]]
-    ) -> bool:
-        """Whether a region is a fragment of a body: much smaller, and close to a part of it."""
-        if areas[number] > 0.5 * areas[body].sum():
+    def _part(self, mask: NDArray[np.bool_], area: float, points: NDArray[np.float32]) -> "_Part":
+        """What is needed to tell of which body a region (h, w) bool is a part."""
+        before = 0
+        if self._last is not None and self._last.ids.shape == mask.shape:
+            before = int(np.argmax(np.bincount(self._last.ids[mask])))
+        sample = points[mask]
+        sample = sample[:: max(1, len(sample) // SAMPLES)]
+        return _Part(area, before, sample, np.stack([sample.min(axis=0), sample.max(axis=0)]))
+
+    def _belongs(self, region: "_Part", body: list["_Part"]) -> bool:
+        """Whether a region is a fragment of a body: close to it, and much smaller or of the same body before."""
+        small = region.area < 0.5 * sum(part.area for part in body)
+        if not small and not (region.before and any(region.before == part.before for part in body)):
             return False
-        return any(_gap(samples[number], samples[part]) < self.config.merge_distance for part in body)
+        return any(_nearer(region, part, self.config.merge_distance) for part in body)
 
     def _matched(
         self, timestamp: float, bodies: list[NDArray[np.bool_]], points: NDArray[np.float32]
@@ -195,15 +219,14 @@ class MoverTracker:
         import cv2
 
         inner = np.argwhere(cv2.erode(mask.astype(np.uint8), np.ones((3, 3), np.uint8)))[:, ::-1]
-        now = inner[:: max(1, len(inner) // PAIRED_PIXELS)].astype(np.float32)
+        now = inner[:: max(1, len(inner) // PAIRED_PIXELS)].astype(np.float32, order="C")
         if len(now) < FEWEST_PIXELS:
             return None
-        parameters = {"winSize": (WINDOW, WINDOW), "maxLevel": 2, "minEigThreshold": 1e-4}
-        then, found, _ = cv2.calcOpticalFlowPyrLK(seen.grey, last.grey, now, None, **parameters)
-        back, again, _ = cv2.calcOpticalFlowPyrLK(last.grey, seen.grey, then, None, **parameters)
+        then, found = _flow(seen.grey, last.grey, now)
+        back, again = _flow(last.grey, seen.grey, then)
         h, w = mask.shape
         u, v = np.rint(then).astype(np.int64).T
-        good = (found[:, 0] > 0) & (again[:, 0] > 0) & (np.abs(back - now).max(axis=1) < 0.5)
+        good = found & again & (np.abs(back - now).max(axis=1) < 0.5)
         good &= (u >= 0) & (v >= 0) & (u < w) & (v < h)
         good[good] = last.ids[v[good], u[good]] == track.id
         u_now, v_now = now[good].astype(np.int64).T
@@ -216,8 +239,20 @@ class MoverTracker:
     def _take_step(self, track: _Track, timestamp: float, way: NDArray[np.float64]) -> None:
         track.steps = [step for step in track.steps if timestamp - step[0] < self.config.velocity_window]
         track.steps.append((timestamp, timestamp - track.last_seen, way))
-        durations = np.array([step[1] for step in track.steps])
-        track.velocity = np.sum([step[2] for step in track.steps], axis=0) / max(float(durations.sum()), 1e-6)
+        track.velocity = np.median([step[2] / step[1] for step in track.steps], axis=0)
+
+
+def _flow(
+    image: NDArray[np.uint8], other: NDArray[np.uint8], pixels: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Places (n, 2) in another image that look like those in this one, and (n,) whether they were found."""
+    import cv2
+
+    there = pixels.copy(order="C")
+    there, found, _ = cv2.calcOpticalFlowPyrLK(
+        image, other, pixels, there, winSize=(WINDOW, WINDOW), maxLevel=2, minEigThreshold=1e-4
+    )
+    return np.asarray(there, dtype=np.float32), np.asarray(found)[:, 0] > 0
 
 
 def _box(points: NDArray[np.float32]) -> NDArray[np.float64]:
@@ -225,6 +260,18 @@ def _box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     order = np.sort(points, axis=0)
     cut = len(points) // 100
     return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)
+
+
+def _is_whole(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> bool:
+    """Whether a body is neither cut off by the image's border nor by something nearer than it."""
+    import cv2
+
+    if mask[0].any() or mask[-1].any() or mask[:, 0].any() or mask[:, -1].any():
+        return False
+    nearest = cv2.erode(np.where(mask, depth, np.float32(100)), np.ones((5, 5), np.uint8))
+    ring = (nearest < 100) & ~mask
+    cut = ring & (depth > 0) & (depth < nearest - HIDES)
+    return bool(np.count_nonzero(cut) <= 0.1 * np.count_nonzero(ring))
 
 
 def _between(points: NDArray[np.float32], pixels: NDArray[np.float32]) -> NDArray[np.float32]:
@@ -237,13 +284,11 @@ def _between(points: NDArray[np.float32], pixels: NDArray[np.float32]) -> NDArra
     return (1 - dv) * ((1 - du) * corners[0] + du * corners[1]) + dv * ((1 - du) * corners[2] + du * corners[3])
 
 
-def _thinned(points: NDArray[np.float32]) -> NDArray[np.float32]:
-    return points[:: max(1, len(points) // SAMPLES)]
-
-
-def _gap(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
-    """Smallest distance between two sets of points, metres."""
-    return float(np.sqrt(np.square(a[:, None] - b[None]).sum(axis=-1).min()))
+def _nearer(a: _Part, b: _Part, distance: float) -> bool:
+    """Whether two regions come nearer to each other than a distance, metres."""
+    if np.any(a.box[0] - b.box[1] > distance) or np.any(b.box[0] - a.box[1] > distance):
+        return False
+    return float(np.square(a.sample[:, None] - b.sample[None]).sum(axis=-1).min()) < distance**2
 
 
 def _overlap(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
