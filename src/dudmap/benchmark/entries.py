@@ -40,8 +40,14 @@ class Entry:
         """
         if self.path is not None:
             from dudmap.sequences import open_sequence
+            from dudmap.sequences.tum import TumSequence
+            from dudmap.trajectory import Trajectory
 
-            return open_sequence(self.path, self.camera)
+            recording = open_sequence(self.path, self.camera)
+            beside = sorted(self.path.glob("*.gt.freiburg"))  # the name that ICL-NUIM gives its ground truth
+            if isinstance(recording, TumSequence) and recording.ground_truth is None and len(beside) == 1:
+                recording.ground_truth = Trajectory.load(beside[0])
+            return recording
         from dudmap.synthetic import sequence
         from dudmap.synthetic.recording import DEFAULT_CAMERA
 

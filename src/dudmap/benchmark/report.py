@@ -46,7 +46,8 @@ def run_suite(
     order = {entry.name: number for number, entry in enumerate(suite.entries)}
     rows.sort(key=lambda row: order[row["sequence"]])
     printed = published(suite.names())
-    text = f"# Suite {suite.name}\n\n{markdown(rows)}\n{_missing(suite)}{beside(rows, printed, suite)}"
+    table = markdown(rows) if rows else "None of its recordings was found.\n"
+    text = f"# Suite {suite.name}\n\n{table}\n{_missing(suite)}{beside(rows, printed, suite)}"
     if workers > 1:
         text += f"\n{workers} runs at a time: the times per frame are not those of an otherwise idle machine.\n"
     cpu = machine()
