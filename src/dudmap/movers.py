@@ -12,11 +12,11 @@ from dudmap.config import MoversConfig
 from dudmap.kernels import labeling
 from dudmap.tracker import Level
 
-SAMPLES = 150
+SAMPLES = 100
 """Points per region that measure the gap to another region."""
 MOST_REGIONS = 24
 """Larger regions that are looked at; the rest is noise."""
-PAIRED_PIXELS = 150
+PAIRED_PIXELS = 100
 """Pixels of a body that are looked for in the last frame."""
 FEWEST_PIXELS = 15
 """Pixels with a known motion that make a velocity."""
@@ -24,7 +24,7 @@ WINDOW = 9
 """Width of the patch that is looked for, pixels."""
 HIDES = 0.1
 """What is nearer than a body's border by more than this hides a part of it, metres."""
-SPECK = 8
+SPECK = 12
 """Regions of fewer pixels are noise."""
 
 
@@ -288,7 +288,9 @@ def _nearer(a: _Part, b: _Part, distance: float) -> bool:
     """Whether two regions come nearer to each other than a distance, metres."""
     if np.any(a.box[0] - b.box[1] > distance) or np.any(b.box[0] - a.box[1] > distance):
         return False
-    return float(np.square(a.sample[:, None] - b.sample[None]).sum(axis=-1).min()) < distance**2
+    p, q = a.sample - a.box[0], b.sample - a.box[0]
+    squared = np.einsum("ij,ij->i", p, p)[:, None] + np.einsum("ij,ij->i", q, q) - 2 * p @ q.T
+    return float(squared.min()) < distance**2
 
 
 def _overlap(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
