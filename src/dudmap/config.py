@@ -216,7 +216,7 @@ class MoversConfig(Part):
     memory: float = Field(default=0.7, ge=0)
     """A body that comes back into view within this time keeps its number, seconds."""
     velocity_window: float = Field(default=0.2, gt=0)
-    """The velocity is the median over this time, seconds."""
+    """The velocity is the mean over this time, seconds."""
 
 
 class Config(Part):

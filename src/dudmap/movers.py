@@ -24,6 +24,8 @@ WINDOW = 9
 """Width of the patch that is looked for, pixels."""
 HIDES = 0.1
 """What is nearer than a body's border by more than this hides a part of it, metres."""
+CREDIBLE = 0.7
+"""A motion that differs from the median of its neighbours by more than this is a change of the mask, m/s."""
 SPECK = 12
 """Regions of fewer pixels are noise."""
 
@@ -93,12 +95,12 @@ class _Part:
 class MoverTracker:
     """Bodies of a frame, matched to those of the frames before.
 
-    A body's velocity is the median of its motions during the last ``velocity_window`` seconds. The motion from one
-    frame to the next is the median displacement in the world of its pixels, paired by optical flow there and back
+    A body's velocity is the mean of its credible motions during the last ``velocity_window`` seconds. The motion from
+    one frame to the next is the median displacement in the world of its pixels, paired by optical flow there and back
     (Lucas and Kanade 1981). While the body is wholly in view, the motions of its centroid and of its box's middle are
     asked too and the median of the three counts: the surface of a rolling ball does not move like the ball. A body that
-    is cut off by the image's border or by something nearer has no such middle, nor has one with too few paired pixels
-    more than its centroid.
+    is cut off by the image's border or by something nearer has no such middle; with too few paired pixels the centroid
+    and the box must do all the same.
 
     Args:
         config: Sizes and times.
@@ -239,7 +241,9 @@ class MoverTracker:
     def _take_step(self, track: _Track, timestamp: float, way: NDArray[np.float64]) -> None:
         track.steps = [step for step in track.steps if timestamp - step[0] < self.config.velocity_window]
         track.steps.append((timestamp, timestamp - track.last_seen, way))
-        track.velocity = np.median([step[2] / step[1] for step in track.steps], axis=0)
+        velocities = np.array([step[2] / step[1] for step in track.steps])
+        off = np.linalg.norm(velocities - np.median(velocities, axis=0), axis=1)
+        track.velocity = velocities[off <= max(CREDIBLE, float(np.median(off)))].mean(axis=0)
 
 
 def _flow(
