@@ -114,6 +114,7 @@ class Slam:
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
             or self.health.doubt(tracked)
+            or self._undecided(levels, labels)
         )
         recognised = self._recognise(observation, levels, known, clock) if reason else None
         if recognised is not None:
@@ -186,6 +187,16 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _undecided(self, levels: dict[int, Level], labels: Labels | None) -> str:
+        """Sentence if so much seems to move that the static world cannot be told, else empty."""
+        if labels is None:
+            return ""
+        readings = levels[self._level(self.config.dynamics.width)].depth > 0
+        share = np.count_nonzero(labels.dynamic & readings) / max(np.count_nonzero(readings), 1)
+        if share <= self.config.dynamics.max_share:
+            return ""
+        return f"{share:.0%} of the readings seem to move: the static world cannot be told"
 
     def _remember(
         self,

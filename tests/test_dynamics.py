@@ -1,0 +1,125 @@
+"""Labels: the mixture against EM on raw samples, the labelling loops against plain Python, whole frames."""
+
+from collections import deque
+
+import numpy as np
+import pytest
+from oracle import half_normal_mixture_em
+
+from dudmap import synthetic
+from dudmap.camera import Camera
+from dudmap.config import Config
+from dudmap.dynamics import BINS, LARGEST, Mixture, fit_mixture
+from dudmap.kernels import labeling
+from dudmap.slam import Slam
+
+SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+
+
+@pytest.mark.parametrize(("share", "sigmas"), [(0.7, (1.0, 6.0)), (0.9, (0.8, 8.0)), (0.5, (1.2, 5.0))])
+def test_mixture_recovers_what_the_samples_were_drawn_from(share, sigmas):
+    rng = np.random.default_rng(0)
+    n = 20_000
+    static = rng.random(n) < share
+    samples = np.abs(rng.normal(0, np.where(static, *sigmas)))
+    samples = samples[samples < LARGEST]
+    histogram, edges = np.histogram(samples, bins=BINS, range=(0, LARGEST))
+    found = fit_mixture(histogram, edges, iterations=300)
+    prior, sigma = half_normal_mixture_em(samples)
+    assert found.prior[0] == pytest.approx(prior[0], abs=0.04)
+    assert found.sigma[0] == pytest.approx(sigma[0], rel=0.08)
+    assert found.sigma[1] == pytest.approx(sigma[1], rel=0.08)
+
+
+def test_log_odds_are_the_ratio_of_the_densities():
+    mixture = Mixture((0.7, 0.3), (1.1, 5.0))
+    r = np.linspace(0, 10, 50)
+    static, dynamic = mixture.density(r)
+    assert np.allclose(mixture.log_odds(r), np.log(static / dynamic), atol=1e-4)
+    fine = np.linspace(0, 80, 200_000)
+    assert mixture.density(fine).sum() * (fine[1] - fine[0]) == pytest.approx(1.0, abs=1e-3)
+
+
+def test_no_residuals_give_the_prior_mixture():
+    assert fit_mixture(np.zeros(BINS, np.int64), np.linspace(0, LARGEST, BINS + 1)).prior[0] > 0.5
+
+
+def grown(seeds, open_pixels, depth, tolerance):
+    """Breadth-first regions in plain Python."""
+    labels, count = np.zeros(depth.shape, int), 0
+    for start in zip(*np.nonzero(seeds), strict=True):
+        if labels[start]:
+            continue
+        count += 1
+        labels[start] = count
+        queue = deque([start])
+        while queue:
+            v, u = queue.popleft()
+            for vn, un in ((v + 1, u), (v - 1, u), (v, u + 1), (v, u - 1)):
+                if not (0 <= vn < depth.shape[0] and 0 <= un < depth.shape[1]) or labels[vn, un]:
+                    continue
+                if (open_pixels[vn, un] or seeds[vn, un]) and depth[vn, un] > 0:
+                    if abs(depth[vn, un] - depth[v, u]) <= tolerance[v, u]:
+                        labels[vn, un] = count
+                        queue.append((vn, un))
+    return labels, count
+
+
+def test_regions_grow_like_a_breadth_first_search():
+    rng = np.random.default_rng(1)
+    for _ in range(10):
+        depth = rng.choice([0.0, 1.0, 1.02, 1.5], (20, 30), p=[0.1, 0.4, 0.3, 0.2]).astype(np.float32)
+        seeds = (rng.random(depth.shape) < 0.05) & (depth > 0)
+        open_pixels, tolerance = rng.random(depth.shape) < 0.7, np.full(depth.shape, 0.05, np.float32)
+        labels = np.empty(depth.shape, np.int32)
+        count = labeling.grow(seeds, open_pixels, depth, tolerance, labels)
+        expected, expected_count = grown(seeds, open_pixels, depth, tolerance)
+        assert count == expected_count
+        assert np.array_equal(labels, expected)
+
+
+def test_neighbours_pull_a_doubtful_pixel_over_but_not_across_a_depth_edge():
+    evidence = np.full((5, 6), 3.0, np.float32)
+    evidence[2, 2] = -1.0
+    flat = np.ones((5, 6), np.float32)
+    near = np.full((5, 6), 0.05, np.float32)
+    assert labeling.smooth(evidence, flat, near, np.float32(4), 4)[2, 2] > 0.5
+    apart = flat.copy()
+    apart[2, 2] = 2.0
+    assert labeling.smooth(evidence, apart, near, np.float32(4), 4)[2, 2] == pytest.approx(1 / (1 + np.e), abs=1e-3)
+
+
+def test_full_size_labels_follow_the_depth_edge():
+    depth = np.ones((16, 16), np.float32)
+    depth[:, 9:] = 3.0  # the edge lies inside a low-size pixel
+    low_depth = np.where(np.arange(4) < 2, 1.0, 3.0)[None, :].repeat(4, axis=0).astype(np.float32)
+    low = (low_depth < 2).astype(np.uint8)
+    out = np.empty(depth.shape, np.uint8)
+    labeling.upsample(0, 16, low, low_depth, depth, 4, out)
+    assert np.array_equal(out > 0, depth < 2)
+
+
+@pytest.fixture(scope="module")
+def recording():
+    sequence = synthetic.sequence("room", movers=("person",), frames=60, camera=SMALL, noise="none")
+    return sequence, [sequence[index] for index in range(60)]
+
+
+def overlap(recording, *assignments: str) -> float:
+    sequence, frames = recording
+    slam, scores = Slam(sequence.camera, Config().override(assignments)), []
+    for index, frame in enumerate(frames):
+        mask, truth = slam.process(frame).dynamic_mask, sequence.mask(index)
+        if truth.mean() > 0.05:
+            scores.append((mask & truth).sum() / (mask | truth).sum())
+    return float(np.mean(scores))
+
+
+def test_a_walking_person_is_labelled_as_a_whole(recording):
+    assert overlap(recording) > 0.7
+
+
+def test_every_method_runs_and_none_labels_nothing(recording):
+    assert overlap(recording, "dynamics.method=threshold") > 0.1
+    assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false") > 0.05
+    assert overlap(recording, "dynamics.method=none") == 0.0

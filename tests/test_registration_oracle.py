@@ -1,0 +1,192 @@
+"""The registration against plain NumPy and against numerical derivatives; the tracker's checks."""
+
+import numpy as np
+import pytest
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.config import SensorConfig, TrackerConfig, VolumeConfig
+from dudmap.frame import Frame
+from dudmap.health import TrackingHealth
+from dudmap.motion import MotionModel
+from dudmap.tracker import Level, Tracker, TrackingResult, chained, exposed, fit_exposure, moved
+from dudmap.volume import TsdfVolume
+
+CAMERA = Camera(80.0, 80.0, 39.5, 29.5, 80, 60)
+SENSOR = SensorConfig()
+
+
+def corner(shift: np.ndarray | None = None) -> Frame:
+    """Three walls that meet, with a smooth texture, seen from a camera moved by a twist."""
+    T = np.eye(4) if shift is None else se3.exp(shift)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
+    normals = np.array([[0.75, 0.1, 0.65], [-0.65, 0.15, 0.75], [0.05, 0.8, 0.6]])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    t = (np.array([1.3, 1.35, 1.25]) - normals @ T[:3, 3]) / (rays @ normals.T)
+    t = np.where(t > 0, t, np.inf).min(axis=-1)
+    points = rays * t[..., None] + T[:3, 3]
+    shade = 0.5 + 0.2 * np.sin(points[..., 0] * 9) * np.cos(points[..., 1] * 8) + 0.15 * np.sin(points[..., 2] * 7)
+    gray = np.clip(255 * shade, 0, 255).astype(np.uint8)
+    return Frame(0.0, t.astype(np.float32), np.repeat(gray[..., None], 3, axis=2))
+
+
+def level_of(frame: Frame) -> Level:
+    return Level(CAMERA, frame.depth, frame.color[..., 0].astype(np.float32) / 255)
+
+
+@pytest.fixture(scope="module")
+def volume() -> TsdfVolume:
+    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
+    for _ in range(3):
+        volume.integrate(corner(), np.eye(4))
+    return volume
+
+
+def ones(level: Level) -> np.ndarray:
+    return np.ones_like(level.depth)
+
+
+def interior(tracker: Tracker, volume: TsdfVolume, level: Level, T: np.ndarray, reach: float) -> np.ndarray:
+    """Weights of the pixels that stay on the map for all small steps."""
+    valid = np.isfinite(tracker.linearize(volume, level, T, ones(level)).residuals[1])
+    for axis in range(6):
+        for sign in (-1, 1):
+            T_near = moved(T, sign * reach * np.eye(6)[axis])
+            valid &= np.isfinite(tracker.linearize(volume, level, T_near, ones(level)).residuals[1])
+    return valid.astype(np.float32)
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("robust", ["huber", "tukey"])
+def test_the_gradient_is_that_of_the_cost(volume, robust, noisy):
+    config = TrackerConfig(robust=robust, huber=0.02, tukey=0.2, color_weight=0.3, noise_weighting=noisy)
+    tracker, level = Tracker(config, SENSOR), level_of(corner())
+    T = moved(np.eye(4), np.array([0.006, -0.004, 0.005, 0.004, 0.003, -0.004]))
+    step = 5e-5
+    weights = interior(tracker, volume, level, T, 2 * step)
+    assert weights.mean() > 0.5
+    b = tracker.linearize(volume, level, T, weights).b
+    numerical = np.zeros(6)
+    for axis in range(6):
+        ahead = tracker.linearize(volume, level, moved(T, step * np.eye(6)[axis]), weights).cost
+        back = tracker.linearize(volume, level, moved(T, -step * np.eye(6)[axis]), weights).cost
+        numerical[axis] = (ahead - back) / (2 * step)
+    assert np.linalg.norm(b - numerical) < 0.05 * np.linalg.norm(numerical)
+
+
+def test_normal_equations_equal_a_plain_sum_over_pixels(volume):
+    """H and b rebuilt from numerically differentiated residuals of every pixel, with quadratic cost."""
+    config = TrackerConfig(huber=10.0, color_huber=10.0, color_weight=0.3, noise_weighting=False)
+    tracker, level = Tracker(config, SENSOR), level_of(corner())
+    T = moved(np.eye(4), np.array([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]))
+    step = 1e-4
+    weights = interior(tracker, volume, level, T, 2 * step)
+    system = tracker.linearize(volume, level, T, weights)
+    r = system.residuals[:, weights > 0].astype(np.float64)
+    J = np.empty((*r.shape, 6))
+    for axis in range(6):
+        ahead = tracker.linearize(volume, level, moved(T, step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
+        back = tracker.linearize(volume, level, moved(T, -step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
+        J[..., axis] = (ahead.astype(np.float64) - back) / (2 * step)
+    scale = np.array([1.0, 0.3])[:, None]
+    H = np.einsum("cn,cni,cnj->ij", np.broadcast_to(scale, r.shape), J, J)
+    b = np.einsum("cn,cni,cn->i", np.broadcast_to(scale, r.shape), J, r)
+    assert np.abs(system.H - H).max() < 0.05 * np.abs(H).max()
+    assert np.abs(system.b - b).max() < 0.05 * np.abs(b).max()
+    assert np.allclose(system.H, system.H.T)
+
+
+def test_alignment_finds_a_known_motion(volume):
+    tracker = Tracker(TrackerConfig(widths=(40, 80), iterations=(10, 10)), SENSOR)
+    xi = np.array([0.02, -0.015, 0.01, 0.01, -0.012, 0.015])
+    frame = corner(xi)
+    every_second = slice(None, None, 2)
+    coarse = Level(
+        Camera(40.0, 40.0, 19.75, 14.75, 40, 30),
+        np.ascontiguousarray(frame.depth[every_second, every_second]),
+        np.ascontiguousarray(level_of(frame).intensity[every_second, every_second]),
+    )
+    result = tracker.align(volume, [coarse, level_of(frame)], np.eye(4))
+    error = se3.inverse(se3.exp(xi)) @ result.T_world_camera
+    assert result.converged
+    assert np.linalg.norm(error[:3, 3]) < 0.003
+    assert np.degrees(se3.rotation_angle(error)) < 0.15
+
+
+def test_pixels_of_weight_zero_have_no_say(volume):
+    tracker, level = Tracker(TrackerConfig(), SENSOR), level_of(corner())
+    weights = ones(level)
+    weights[:, 40:] = 0
+    spoiled = Level(CAMERA, level.depth.copy(), level.intensity.copy())
+    spoiled.depth[:, 40:] -= 0.02
+    a = tracker.linearize(volume, level, np.eye(4), weights)
+    b = tracker.linearize(volume, spoiled, np.eye(4), weights)
+    assert np.array_equal(a.H, b.H)
+    assert a.cost == b.cost
+
+
+def test_a_view_of_nothing_known_is_not_converged(volume):
+    tracker = Tracker(TrackerConfig(widths=(80,), iterations=(5,)), SENSOR)
+    away = np.eye(4)
+    away[0, 3] = 30.0
+    result = tracker.align(volume, [level_of(corner())], away)
+    assert not result.converged
+    assert "fall on the map" in result.reason
+
+
+def test_a_flat_wall_without_texture_is_degenerate():
+    flat = Frame(0.0, np.full(CAMERA.shape, 1.5, np.float32), np.full((*CAMERA.shape, 3), 120, np.uint8))
+    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
+    for _ in range(3):
+        volume.integrate(flat, np.eye(4))
+    result = Tracker(TrackerConfig(widths=(80,), iterations=(5,)), SENSOR).align(volume, [level_of(flat)], np.eye(4))
+    assert not result.converged
+    assert "constrain" in result.reason
+
+
+@pytest.mark.parametrize(("gain", "offset"), [(1.0, 0.0), (0.8, 0.1), (1.25, -0.08)])
+def test_exposure_is_found_in_spite_of_outliers(gain, offset):
+    rng = np.random.default_rng(5)
+    intensity = rng.uniform(0.1, 0.9, (60, 80)).astype(np.float32)
+    difference = (gain * intensity + offset - intensity + rng.normal(0, 0.01, intensity.shape)).astype(np.float32)
+    difference[:15] = rng.uniform(-0.5, 0.5, (15, 80))
+    difference[15] = np.nan
+    found = fit_exposure(intensity, difference, np.ones_like(intensity))
+    assert found[0] == pytest.approx(gain, abs=0.05)
+    assert found[0] * 0.5 + found[1] == pytest.approx(gain * 0.5 + offset, abs=0.02)
+
+
+def test_chained_exposures_apply_one_after_the_other():
+    level = Level(CAMERA, np.ones((2, 2), np.float32), np.array([[0.1, 0.2], [0.3, 0.4]], np.float32))
+    twice = exposed(exposed(level, (1.2, 0.1)), (0.9, -0.05))
+    assert np.allclose(exposed(level, chained((1.2, 0.1), (0.9, -0.05))).intensity, twice.intensity)
+
+
+def test_constant_velocity_goes_on_and_stops_after_a_loss():
+    model = MotionModel(TrackerConfig())
+    motion = se3.exp(np.array([0.01, 0.0, 0.02, 0.0, 0.01, 0.0]))
+    model.update(0.0, np.eye(4))
+    model.update(0.1, motion)
+    assert np.allclose(model.predict(0.2), motion @ motion, atol=1e-9)
+    assert np.allclose(model.predict(0.3), motion @ motion @ motion, atol=1e-9)
+    model.lost()
+    assert np.allclose(model.predict(0.2), motion)
+    assert "jumped" in model.implausible(0.2, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
+
+
+def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
+    def result(residual: float, share: float) -> TrackingResult:
+        return TrackingResult(np.eye(4), (1.0, 0.0), True, "", share, residual, 0.1, 3)
+
+    health = TrackingHealth()
+    for _ in range(10):
+        assert health.doubt(result(0.001, 0.9)) == ""
+        health.tracked(result(0.001, 0.9))
+    assert health.doubt(result(0.0025, 0.9)) == ""
+    assert "off the map" in health.doubt(result(0.006, 0.9))
+    health.lost()
+    assert "off the map" in health.doubt(result(0.0025, 0.9))
+    assert "fall on the map" in health.doubt(result(0.001, 0.3))
+    health.tracked(result(0.001, 0.9))
+    assert health.doubt(result(0.0025, 0.3)) == ""

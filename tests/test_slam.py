@@ -1,0 +1,162 @@
+"""The whole algorithm on small synthetic recordings: accuracy, loss, redundancy, switches, determinism."""
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from dudmap import se3, synthetic
+from dudmap.camera import Camera
+from dudmap.config import Config
+from dudmap.errors import DatasetError
+from dudmap.frame import Frame
+from dudmap.slam import Slam
+
+SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+FRAMES = 24
+
+
+@pytest.fixture(scope="module")
+def recording():
+    sequence = synthetic.sequence("room", movers=(), frames=FRAMES, camera=SMALL, noise="none")
+    return sequence, [sequence[index] for index in range(FRAMES)]
+
+
+def errors(sequence, results) -> np.ndarray:
+    """Distance (m) of each tracked pose from the truth; the first poses agree by definition."""
+    truth = sequence.ground_truth.Ts_world_camera
+    return np.array(
+        [
+            np.linalg.norm((se3.inverse(truth[0]) @ truth[index] - result.T_world_camera)[:3, 3])
+            for index, result in enumerate(results)
+            if result.T_world_camera is not None
+        ]
+    )
+
+
+def test_a_static_room_is_followed(recording):
+    sequence, frames = recording
+    slam = Slam(sequence.camera)
+    results = [slam.process(frame) for frame in frames]
+    assert {result.state for result in results} == {"tracked"}
+    assert errors(sequence, results).max() < 0.05
+    assert np.mean([result.dynamic_share for result in results]) < 0.05
+    assert np.array_equal(slam.trajectory.timestamps, [frame.timestamp for frame in frames])
+    view = slam.volume.raycast(results[-1].T_world_camera)
+    both = (view.depth > 0) & (frames[-1].depth > 0)
+    assert both.mean() > 0.5
+    assert np.median(np.abs(view.depth - frames[-1].depth)[both]) < 0.03
+
+
+@pytest.mark.parametrize(
+    "assignments",
+    [
+        ["preset=thesis"],
+        ["tracker.robust=tukey"],
+        ["tracker.second_pass=false"],
+        ["tracker.constant_velocity=false"],
+        ["tracker.noise_weighting=false", "tracker.exposure=false"],
+        ["volume.weighting=constant", "volume.carving=false"],
+        ["volume.truncation_voxels=6", "volume.truncation_behind_voxels=3"],
+        ["preprocess.filter=none", "preprocess.fill_holes=false"],
+        ["volume.voxel_size=0.03"],
+        ["dynamics.method=threshold"],
+        ["dynamics.method=none"],
+        ["similarity.enabled=false"],
+    ],
+)
+def test_every_part_can_be_switched(recording, assignments):
+    sequence, frames = recording
+    slam = Slam(sequence.camera, Config().override(assignments))
+    results = [slam.process(frame) for frame in frames[:8]]
+    assert all(result.state == "tracked" for result in results)
+    assert errors(sequence, results).max() < 0.05
+
+
+def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recording):
+    sequence, frames = recording
+    slam = Slam(sequence.camera)
+    for frame in frames[:10]:
+        slam.process(frame)
+    before = slam.volume.num_blocks
+    blank = Frame(frames[10].timestamp, np.zeros_like(frames[10].depth), frames[10].color)
+    result = slam.process(blank)
+    assert (result.state, result.fused, result.T_world_camera) == ("lost", False, None)
+    assert result.lost_reason
+    assert slam.volume.num_blocks == before
+    again = slam.process(frames[11])
+    assert again.state == "tracked"
+    assert len(slam.trajectory) == 11
+
+
+def test_another_room_is_never_taken_for_this_one(recording):
+    sequence, frames = recording
+    slam = Slam(sequence.camera)
+    for frame in frames[:10]:
+        slam.process(frame)
+    other = synthetic.sequence("corridor", movers=(), frames=3, camera=SMALL, seed=7, noise="none")
+    shifted = Frame(frames[10].timestamp, other[0].depth, other[0].color)
+    result = slam.process(shifted)
+    assert result.state == "lost"
+    assert not result.fused
+
+
+def test_nothing_to_start_from_is_lost():
+    slam = Slam(SMALL)
+    empty = Frame(0.0, np.zeros(SMALL.shape, np.float32), np.zeros((*SMALL.shape, 3), np.uint8))
+    result = slam.process(empty)
+    assert result.state == "lost"
+    assert slam.volume.is_empty
+    assert len(slam.trajectory) == 0
+
+
+def test_a_redundant_view_gets_a_pose_but_is_not_fused():
+    camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+    sequence = synthetic.sequence("room", movers=(), frames=3, camera=camera, noise="none")
+    frame = sequence[0]
+    slam = Slam(camera)
+    slam.process(frame)
+    result = slam.process(Frame(frame.timestamp + 0.03, frame.depth, frame.color))
+    assert (result.state, result.fused, result.skipped_similar) == ("tracked", False, True)
+    assert len(slam.trajectory) == 2
+
+
+def test_frames_that_do_not_fit_the_camera_are_refused():
+    with pytest.raises(DatasetError, match="160x120"):
+        Slam(SMALL).process(Frame(0.0, np.ones((10, 10), np.float32), np.zeros((10, 10, 3), np.uint8)))
+
+
+SCRIPT = """
+import hashlib
+from dudmap import Slam, synthetic
+from dudmap.camera import Camera
+camera = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+sequence = synthetic.sequence("room", movers=("person",), frames=10, camera=camera, start_dynamic=True)
+slam = Slam(camera)
+for index in range(10):
+    slam.process(sequence[index])
+mesh = slam.volume.extract_mesh()
+print(hashlib.sha256(slam.trajectory.Ts_world_camera.tobytes() + mesh.vertices.tobytes()).hexdigest())
+"""
+
+
+def test_the_result_does_not_depend_on_the_number_of_threads_or_the_run():
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", SCRIPT],
+            env={**os.environ, "DUDMAP_THREADS": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2", "2")
+    }
+    assert len(digests) == 1
+
+
+def test_importing_dudmap_is_light():
+    code = "import sys, dudmap; print([name for name in ('numba', 'cv2', 'scipy', 'trimesh') if name in sys.modules])"
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"
