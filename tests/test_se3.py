@@ -1,0 +1,77 @@
+"""Identities that rigid motions satisfy, for random motions."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from dudmap import se3
+
+number = st.floats(-1.0, 1.0)
+twists = st.builds(lambda v, omega: np.array([*v, *omega]), st.tuples(*[number] * 3), st.tuples(*[number] * 3))
+turns = st.builds(
+    lambda axis, angle: np.array(axis) / np.linalg.norm(axis) * angle,
+    st.tuples(*[st.floats(0.1, 1.0)] * 3),
+    st.floats(0.0, np.pi - 1e-6),
+)
+QUICK = settings(max_examples=60, deadline=None)
+
+
+@QUICK
+@given(twists)
+def test_exp_is_the_matrix_exponential(xi):
+    generator = np.zeros((4, 4))
+    generator[:3, :3], generator[:3, 3] = se3.hat(xi[3:]), xi[:3]
+    assert np.allclose(se3.exp(xi), expm(generator), atol=1e-9)
+
+
+@QUICK
+@given(twists)
+def test_log_undoes_exp(xi):
+    assert np.allclose(se3.log(se3.exp(xi)), xi, atol=1e-7)
+
+
+@QUICK
+@given(twists, st.floats(1e-12, 1e-3))
+def test_small_motions_lose_nothing(xi, size):
+    assert np.allclose(se3.log(se3.exp(xi * size)), xi * size, rtol=1e-5, atol=1e-15)
+
+
+@QUICK
+@given(turns)
+def test_rotation_vectors_up_to_half_a_turn(omega):
+    R = Rotation.from_rotvec(omega).as_matrix()
+    assert np.allclose(se3.log_rotation(R), omega, atol=1e-6)
+    assert np.isclose(se3.rotation_angle(R), np.linalg.norm(omega), atol=1e-6)
+
+
+@QUICK
+@given(twists, twists)
+def test_inverse_and_interpolation(a, b):
+    T_a, T_b = se3.exp(a), se3.exp(b)
+    assert np.allclose(se3.inverse(T_a) @ T_a, np.eye(4), atol=1e-12)
+    assert np.allclose(se3.inverse(np.stack([T_a, T_b]))[1], se3.inverse(T_b))
+    assert np.allclose(se3.interpolate(T_a, T_b, 0.0), T_a, atol=1e-9)
+    assert np.allclose(se3.interpolate(T_a, T_b, 1.0), T_b, atol=1e-7)
+    half = se3.interpolate(T_a, T_b, 0.5)
+    assert np.allclose(se3.inverse(T_a) @ half, se3.inverse(half) @ T_b, atol=1e-7)
+
+
+@QUICK
+@given(turns)
+def test_quaternions_agree_with_scipy(omega):
+    rotation = Rotation.from_rotvec(omega)
+    quat_xyzw = se3.rotation_to_quat_xyzw(rotation.as_matrix())
+    assert quat_xyzw[3] >= 0
+    expected = rotation.as_quat(canonical=True)
+    assert np.allclose(quat_xyzw, expected, atol=1e-7) or np.allclose(quat_xyzw, -expected, atol=1e-7)
+    assert np.allclose(se3.quat_xyzw_to_rotation(3 * quat_xyzw), rotation.as_matrix(), atol=1e-9)
+
+
+def test_nearest_rotation_is_orthonormal():
+    R = Rotation.from_rotvec([0.3, -0.2, 0.5]).as_matrix()
+    mended = se3.nearest_rotation(R + 1e-3 * np.arange(9).reshape(3, 3))
+    assert np.allclose(mended.T @ mended, np.eye(3), atol=1e-12)
+    assert np.isclose(np.linalg.det(mended), 1.0)
+    assert np.allclose(se3.nearest_rotation(R), R)
