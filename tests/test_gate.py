@@ -32,7 +32,7 @@ def test_a_spoiled_tracker_does_not_pass():
     spoiled = Config().override(["tracker.iterations=[1,0,0]"])
     rows = gate.measure_gate([ENTRIES["desk-fast-camera"]], spoiled)
     caught = {figure for _, figure in failures(rows)}
-    assert {"ate_rmse_m", "rotation_rmse_deg"} <= caught, rows
+    assert caught & {"lost", "ate_rmse_m"}, rows  # it drifts, or notices that it does
 
 
 def test_the_command_shows_the_table_and_fails(tmp_path, monkeypatch):
