@@ -134,7 +134,7 @@ class DynamicDetector:
     ) -> NDArray[np.bool_]:
         """Grow each moving spot over the surface it belongs to, up to what fits the map or a depth edge."""
         labels = np.empty(seeds.shape, dtype=np.int32)
-        count = labeling.grow(seeds, evidence < 2, level.depth, tolerance, labels)
+        count = labeling.grow(seeds, evidence < 1, level.depth, tolerance, labels)
         areas = np.bincount(labels.reshape(-1), minlength=count + 1)
         seeded = np.bincount(labels[seeds], minlength=count + 1)
         smallest = 0.0008 * seeds.size
