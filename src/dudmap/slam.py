@@ -84,6 +84,7 @@ class Slam:
         self.movers = MoverTracker(self.config.movers)
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
+        self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
         self._untested = 0  # frames that are still fused without the similarity test
 
     @property
@@ -123,9 +124,11 @@ class Slam:
         if reason:
             self.motion.lost()
             self.health.lost()
+            self._moved = None
             return self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
         self.motion.update(frame.timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
+        self._moved = None if labels is None else labels.dynamic
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
@@ -174,7 +177,8 @@ class Slam:
             return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
-            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, unmasked)
+            weights = self._expected(tracked_levels, unmasked)
+            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, weights)
         labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             again = tracked_levels[split - 1 :]
@@ -187,6 +191,15 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _expected(
+        self, levels: list[Level], unmasked: list[NDArray[np.float32]] | None
+    ) -> list[NDArray[np.float32]] | None:
+        """Weights of the first registration: what moved in the last frame has little say in this one."""
+        if self._moved is None:
+            return unmasked
+        weights = [np.float32(1) - np.float32(0.9) * _reduced(self._moved, level) for level in levels]
+        return weights if unmasked is None else [a * b for a, b in zip(weights, unmasked, strict=True)]
 
     def _undecided(self, levels: dict[int, Level], labels: Labels | None) -> str:
         """Sentence if so much seems to move that the static world cannot be told, else empty."""
