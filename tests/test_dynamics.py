@@ -4,7 +4,6 @@ from collections import deque
 
 import numpy as np
 import pytest
-from oracle import half_normal_mixture_em
 
 from dudmap import synthetic
 from dudmap.camera import Camera
@@ -12,6 +11,7 @@ from dudmap.config import Config
 from dudmap.dynamics import BINS, LARGEST, Mixture, fit_mixture
 from dudmap.kernels import labeling
 from dudmap.slam import Slam
+from oracle import half_normal_mixture_em
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 

@@ -2,7 +2,6 @@
 
 import numpy as np
 import pytest
-from oracle import fuse, trilinear
 
 from dudmap import se3
 from dudmap.camera import Camera
@@ -11,6 +10,7 @@ from dudmap.errors import MapError
 from dudmap.frame import Frame
 from dudmap.kernels import hashing
 from dudmap.volume import FREE, TsdfVolume
+from oracle import fuse, trilinear
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant", carve_rate=1)
