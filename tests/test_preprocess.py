@@ -254,3 +254,30 @@ def test_deterministic_and_independent_of_the_input_afterwards():
 def test_unfit_images_are_refused(depth, color):
     with pytest.raises(DatasetError, match=r"expected|must have"):
         Preprocessor(CAMERA)(Frame(0.0, depth, color))
+
+
+def test_a_mask_goes_back_into_the_recorded_image():
+    """Every recorded pixel gets the label of the point its ray meets; checked with the distortion written out."""
+    camera = Camera(120.0, 118.0, 81.0, 58.0, 160, 120, distortion=(0.25, -0.6, 0.004, -0.003, 0.5))
+    k1, k2, p1, p2, k3 = camera.distortion
+    v, u = np.mgrid[0:120, 0:160]
+    x, y = (u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy
+    r2 = x * x + y * y
+    radial = 1 + k1 * r2 + k2 * r2**2 + k3 * r2**3
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    inside = (u > 110) & (v > 80) & (u < 140) & (v < 105)  # a block far from the centre, where the lens matters
+    ud, vd = np.rint(xd * camera.fx + camera.cx).astype(int), np.rint(yd * camera.fy + camera.cy).astype(int)
+    recorded = Preprocessor(camera).distorted(inside)
+    assert abs(ud[inside] - u[inside]).max() >= 2  # the test has something to see
+    border = np.zeros_like(inside)
+    border[83:103, 113:138] = True
+    assert recorded[vd[border & inside], ud[border & inside]].mean() == 1
+    assert recorded[vd[~inside & (u > 105) & (u < 108)], ud[~inside & (u > 105) & (u < 108)]].sum() == 0
+    both = Preprocessor(camera).mask(recorded)
+    assert np.count_nonzero(both != inside) <= 0.1 * np.count_nonzero(inside)  # its rim, by rounding
+
+
+def test_without_distortion_a_mask_stays_as_it_is():
+    mask = np.random.default_rng(5).random(CAMERA.shape) < 0.3
+    assert Preprocessor(CAMERA).distorted(mask) is mask

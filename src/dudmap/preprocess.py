@@ -61,6 +61,7 @@ class Preprocessor:
         self.config = config or PreprocessConfig()
         self.camera = replace(camera, distortion=())
         self._maps = _undistortion(camera) if any(camera.distortion) else None
+        self._inverse_map = _distortion(camera) if any(camera.distortion) else None
         radius = self.config.filter_radius
         distance = np.arange(radius + 1)
         self._spatial = np.exp(-(distance**2) / (2 * self.config.filter_sigma_px**2)).astype(np.float32)
@@ -105,6 +106,20 @@ class Preprocessor:
         import cv2
 
         return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
+
+    def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (H, W) bool of an observation as it lies in the recorded image: the reverse of ``mask``.
+
+        Pixels of the recorded image that no observation shows are False.
+        """
+        if self._inverse_map is None:
+            return mask
+        import cv2
+
+        recorded = cv2.remap(
+            mask.astype(np.uint8), *self._inverse_map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+        return np.asarray(recorded) > 0
 
     def _check(self, frame: Frame) -> None:
         h, w = self.camera.shape
@@ -188,3 +203,16 @@ def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArra
     nearest, _ = cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=True)
     whole, fraction = cv2.convertMaps(u, v, cv2.CV_16SC2)
     return (np.asarray(nearest), np.empty(0, np.uint16)), (np.asarray(whole), np.asarray(fraction))
+
+
+def _distortion(camera: Camera) -> tuple[NDArray, NDArray]:
+    """Map pair of cv2.remap from the distorted image into the undistorted one, to the nearest pixel."""
+    import cv2
+
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    straight = cv2.undistortPoints(pixels, camera.K, coefficients, P=camera.K).reshape(*camera.shape, 2)
+    within = np.clip(straight, -2, max(camera.shape) + 2).astype(np.float32)  # the fixed-point map holds 16 bits
+    nearest, _ = cv2.convertMaps(within[..., 0], within[..., 1], cv2.CV_16SC2, nninterpolation=True)
+    return np.asarray(nearest), np.empty(0, np.uint16)

@@ -37,7 +37,7 @@ class FrameResult:
         fused: Whether the frame changed the map.
         skipped_similar: Whether it was left out of the fusion as a redundant view.
         relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
-        dynamic_mask: (H, W) bool.
+        dynamic_mask: (H, W) bool, in the image as it was recorded.
         dynamic_share: Share of the readings that lie in the mask.
         residuals: (h, w) float32 signed distance to the map in metres at the label resolution, NaN off the map.
         labels: The label step's full outcome, None where it did not run.
@@ -109,7 +109,7 @@ class Slam:
             levels = self._levels(observation)
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.volume.is_empty:
-            return self._start(frame, observation, known, clock)
+            return self._as_recorded(self._start(frame, observation, known, clock))
         tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), known, clock)
         reason = (
             tracked.reason
@@ -125,7 +125,9 @@ class Slam:
             self.motion.lost()
             self.health.lost()
             self._moved = None
-            return self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
+            return self._as_recorded(
+                self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
+            )
         self.motion.update(frame.timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
         self._moved = None if labels is None else labels.dynamic
@@ -139,7 +141,11 @@ class Slam:
         if not redundant:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
-        return result
+        return self._as_recorded(result)
+
+    def _as_recorded(self, result: FrameResult) -> FrameResult:
+        """The mask back in the image that came in, where the lens bends straight lines."""
+        return replace(result, dynamic_mask=self.preprocess.distorted(result.dynamic_mask))
 
     def _start(
         self, frame: Frame, observation: Observation, known: NDArray[np.bool_] | None, clock: "Clock"
