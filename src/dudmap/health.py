@@ -11,7 +11,7 @@ MEMORY = 30
 
 
 class TrackingHealth:
-    """Compares a registration's residual and share of readings on the map with the recent ones.
+    """Compares a registration's residuals and share of readings on the map with the recent ones.
 
     A registration that slid into a wrong minimum explains the frame much worse than its predecessors were explained,
     though still well enough for any fixed threshold. After a loss the first guess is poor and such minima are common,
@@ -21,23 +21,28 @@ class TrackingHealth:
     def __init__(self) -> None:
         self._residuals: deque[float] = deque(maxlen=MEMORY)
         self._shares: deque[float] = deque(maxlen=MEMORY)
+        self._colors: deque[float] = deque(maxlen=MEMORY)
         self.recovering = False
 
     def doubt(self, tracked: TrackingResult) -> str:
         """Sentence on what is much worse than before, empty if nothing is."""
         if len(self._residuals) < 5:
             return ""
-        residual, share = float(np.median(self._residuals)), float(np.median(self._shares))
+        residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
         if tracked.residual > (1.6 if self.recovering else 4.0) * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
         if self.recovering and tracked.inlier_share < 0.6 * share:
             return f"only {tracked.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
+        # one wall fits another of the same room, but it does not look like it
+        if tracked.color_residual > (max(0.02, 2.5 * color) if self.recovering else max(0.03, 4.0 * color)):
+            return f"the image differs by {tracked.color_residual:.1%} from the map, {color:.1%} were usual"
         return ""
 
     def tracked(self, tracked: TrackingResult) -> None:
         """Take over a registration that passed."""
         self._residuals.append(tracked.residual)
         self._shares.append(tracked.inlier_share)
+        self._colors.append(tracked.color_residual)
         self.recovering = False
 
     def lost(self) -> None:

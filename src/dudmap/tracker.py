@@ -60,6 +60,7 @@ class TrackingResult:
         residual: Root mean square distance residual, metres at one metre depth.
         condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
         iterations: Linearisations over all levels.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -70,6 +71,7 @@ class TrackingResult:
     residual: float
     condition: float
     iterations: int
+    color_residual: float = 0.0
 
 
 class Tracker:
@@ -100,6 +102,7 @@ class Tracker:
         """
         volume.look_at(T_init)
         T, iterations, system = T_init, 0, None
+        weights = np.ones_like(levels[-1].depth)
         for index, level in enumerate(levels):
             limit = self.config.iterations[first_level + index]
             if limit == 0:
@@ -113,8 +116,8 @@ class Tracker:
             T, system, used = self._optimize(volume, lit, T, weights, limit)
             iterations += used
         if system is None:  # every level is left out: judge the first guess
-            system = self.linearize(volume, levels[-1], T, np.ones_like(levels[-1].depth))
-        return self._judge(T, exposure, system, iterations)
+            system = self.linearize(volume, levels[-1], T, weights)
+        return self._judge(T, exposure, system, weights, iterations)
 
     def _optimize(
         self, volume: TsdfVolume, level: Level, T: NDArray[np.float64], weights: NDArray[np.float32], limit: int
@@ -180,7 +183,12 @@ class Tracker:
         )  # fmt: skip
 
     def _judge(
-        self, T: NDArray[np.float64], exposure: tuple[float, float], system: LinearSystem, iterations: int
+        self,
+        T: NDArray[np.float64],
+        exposure: tuple[float, float],
+        system: LinearSystem,
+        weights: NDArray[np.float32],
+        iterations: int,
     ) -> TrackingResult:
         """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
         config = self.config
@@ -197,7 +205,10 @@ class Tracker:
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
-        return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations)
+        difference = system.residuals[1, ::2, ::2][weights[::2, ::2] > 0.5]
+        difference = np.abs(difference[np.isfinite(difference)])
+        color_residual = float(np.median(difference)) if len(difference) else 0.0
+        return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
 
 
 def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
