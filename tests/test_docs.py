@@ -1,0 +1,132 @@
+"""What the documentation shows is so: links, commands, options, parameters, files, and the README's Python."""
+
+import csv
+import json
+import os
+import re
+import shlex
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+import typer
+
+from dudmap.cli import COMMANDS
+from dudmap.config import Config, keys
+
+ROOT = Path(__file__).parent.parent
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXCERPT = ROOT / "tests" / "fixtures" / "freiburg1_xyz"
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def blocks(text, language=""):
+    return re.findall(rf"^```{language}\n(.*?)^```", text, flags=re.MULTILINE | re.DOTALL)
+
+
+def shown_commands():
+    """Every line of a code block that calls dudmap, without its comment, by page."""
+    for page in PAGES:
+        for block in blocks(page.read_text(encoding="utf-8")):
+            for line in block.splitlines():
+                if line.startswith("dudmap "):
+                    yield pytest.param(line.partition("#")[0].strip(), id=f"{page.name}: {line[:60]}")
+
+
+def program(*arguments, cwd):
+    dudmap = "from dudmap.cli import main; main()"
+    return subprocess.run(
+        [sys.executable, "-c", dudmap, *arguments],
+        cwd=cwd, capture_output=True, text=True, check=False, env=os.environ | {"COLUMNS": "120"},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def run_folder(tmp_path_factory):
+    """What the README's second command leaves, on the real excerpt."""
+    where = tmp_path_factory.mktemp("docs")
+    line = next(line for line in README.splitlines() if "--save-masks --out my_run" in line)
+    arguments = shlex.split(line.partition("#")[0].replace("SEQUENCE", str(EXCERPT)))[1:]
+    done = program(*arguments, cwd=where)
+    assert done.returncode == 0, done.stderr
+    return where / "my_run"
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_links_lead_somewhere(page):
+    for target in re.findall(r"\]\(([^)#]+)[^)]*\)", page.read_text(encoding="utf-8")):
+        if not target.startswith("http"):
+            assert (page.parent / target).exists(), f"{page.name} links {target}"
+
+
+def test_every_page_is_in_the_index():
+    index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
+    for page in PAGES[2:]:
+        assert page.name == "README.md" or f"({page.name})" in index
+
+
+@pytest.mark.parametrize("line", shown_commands())
+def test_shown_commands_exist_with_their_options(line):
+    words = shlex.split(line.replace("[", " ").replace("]", " ").replace("|", " "))[1:]
+    assert words[0] in COMMANDS
+    command = typer.main.get_command(import_module(f"dudmap.cli.{words[0]}").app)
+    nested = getattr(command, "commands", {})
+    if nested:
+        command = nested[words[1] if len(words) > 1 and words[1] in nested else next(iter(nested))]
+    known = {name for parameter in command.params for name in (*parameter.opts, *parameter.secondary_opts)}
+    assert {word for word in words if word.startswith("--")} <= known | {"--help"}
+
+
+def test_shown_parameters_exist():
+    for page in PAGES:
+        for key in re.findall(r"`([a-z]+\.[a-z_]+) ?=|--set ([a-z]+\.[a-z_]+)=", page.read_text(encoding="utf-8")):
+            assert (key[0] or key[1]) in keys(), f"{page.name} names {key}"
+
+
+def test_every_part_of_the_configuration_is_described():
+    page = (ROOT / "docs" / "configuration.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"^\| `([a-z]+)` \|", page, flags=re.MULTILINE))
+    assert described == {key.partition(".")[0] for key in keys()} - {"preset"}
+
+
+def test_the_printed_configuration_is_the_default(tmp_path):
+    printed = program("config", cwd=tmp_path)
+    (tmp_path / "my.toml").write_text(printed.stdout, encoding="utf-8")
+    assert Config.load(tmp_path / "my.toml") == Config()
+
+
+def test_the_readme_python_runs(tmp_path):
+    (code,) = blocks(README, "python")
+    path = re.search(r'open_sequence\("([^"]+)"\)', code)
+    assert path is not None
+    code = code.replace(path[1], str(EXCERPT))
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.count("tracked") == 12
+    assert (tmp_path / "trajectory.txt").is_file()
+    assert (tmp_path / "mesh.ply").is_file()
+
+
+def test_the_readme_evaluation_runs(run_folder):
+    done = program("evaluate", "my_run", "--reference", str(EXCERPT), cwd=run_folder.parent)
+    assert done.returncode == 0, done.stderr
+
+
+def test_every_written_file_and_figure_is_described(run_folder):
+    page = (ROOT / "docs" / "files.md").read_text(encoding="utf-8")
+    described = set(re.findall(r"`([A-Za-z_0-9.<>/]+)`", page))
+    metrics = json.loads((run_folder / "metrics.json").read_text(encoding="utf-8"))
+    for name in [path.name for path in run_folder.iterdir() if path.is_file()] + list(metrics):
+        assert name in described or name.startswith(("evaluation", "trajectory")), f"docs/files.md lacks {name}"
+    with (run_folder / "timings.csv").open(encoding="utf-8") as file:
+        columns = next(csv.reader(file))
+    assert columns[:6] == ["timestamp", "state", "fused", "dynamic_share", "reading", "total"]
+
+
+def test_continuous_integration_is_make_test():
+    commands = [line for line in (ROOT / ".ci/run").read_text().splitlines() if "make" in line]
+    assert commands == ["exec make test"]
+    for target in re.findall(r"^make (\w+)", README, flags=re.MULTILINE):
+        assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)
