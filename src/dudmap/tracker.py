@@ -197,7 +197,9 @@ class Tracker:
         scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
-        if share < config.min_inliers or system.weight < 100:
+        if system.weight < 100:
+            reason = f"only {system.weight:.0f} static readings fall on the map"
+        elif share < config.min_inliers:
             reason = f"only {share:.0%} of the static readings fall on the map"
         elif residual > config.max_residual * (self.sensor.sigma_base + self.sensor.sigma_scale):
             reason = f"readings lie {1000 * residual:.1f} mm off the map"
