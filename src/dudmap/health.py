@@ -24,12 +24,18 @@ class TrackingHealth:
         self._colors: deque[float] = deque(maxlen=MEMORY)
         self.recovering = False
 
-    def doubt(self, tracked: TrackingResult) -> str:
-        """Sentence on what is much worse than before, empty if nothing is."""
+    def doubt(self, tracked: TrackingResult, *, recognised: bool = False) -> str:
+        """Sentence on what is much worse than before, empty if nothing is.
+
+        Args:
+            tracked: The registration.
+            recognised: Whether features put the camera there too; then the distances alone need not be as usual.
+        """
         if len(self._residuals) < 5:
             return ""
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
-        if tracked.residual > (1.6 if self.recovering else 4.0) * residual:
+        worst = 4.0 if not self.recovering else 2.5 if recognised else 1.6
+        if tracked.residual > worst * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
         if self.recovering and tracked.inlier_share < 0.6 * share:
             return f"only {tracked.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"

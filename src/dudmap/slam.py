@@ -249,7 +249,7 @@ class Slam:
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
                 tracked.converged
-                and not self.health.doubt(tracked)
+                and not self.health.doubt(tracked, recognised=True)
                 and static * tracked.inlier_share >= config.min_on_map
                 and agree(tracked.T_world_camera, T_world_camera, config.max_distance, config.max_angle_deg)
             ):
