@@ -115,7 +115,7 @@ class Tracker:
             lit = exposed(level, exposure)
             system = self.linearize(volume, lit, T, weights)
             iterations += 1
-            if self.config.exposure:
+            if self.config.exposure and index == 0:
                 change = fit_exposure(lit.intensity, system.residuals[1], weights)
                 if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
