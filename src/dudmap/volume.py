@@ -114,6 +114,7 @@ class TsdfVolume:
         self._colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
         self._entry_of = np.full(1 << 10, -1, dtype=np.int32)
         self._slot_coords = np.zeros((1 << 10, 3), dtype=np.int32)
+        self._written = np.zeros(1 << 10, dtype=np.int32)  # number of the frame that last wrote a slot
         self._num_slots = 0
         self._unused: list[int] = []
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
@@ -138,7 +139,7 @@ class TsdfVolume:
     @property
     def num_bytes(self) -> int:
         """Memory of the map: voxels of the blocks in use and the index of all entries, without spare capacity."""
-        voxels = self._num_slots * (2 * BLOCK**3 * 4 + 4 + 12)
+        voxels = self._num_slots * (2 * BLOCK**3 * 4 + 4 + 12 + 4)
         return voxels + self._num_entries * (12 + 4 + 1) + self._table.nbytes
 
     @property
@@ -249,6 +250,7 @@ class TsdfVolume:
         slots = self._take_slots(len(entries))
         self._entry_of[slots] = entries
         self._slot_coords[slots] = self._coords[entries]
+        self._written[slots] = self._frame_number
         self._slot_of[entries] = slots
         self._window[cells] = slots
         self._near = np.concatenate([self._near, slots])
@@ -282,6 +284,7 @@ class TsdfVolume:
             self._colors = _grown(self._colors, capacity, 0)
             self._entry_of = _grown(self._entry_of, capacity, -1)
             self._slot_coords = _grown(self._slot_coords, capacity, 0)
+            self._written = _grown(self._written, capacity, 0)
         slots = np.array(reused + list(range(self._num_slots, needed)), dtype=np.int32)
         self._num_slots = needed
         return slots
@@ -308,6 +311,7 @@ class TsdfVolume:
             nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
         )  # fmt: skip
         visible = visible[:count]
+        self._written[visible] = self._frame_number
         voxel = np.array(
             [
                 self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
@@ -440,13 +444,43 @@ class TsdfVolume:
         )  # fmt: skip
         return Mesh(vertices, faces, colors, normals)
 
+    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+        """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
+
+        Args:
+            slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
+            chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
+        """
+        parts = meshing.extract_chunks(
+            self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
+            self.sdf_unit, self.config.min_weight, chunks, STEEPEST * self.voxel_size,
+        )  # fmt: skip
+        return [Mesh(*part) for part in parts]
+
+    @property
+    def num_integrated(self) -> int:
+        """Frames that were integrated."""
+        return self._frame_number
+
+    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
+
+        A slot whose block gave its voxels back is among them, with the coordinates of that block or of the next one.
+        """
+        slots = np.flatnonzero(self._written[: self._num_slots] > num_integrated).astype(np.int32)
+        return slots, self._slot_coords[slots]
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        entries = hashing.find_all(self._table, self._coords, coords)
+        return np.where(entries >= 0, self._slot_of[entries], -1).astype(np.int32)
+
     def _neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
         out = np.empty((len(slots), 8), dtype=np.int32)
         for column in range(8):
             offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            entries = hashing.find_all(self._table, self._coords, self._slot_coords[slots] + offset)
-            out[:, column] = np.where(entries >= 0, self._slot_of[entries], -1)
+            out[:, column] = self.slots_at(self._slot_coords[slots] + offset)
         return out
 
     # -- files -------------------------------------------------------------------------------------------------------
@@ -516,7 +550,7 @@ class TsdfVolume:
         self._coords, self._free_count, self._num_entries = coords.copy(), free_count.copy(), n
         hashing.rebuild(self._table, self._coords, n)
         self._geometry, self._colors, self._num_slots = geometry.copy(), colors.copy(), m
-        self._entry_of, self._slot_coords = entries.copy(), coords[entries]
+        self._entry_of, self._slot_coords, self._written = entries.copy(), coords[entries], np.zeros(m, np.int32)
         self._slot_of = np.full(n, -1, dtype=np.int32)
         self._slot_of[entries] = np.arange(m, dtype=np.int32)
         self._origin = None
