@@ -204,11 +204,40 @@ def test_images_of_another_size_are_refused():
         TsdfVolume(CAMERA, CONSTANT).integrate(frame, np.eye(4))
 
 
-def test_space_that_was_seen_empty_costs_a_byte_not_a_block():
-    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
+def test_space_that_was_seen_empty_costs_a_hundredth_of_its_voxels():
+    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02), depth_max=4.0)
+    before = volume.num_bytes
     for _ in range(12):
         volume.integrate(wall(3.5), np.eye(4))
-    assert volume.num_free_blocks > 20
-    per_block = 2 * 512 * 4
-    assert volume._coords.itemsize * 3 + 4 + 1 < 0.01 * per_block
-    assert volume.num_bytes - volume._table.nbytes <= 4200 * volume.num_blocks + 20 * volume._num_entries
+    assert volume.num_free_blocks > 1.5 * volume.num_blocks
+    voxels = 2 * 512 * 4
+    index = volume.num_bytes - before - volume._num_slots * (voxels + 20)
+    assert 0 < index <= 0.01 * voxels * volume._num_entries
+
+
+def test_an_occupied_block_costs_little_more_than_its_voxels():
+    """As many free entries per block as a room has; 4.2 KB of 1024 bytes, with the hash at its emptiest and fullest."""
+    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.005), depth_max=4.0)
+    volume.look_at(np.eye(4))
+    known = 0
+    for blocks in (4_000, 9_000, 16_000):
+        cells = np.arange(known, 3 * blocks, dtype=np.int32)
+        volume._entries_of(cells)
+        volume._add_voxels(cells[: blocks - volume.num_blocks])
+        known = 3 * blocks
+        assert volume.num_blocks == blocks
+        assert volume._num_entries == known
+        assert volume._num_entries <= 0.7 * len(volume._table)
+        assert volume.num_bytes <= 4.2 * 1024 * blocks
+
+
+def test_the_map_has_an_end_and_says_so():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
+    edge = np.eye(4)
+    edge[0, 3] = 0.4 * (1 << 15) - 4.0
+    for _ in range(3):
+        volume.integrate(wall(1.5), edge)
+    assert volume.extract_mesh().vertices[:, 0].min() > 13_000
+    edge[0, 3] += 4.0
+    with pytest.raises(MapError, match="13107 m from where the map began"):
+        volume.integrate(wall(1.5), edge)

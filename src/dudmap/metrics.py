@@ -36,6 +36,7 @@ class RunRecord:
         unreadable: One sentence per frame that could not be read.
         mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
         masked: Frames that had a mask from outside, None if none were given.
+        dropped: Frames of a live run that there was no time for, None if the frames waited.
         movers: One object per frame with moving bodies, as written to movers.jsonl.
         residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
     """
@@ -50,11 +51,22 @@ class RunRecord:
     skipped_similar: int = 0
     relocalized: int = 0
     masked: int | None = None
+    dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
 
-    def add(self, result: "FrameResult", total_ms: float, reading_ms: float, mask: NDArray[np.bool_] | None) -> None:
-        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known."""
+    def add(
+        self,
+        result: "FrameResult",
+        total_ms: float,
+        reading_ms: float,
+        mask: NDArray[np.bool_] | None,
+        **delays: float,
+    ) -> None:
+        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known.
+
+        ``delays`` of a live run: frames ``dropped`` before this one, ``latency`` from its arrival to the result, ms.
+        """
         self.rows.append(
             {
                 "timestamp": f"{result.timestamp:.6f}",
@@ -64,6 +76,7 @@ class RunRecord:
                 "reading": round(reading_ms, 3),
                 "total": round(total_ms, 3),
             }
+            | {key: round(value, 3) for key, value in delays.items()}
             | {stage: round(ms, 3) for stage, ms in result.timings.items()}
         )
         self.fused += result.fused
@@ -126,14 +139,22 @@ class RunRecord:
             "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
             "lost_frames": self.lost,
             "unreadable_frames": self.unreadable,
-        } | self._of_masks()
+        } | self._occasional()
 
-    def _of_masks(self) -> dict[str, Any]:
+    def _occasional(self) -> dict[str, Any]:
+        """What only runs with masks and live runs have."""
         out: dict[str, Any] = {}
         if self.masked is not None:
             out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
         if self.mask_ious:
             out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
+        if self.dropped is not None:
+            latencies = np.array([row["latency"] for row in self.rows] or [np.nan])
+            out |= {
+                "dropped": self.dropped,
+                "latency_ms_median": _number(np.median(latencies)),
+                "latency_ms_p95": _number(np.percentile(latencies, 95)),
+            }
         return out
 
 

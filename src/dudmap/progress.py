@@ -49,8 +49,8 @@ class RunProgress:
     ) -> None:
         self._bar.stop()
 
-    def frame(self, index: int, result: "FrameResult") -> None:
-        """Show a processed frame."""
+    def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
+        """Show a processed frame, and how many of a live run were dropped so far."""
         if result.state == "lost":
             if self._lost == 0:
                 self.note(f"frame {index}: lost, {result.lost_reason}")
@@ -61,6 +61,8 @@ class RunProgress:
         self._times.append(time.perf_counter())
         seconds = self._times[-1] - self._times[0]
         state = "[red]lost[/]" if result.state == "lost" else "[green]tracked[/]"
+        if dropped:
+            state += f", {dropped} dropped"
         self._bar.update(
             self._task,
             completed=index + 1,
@@ -89,6 +91,10 @@ def summary(metrics: dict[str, Any]) -> Table:
         value = metrics[key]
         bad = key in ("lost", "unreadable") and value
         table.add_row(f"  {key.replace('_', ' ')}", f"[red]{value}[/]" if bad else str(value))
+    if "dropped" in metrics:
+        table.add_row("  dropped", str(metrics["dropped"]))
+        table.add_row("arrival to result, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))
+        table.add_row("arrival to result, 95 %", _text(metrics["latency_ms_p95"], "{:.1f} ms"))
     table.add_row("time per frame, median", _text(metrics["ms_per_frame_median"], "{:.1f} ms"))
     table.add_row("time per frame, 95 %", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
     table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))

@@ -64,6 +64,22 @@ class Reading(NamedTuple):
     known: NDArray[np.bool_] | FrameError | None = None
 
 
+class Turn(NamedTuple):
+    """A frame whose turn it is.
+
+    Attributes:
+        number: Its number.
+        reading: What was read.
+        dropped: Frames that were dropped since the one before.
+        arrival: When it arrived, seconds of ``time.perf_counter``; None where frames wait for the system.
+    """
+
+    number: int
+    reading: Reading
+    dropped: int = 0
+    arrival: float | None = None
+
+
 def run(
     sequence: "Sequence",
     config: Config,
@@ -74,6 +90,7 @@ def run(
     masks: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
+    live: bool = False,
     observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -96,6 +113,8 @@ def run(
         progress: Show a progress bar on a terminal.
         ahead: Frames that are read while an earlier one is processed; 0 where reading is work for all cores, as with
             rendered frames, and would disturb the times. The result does not depend on it.
+        live: Frames arrive as their times tell, from when the kernels are loaded; the newest that has arrived is
+            processed, and those that there is no time for are dropped and counted. Nothing queues.
         observe: Called after each processed frame with its number, reading and result.
 
     Raises:
@@ -111,14 +130,20 @@ def run(
             f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
         )
     known = None if masks is None else _open_masks(masks, sequence)
-    slam, record = Slam(sequence.camera, config), RunRecord(masked=None if masks is None else 0)
+    slam = Slam(sequence.camera, config)
+    record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     _prepare(out, save_masks=save_masks)
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:
-            with closing(read_ahead(sequence, count, ahead, known)) as readings:
-                for index, reading in enumerate(readings):
-                    _process(index, reading, slam, record, display, out if save_masks else None, observe)
+            if live:
+                display.working("loading kernels")
+                _load_kernels(Slam(sequence.camera, config), sequence, count)
+            with closing(_live(sequence, count, known) if live else _waiting(sequence, count, ahead, known)) as turns:
+                for turn in turns:
+                    _process(turn, slam, record, display, out if save_masks else None, observe)
+            if record.dropped:
+                display.note(f"live: {record.dropped} of {count} frames dropped; the newest was always taken")
         except KeyboardInterrupt:
             stopped = f"interrupted after {len(record.rows)} frames"
             raise KeyboardInterrupt(f"{stopped}; the trajectory and the map up to there are in {out}") from None
@@ -160,6 +185,29 @@ def read_ahead(
         reader.shutdown(cancel_futures=True)
 
 
+def _waiting(sequence: "Sequence", count: int, ahead: int, known: "MaskFolder | None") -> "Generator[Turn]":
+    for index, reading in enumerate(read_ahead(sequence, count, ahead, known)):
+        yield Turn(index, reading)
+
+
+def _live(sequence: "Sequence", count: int, known: "MaskFolder | None") -> "Generator[Turn]":
+    from dudmap.live import live
+
+    last = -1
+    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, known))) as arrivals:
+        for arrival in arrivals:
+            yield Turn(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
+            last = arrival.number
+
+
+def _load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
+    """Run the first frames through a system that is thrown away: a sensor is switched on when all is compiled."""
+    for index in range(min(count, 3)):
+        frame = _read(sequence, index).frame
+        if not isinstance(frame, FrameError):
+            slam.process(frame)
+
+
 def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None) -> Reading:
     start = time.perf_counter()
     try:
@@ -178,14 +226,16 @@ def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> ND
 
 
 def _process(
-    index: int,
-    reading: Reading,
+    turn: Turn,
     slam: "Slam",
     record: RunRecord,
     display: RunProgress,
     out_of_masks: Path | None,
     observe: "Callable[[int, Reading, FrameResult], None] | None",
 ) -> None:
+    index, reading = turn.number, turn.reading
+    if record.dropped is not None:
+        record.dropped += turn.dropped
     if isinstance(reading.frame, FrameError):
         record.unreadable.append(str(reading.frame))
         display.note(f"skipped: {reading.frame}")
@@ -202,12 +252,14 @@ def _process(
         record.masked += known is not None
     start = time.perf_counter()
     result = slam.process(reading.frame) if known is None else slam.process(reading.frame, known)
-    record.add(result, 1000 * (time.perf_counter() - start), reading.ms, truth)
+    end = time.perf_counter()
+    delays = {} if turn.arrival is None else {"dropped": turn.dropped, "latency": 1000 * (end - turn.arrival)}
+    record.add(result, 1000 * (end - start), reading.ms, truth, **delays)
     if out_of_masks is not None:
         _save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, reading, result)
-    display.frame(index, result)
+    display.frame(index, result, record.dropped)
 
 
 def _save_mask(path: Path, mask: NDArray[np.bool_]) -> None:

@@ -18,6 +18,8 @@ from dudmap.mesh import Mesh
 
 BLOCK = 8
 """Voxels along the edge of a block."""
+FULLEST = 0.7
+"""Largest share of the hash table that may be taken: 13 ns per insertion, 5 ns at half of that."""
 FORMAT = "dudmap map 1"
 STEEPEST = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
@@ -106,14 +108,15 @@ class TsdfVolume:
         self._stamps = np.zeros(size**3, dtype=np.int32)
         self._origin: NDArray[np.int64] | None = None
         self._table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
-        self._coords = np.empty((1 << 12, 3), dtype=np.int32)
+        self._coords = np.empty((1 << 12, 3), dtype=np.int16)
         self._slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self._free_count = np.zeros(1 << 12, dtype=np.uint8)
         self._num_entries = 0
         self._geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
         self._colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
         self._entry_of = np.full(1 << 10, -1, dtype=np.int32)
-        self._slot_coords = np.zeros((1 << 10, 3), dtype=np.int32)
+        self._slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
+        self._written = np.zeros(1 << 10, dtype=np.int32)  # number of the frame that last wrote a slot
         self._num_slots = 0
         self._unused: list[int] = []
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
@@ -138,9 +141,15 @@ class TsdfVolume:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: voxels of the blocks in use and the index of all entries, without spare capacity."""
-        voxels = self._num_slots * (2 * BLOCK**3 * 4 + 4 + 12)
-        return voxels + self._num_entries * (12 + 4 + 1) + self._table.nbytes
+        """Memory of the map: voxels, also those given back and not taken again yet, the index of all entries, the hash.
+
+        Arrays grow ahead of what they hold; that spare room is address space the system has not backed with memory, and
+        is left out. So is the window, whose size depends on the view and the voxels, not on the map.
+        """
+        slots = sum(_row_bytes(array) for array in (self._geometry, self._colors, self._slot_coords, self._entry_of))
+        entries = sum(_row_bytes(array) for array in (self._coords, self._slot_of, self._free_count))
+        slots += _row_bytes(self._written)
+        return self._num_slots * slots + self._num_entries * entries + self._table.nbytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
@@ -250,6 +259,7 @@ class TsdfVolume:
         slots = self._take_slots(len(entries))
         self._entry_of[slots] = entries
         self._slot_coords[slots] = self._coords[entries]
+        self._written[slots] = self._frame_number
         self._slot_of[entries] = slots
         self._window[cells] = slots
         self._near = np.concatenate([self._near, slots])
@@ -258,18 +268,24 @@ class TsdfVolume:
         """Entries of window cells, made where there is none yet."""
         assert self._origin is not None
         coords = np.stack(np.unravel_index(cells, tuple(self._shape)), axis=1) + self._origin
+        if np.abs(coords).max(initial=0) >= 1 << 15:
+            farthest = (1 << 15) * self.block_size
+            raise MapError(
+                f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
+                f"{self.voxel_size} m it cannot be larger: set volume.voxel_size to a larger value"
+            )
         needed = self._num_entries + len(cells)
         if needed > len(self._coords):
             capacity = max(needed, 2 * len(self._coords))
             self._coords = _grown(self._coords, capacity, 0)
             self._slot_of = _grown(self._slot_of, capacity, -1)
             self._free_count = _grown(self._free_count, capacity, 0)
-        if 2 * needed > len(self._table):
-            size = 1 << int(4 * needed - 1).bit_length()  # a full table would be searched for ever
+        if needed > FULLEST * len(self._table):
+            size = 1 << int(2 * needed - 1).bit_length()  # a full table would be searched for ever
             self._table = np.full(size, hashing.EMPTY, dtype=np.int32)
             hashing.rebuild(self._table, self._coords, self._num_entries)
         entries, self._num_entries = hashing.insert_all(
-            self._table, self._coords, self._num_entries, coords.astype(np.int32)
+            self._table, self._coords, self._num_entries, coords.astype(np.int16)
         )
         return entries
 
@@ -283,6 +299,7 @@ class TsdfVolume:
             self._colors = _grown(self._colors, capacity, 0)
             self._entry_of = _grown(self._entry_of, capacity, -1)
             self._slot_coords = _grown(self._slot_coords, capacity, 0)
+            self._written = _grown(self._written, capacity, 0)
         slots = np.array(reused + list(range(self._num_slots, needed)), dtype=np.int32)
         self._num_slots = needed
         return slots
@@ -309,6 +326,7 @@ class TsdfVolume:
             nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
         )  # fmt: skip
         visible = visible[:count]
+        self._written[visible] = self._frame_number
         voxel = np.array(
             [
                 self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
@@ -450,13 +468,43 @@ class TsdfVolume:
         )  # fmt: skip
         return Mesh(vertices, faces, colors, normals)
 
+    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+        """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
+
+        Args:
+            slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
+            chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
+        """
+        parts = meshing.extract_chunks(
+            self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
+            self.sdf_unit, self.config.min_weight, chunks, STEEPEST * self.voxel_size,
+        )  # fmt: skip
+        return [Mesh(*part) for part in parts]
+
+    @property
+    def num_integrated(self) -> int:
+        """Frames that were integrated."""
+        return self._frame_number
+
+    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
+
+        A slot whose block gave its voxels back is among them, with the coordinates of that block or of the next one.
+        """
+        slots = np.flatnonzero(self._written[: self._num_slots] > num_integrated).astype(np.int32)
+        return slots, self._slot_coords[slots].astype(np.int32)
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        entries = hashing.find_all(self._table, self._coords, coords)
+        return np.where(entries >= 0, self._slot_of[entries], -1).astype(np.int32)
+
     def _neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
         out = np.empty((len(slots), 8), dtype=np.int32)
         for column in range(8):
             offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            entries = hashing.find_all(self._table, self._coords, self._slot_coords[slots] + offset)
-            out[:, column] = np.where(entries >= 0, self._slot_of[entries], -1)
+            out[:, column] = self.slots_at(self._slot_coords[slots] + offset)
         return out
 
     # -- files -------------------------------------------------------------------------------------------------------
@@ -478,7 +526,7 @@ class TsdfVolume:
                     config=self.config.model_dump_json(),
                     sensor=self.sensor.model_dump_json(),
                     depth_max=self.depth_max,
-                    coords=self._coords[:n],
+                    coords=self._coords[:n].astype(np.int32),
                     free_count=self._free_count[:n],
                     entries=self._entry_of[slots],
                     geometry=self._geometry[slots],
@@ -522,11 +570,11 @@ class TsdfVolume:
         colors: NDArray[np.int32],
     ) -> None:
         n, m = len(coords), len(entries)
-        self._table = np.full(max(1 << 14, 1 << int(np.ceil(np.log2(2 * n + 1)))), hashing.EMPTY, dtype=np.int32)
-        self._coords, self._free_count, self._num_entries = coords.copy(), free_count.copy(), n
+        self._table = np.full(max(1 << 14, 1 << (2 * n).bit_length()), hashing.EMPTY, dtype=np.int32)
+        self._coords, self._free_count, self._num_entries = coords.astype(np.int16), free_count.copy(), n
         hashing.rebuild(self._table, self._coords, n)
         self._geometry, self._colors, self._num_slots = geometry.copy(), colors.copy(), m
-        self._entry_of, self._slot_coords = entries.copy(), coords[entries]
+        self._entry_of, self._slot_coords, self._written = entries.copy(), self._coords[entries], np.zeros(m, np.int32)
         self._slot_of = np.full(n, -1, dtype=np.int32)
         self._slot_of[entries] = np.arange(m, dtype=np.int32)
         self._origin = None
@@ -538,3 +586,8 @@ def _grown(array: NDArray, capacity: int, value: int) -> NDArray:
     out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
     out[: len(array)] = array
     return out
+
+
+def _row_bytes(array: NDArray) -> int:
+    """Memory of one element along the first axis."""
+    return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))

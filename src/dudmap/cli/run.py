@@ -40,6 +40,10 @@ def run(
     masks: Annotated[
         Path | None, typer.Option("--masks", help="Folder of masks of what moves, <timestamp>.png with 255 = moves.")
     ] = None,
+    live: Annotated[
+        bool,
+        typer.Option("--live", help="Frames arrive at the sensor's rate; those there is no time for are dropped."),
+    ] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -55,7 +59,7 @@ def run(
     out = out or free_folder(Path("runs") / recording.name)
     report = run_sequence(
         recording, parameters, out,
-        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet,
+        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

@@ -31,7 +31,7 @@ def find(table, coords, x, y, z):
 
 @kernel
 def find_all(table, coords, wanted):
-    """Entries (n,) int32 of blocks ``wanted`` (n, 3) int32, -1 where there is none."""
+    """Entries (n,) int32 of blocks ``wanted`` (n, 3), -1 where there is none."""
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
         out[n] = find(table, coords, np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2]))

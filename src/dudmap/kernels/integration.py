@@ -85,7 +85,7 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
 
     Args:
         slots: (n,) int32 candidates.
-        coords: (num_slots, 3) int32 block coordinates by slot.
+        coords: (num_slots, 3) int16 block coordinates by slot.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
@@ -187,7 +187,7 @@ def integrate(
     Args:
         start, stop: Range of blocks.
         slots: (n,) int32.
-        coords: (num_slots, 3) int32.
+        coords: (num_slots, 3) int16.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.

@@ -320,7 +320,7 @@ def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, m
         geometry: (num_slots, 512) int32, packed voxels.
         colors: (num_slots, 512) int32, packed colours.
         slots: (n,) int32, blocks to mesh; each once.
-        coords: (num_slots, 3) int32, block coordinates per slot.
+        coords: (num_slots, 3) int, block coordinates per slot.
         neighbours: (n, 8) int32; column 4 dx + 2 dy + dz holds the slot of the block at +(dx, dy, dz), -1 = none.
         voxel_size: Metres.
         sdf_unit: Metres per step of the stored distance.
@@ -368,10 +368,13 @@ def extract_chunks(
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
     first = np.empty(num_chunks + 1, dtype=np.int64)
     _split(begin, len(vertices), faces, ids, local_faces, first)
+    ids = ids[: first[-1]]
+    vertices, vertex_colors, normals = vertices[ids], vertex_colors[ids], normals[ids]
     out = []
-    for chunk in range(num_chunks):
-        own = ids[first[chunk] : first[chunk + 1]]
-        out.append((vertices[own], local_faces[begin[chunk] : begin[chunk + 1]], vertex_colors[own], normals[own]))
+    for chunk in range(num_chunks):  # copies: a view would keep the arrays of all chunks alive
+        own, faces_of = slice(first[chunk], first[chunk + 1]), slice(begin[chunk], begin[chunk + 1])
+        parts = vertices[own], local_faces[faces_of], vertex_colors[own], normals[own]
+        out.append(tuple(part.copy() for part in parts))
     return out
 
 

@@ -1,0 +1,161 @@
+"""Live frames: the newest is taken, the rest dropped and counted; a clock made of numbers instead of waiting."""
+
+import csv
+import json
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from dudmap.config import Config
+from dudmap.errors import DatasetError
+from dudmap.live import Arrival, Newest, live, replay
+from dudmap.run import run
+from dudmap.sequences import open_sequence
+from recordings import cut, write_recording
+from test_run import StandIn, slam  # noqa: F401
+
+
+class Clock:
+    """Time that passes only where somebody waits or works."""
+
+    def __init__(self):
+        self.time = 50.0
+
+    def now(self):
+        return self.time
+
+    def wait(self, seconds):
+        self.time += seconds
+        return False
+
+
+def replayed(timestamps, reading_s):
+    """Numbers and times of the frames that a sensor with so slow a reader offers."""
+    clock, offered = Clock(), []
+
+    def read(index):
+        clock.time += reading_s
+        return f"frame {index}"
+
+    replay(np.asarray(timestamps), read, offered.append, clock.wait, clock.now)
+    assert all(arrival.item == f"frame {arrival.number}" for arrival in offered)
+    return [arrival.number for arrival in offered], [arrival.time - 50 for arrival in offered]
+
+
+def test_frames_arrive_when_their_times_tell():
+    indices, times = replayed([7.0, 7.1, 7.2, 9.0], 0.01)
+    assert indices == [0, 1, 2, 3]
+    np.testing.assert_allclose(times, [0, 0.1, 0.2, 2.0], atol=1e-9)
+
+
+def test_a_reader_that_is_too_slow_goes_on_with_the_newest_frame():
+    indices, times = replayed(3 + 0.1 * np.arange(10), 0.25)
+    assert indices == [0, 2, 5, 7, 9]  # free again at 0.25, 0.5, 0.75, 1.0
+    np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
+
+
+def test_a_replay_ends_when_told():
+    offered = []
+    replay(np.arange(5.0), lambda index: index, offered.append, lambda seconds: True)
+    assert [arrival.number for arrival in offered] == [0]
+
+
+def test_only_the_newest_is_held():
+    newest = Newest()
+    for number in range(5):
+        newest.put(number)
+    assert newest.take() == 4
+    newest.put(5)
+    newest.close()
+    assert newest.take() == 5
+    assert newest.take() is None
+    assert newest.take() is None
+
+
+def test_a_consumer_waits_for_the_next():
+    newest, taken = Newest(), []
+    thread = threading.Thread(target=lambda: taken.append(newest.take()))
+    thread.start()
+    newest.put("late")
+    thread.join(timeout=5)
+    assert taken == ["late"]
+
+
+def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
+    arrivals = []
+    for arrival in live(0.01 * np.arange(30), str):
+        arrivals.append(arrival)
+        if arrival.number < 20:
+            time.sleep(0.035)
+    indices = [arrival.number for arrival in arrivals]
+    assert indices[0] == 0
+    assert indices[-1] == 29
+    assert all(np.diff(indices) >= 1)
+    assert len(indices) < 25
+    assert isinstance(arrivals[0], Arrival)
+
+
+def test_stopping_early_stops_the_sensor():
+    before = threading.active_count()
+    frames = live(np.array([0.0, 60.0]), str)
+    assert next(frames).item == "0"
+    frames.close()
+    assert threading.active_count() == before
+
+
+def test_an_error_of_the_reader_reaches_the_consumer():
+    def read(index):
+        raise DatasetError("the disk is gone")
+
+    with pytest.raises(DatasetError, match="the disk is gone"):
+        list(live(np.arange(3.0), read))
+
+
+@pytest.fixture
+def recording(tmp_path):
+    """Eight frames at 20 Hz."""
+    folder = write_recording(tmp_path / "desk", 8)
+    for name in ("rgb.txt", "depth.txt"):
+        lines = (folder / name).read_text().splitlines()
+        stamped = [f"{100 + 0.05 * k:.6f} {line.split()[1]}" for k, line in enumerate(lines[1:])]
+        (folder / name).write_text("\n".join([lines[0], *stamped]) + "\n")
+    return folder
+
+
+def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, monkeypatch):  # noqa: F811
+    fast = StandIn.process
+
+    def slow(self, frame):
+        time.sleep(0.12)
+        return fast(self, frame)
+
+    monkeypatch.setattr(slam, "process", slow)
+    out = tmp_path / "out"
+    report = run(open_sequence(recording), Config(), out, live=True, progress=False)
+    metrics = json.loads((out / "metrics.json").read_text())
+    assert metrics == json.loads(json.dumps(report.metrics))
+    assert metrics["dropped"] >= 2
+    assert metrics["frames"] + metrics["dropped"] == 8
+    assert metrics["latency_ms_median"] > 100
+    with (out / "timings.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert sum(int(row["dropped"]) for row in rows) == metrics["dropped"]
+    assert rows[0]["timestamp"] == "100.000000"
+    assert rows[-1]["timestamp"] == "100.350000"
+    assert all(float(row["latency"]) >= float(row["total"]) for row in rows)
+    assert f"live: {metrics['dropped']} of 8 frames dropped" in capsys.readouterr().err
+
+
+def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):  # noqa: F811
+    cut(recording / "depth/3.png")
+    start = time.perf_counter()
+    metrics = run(open_sequence(recording), Config(), tmp_path / "out", live=True, progress=False).metrics
+    assert time.perf_counter() - start >= 0.35, "frames do not arrive before their time"
+    assert (metrics["tracked"], metrics["unreadable"], metrics["dropped"]) == (7, 1, 0)
+    assert "dropped" not in capsys.readouterr().err
+
+
+def test_a_run_that_waits_says_nothing_of_dropped_frames(slam, recording, tmp_path):  # noqa: F811
+    assert "dropped" not in run(open_sequence(recording), Config(), tmp_path / "out", progress=False).metrics

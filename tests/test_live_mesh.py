@@ -1,0 +1,122 @@
+"""The mesh that follows a growing map equals a full extraction, and touches only what changed."""
+
+import numpy as np
+import pytest
+
+from dudmap import se3
+from dudmap.live_mesh import EDGE, LiveMesh
+from dudmap.volume import TsdfVolume
+from test_map_oracle import CAMERA, CONSTANT, wall
+
+CONFIG = CONSTANT.model_copy(update={"min_weight": 1})
+
+
+def triangles(mesh):
+    """Positions, colours and normals (n, 27) of all triangles in a fixed order, corners rotated to begin alike."""
+    rows = np.concatenate([mesh.vertices, mesh.colors, mesh.normals], axis=1)[mesh.faces]
+    first = np.lexsort((rows[:, :, 2].T, rows[:, :, 1].T, rows[:, :, 0].T), axis=0)[0]
+    rows = np.take_along_axis(rows, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1).reshape(-1, 27)
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+def assert_equal(live, volume):
+    expected = triangles(volume.extract_mesh())
+    assert len(expected) > 100
+    np.testing.assert_array_equal(triangles(live.mesh()), expected)
+
+
+def turned(degrees):
+    return se3.exp(np.array([0, 0, 0, 0, np.radians(degrees), 0]))
+
+
+@pytest.fixture
+def volume():
+    return TsdfVolume(CAMERA, CONFIG, depth_max=4.0)
+
+
+def test_it_equals_the_full_extraction_after_every_frame(volume):
+    live = LiveMesh(volume)
+    for number, angle in enumerate((0, 3, -40, 40, 40)):
+        volume.integrate(wall(1.5 + 0.02 * number, number), turned(angle))
+        live.update()
+        assert_equal(live, volume)
+    assert len(live.chunks) > 5
+
+
+def test_several_frames_may_pass_between_updates(volume):
+    live = LiveMesh(volume)
+    volume.integrate(wall(1.5), turned(0))
+    live.update()
+    for number in range(3):
+        volume.integrate(wall(1.4, number), turned(20 * number))
+    live.update()
+    assert_equal(live, volume)
+
+
+def test_only_what_was_written_is_extracted_again():
+    volume = TsdfVolume(CAMERA, CONFIG.model_copy(update={"voxel_size": 0.0125}), depth_max=4.0)
+    live = LiveMesh(volume)
+    for angle in (0, 90, 180):
+        volume.integrate(wall(1.5), turned(angle))
+    live.update()
+    assert live.update() == []
+    before = dict(live.chunks)
+    volume.integrate(wall(1.45, 1), turned(90))
+    again = set(live.update())
+    assert_equal(live, volume)
+    kept = {key for key in before if live.chunks.get(key) is before[key]}
+    assert len(kept) > len(before) / 4
+    assert not kept & again
+    size = EDGE * volume.block_size
+    looked_at = turned(90)[:3, 2]
+    for key in again:
+        assert (np.array(key) + 0.5) * size @ looked_at > -size
+
+
+def test_blocks_that_give_back_their_voxels_leave_the_mesh():
+    volume = TsdfVolume(CAMERA, CONFIG.model_copy(update={"carve_rate": 8, "carving": True}), depth_max=4.0)
+    live = LiveMesh(volume)
+    volume.integrate(wall(1.0), np.eye(4))
+    live.update()
+    first = set(live.chunks)
+    for number in range(60):
+        volume.integrate(wall(2.5, number), np.eye(4))
+        if number % 7 == 0:
+            live.update()
+            assert_equal(live, volume)
+    assert volume._unused or len(first - set(live.chunks)) > 0, "something must have been given back"
+    live.update()
+    assert_equal(live, volume)
+
+
+def test_slots_that_changed_hands_between_updates(volume):
+    """A slot given back and taken again elsewhere leaves its old place without a surface."""
+    live = LiveMesh(volume)
+    volume.integrate(wall(1.5), np.eye(4))
+    live.update()
+    slots = volume.active_slots
+    volume._frame_number += 1
+    volume._written[slots] = volume._frame_number
+    volume._release(slots)
+    volume.integrate(wall(1.5), turned(100))
+    assert not set(volume._unused) & set(volume.active_slots.tolist())
+    live.update()
+    assert_equal(live, volume)
+
+
+def test_an_empty_map_has_an_empty_mesh(volume):
+    live = LiveMesh(volume)
+    assert live.update() == []
+    assert len(live.mesh().faces) == 0
+
+
+def test_a_loaded_map_is_meshed_whole(volume, tmp_path):
+    for angle in (0, 60):
+        volume.integrate(wall(1.5), turned(angle))
+    volume.save(tmp_path / "map.npz")
+    live = LiveMesh(TsdfVolume.load(tmp_path / "map.npz"))
+    live.update()
+    np.testing.assert_array_equal(triangles(live.mesh()), triangles(volume.extract_mesh()))
+    live._volume.integrate(wall(1.4), turned(60))
+    live.update()
+    assert_equal(live, live._volume)
