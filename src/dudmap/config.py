@@ -169,6 +169,9 @@ class DynamicsConfig(Part):
     """The same in standard deviations of the reading; the larger of both counts."""
     max_share: float = Field(default=0.9, gt=0, le=1)
     """A frame of whose readings more than this share seems to move is not believed, but reported as lost."""
+    start_seconds: float = Field(default=1.0, ge=0)
+    """Time from the first frame on in which movers are also found from image to image (parallax), since the map does
+    not know free space yet; prolonged while that finds what the map does not. 0 turns it off. EM only."""
     margin_px: int = Field(default=5, ge=0, le=50)
     """Pixels around a moving region that are not fused either."""
 

@@ -168,12 +168,19 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     """Moving pixels (H, W) bool at full size; holes in the depth inside a moving region belong to it."""
     import cv2
 
-    stride = depth.shape[1] // level.depth.shape[1]
     low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, _ellipse(2))
     low[(level.depth > 0) & ~labels.dynamic] = 0
+    return full_size(low > 0, level.depth, depth)
+
+
+def full_size(
+    low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Mask (h, w) at the size (H, W) of a depth image: each pixel takes after the nearby one with the depth most alike."""
     out = np.empty(depth.shape, dtype=np.uint8)
+    stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)
     run_bands(
-        lambda start, stop: labeling.upsample(start, stop, low, level.depth, depth, stride, out),
+        lambda start, stop: labeling.upsample(start, stop, marks, low_depth, depth, stride, out),
         bands(depth.shape[0], 60),
     )
     return out > 0

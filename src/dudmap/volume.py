@@ -221,6 +221,10 @@ class TsdfVolume:
         if self.config.carving:
             self._observe_free(T_camera_world, tiles)
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self.__init__(self.camera, self.config, self.sensor, self.depth_max)
+
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
