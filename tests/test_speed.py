@@ -82,7 +82,7 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     from dudmap.benchmark.entries import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))
-    entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (80, 60)})
+    entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (160, 120)})
     result = interleaved.compare_with_open3d(sys.executable, entry, 50, rounds=1)
     assert result.frames == 12
     assert result.theirs_ms == 1e4
