@@ -13,6 +13,10 @@ from dudmap.kernels.threads import bands, run_bands
 from dudmap.volume import TsdfVolume
 
 
+EXPOSURE_NOISE = 0.01
+"""Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
+
+
 @dataclass(frozen=True, eq=False)
 class Level:
     """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
@@ -108,24 +112,35 @@ class Tracker:
             if limit == 0:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
-            if self.config.exposure:
-                residuals = self.linearize(volume, exposed(level, exposure), T, weights).residuals
-                exposure = chained(exposure, fit_exposure(exposed(level, exposure).intensity, residuals[1], weights))
-                iterations += 1
             lit = exposed(level, exposure)
-            T, system, used = self._optimize(volume, lit, T, weights, limit)
+            system = self.linearize(volume, lit, T, weights)
+            iterations += 1
+            if self.config.exposure and index == 0:
+                change = fit_exposure(lit.intensity, system.residuals[1], weights)
+                if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
+                    exposure = chained(exposure, change)
+                    lit = exposed(level, exposure)
+                    system = self.linearize(volume, lit, T, weights)
+                    iterations += 1
+            T, system, used = self._optimize(volume, lit, T, weights, system, limit)
             iterations += used
         if system is None:  # every level is left out: judge the first guess
             system = self.linearize(volume, levels[-1], T, weights)
+        T = T.copy()
+        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
         return self._judge(T, exposure, system, weights, iterations)
 
     def _optimize(
-        self, volume: TsdfVolume, level: Level, T: NDArray[np.float64], weights: NDArray[np.float32], limit: int
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: LinearSystem,
+        limit: int,
     ) -> tuple[NDArray[np.float64], LinearSystem, int]:
         """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
-        damping = self.config.damping
-        system = self.linearize(volume, level, T, weights)
-        used = 1
+        damping, used = self.config.damping, 0
         for _ in range(limit):
             diagonal = np.diag(system.H)
             if not diagonal.max() > 0:
@@ -133,16 +148,15 @@ class Tracker:
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
             T_trial = moved(T, step)
+            if np.linalg.norm(step) < self.config.stop:  # the step is known to be small before it is tried: take it and be done
+                T = T_trial
+                break
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
-                if np.linalg.norm(step) < self.config.stop:
-                    break
             else:
                 damping *= 5
-                if np.linalg.norm(step) < self.config.stop:
-                    break
         return T, system, used
 
     def linearize(
@@ -162,7 +176,7 @@ class Tracker:
         )  # fmt: skip
         window, shape, geometry = volume.window
         height = level.depth.shape[0]
-        ranges = bands(height, max(8, -(-height // 8)))
+        ranges = bands(height, 30)
         sums = np.zeros((len(ranges), registration.NUM_SUMS))
         residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
         T = volume.lattice(T_world_camera)
@@ -215,9 +229,9 @@ class Tracker:
 
 def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pose after a twist (v, omega) about the camera's centre, world axes."""
-    out = se3.exp(np.concatenate([np.zeros(3), step[3:]])) @ T_world_camera
-    out[:3, 3] = T_world_camera[:3, 3] + step[:3]
-    out[:3, :3] = se3.nearest_rotation(out[:3, :3])
+    out = T_world_camera.copy()
+    out[:3, :3] = se3.exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3] @ T_world_camera[:3, :3]
+    out[:3, 3] += step[:3]
     return out
 
 
@@ -249,11 +263,11 @@ def fit_exposure(
     used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
     if len(used) < 100:
         return 1.0, 0.0
-    used = used[:: max(1, len(used) // 2000)]  # two thousand pixels tell two numbers
+    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
     x = intensity.reshape(-1)[used].astype(np.float64)
     y = x + difference.reshape(-1)[used]
     gain, offset = 1.0, float(np.median(y - x))
-    for _ in range(5):  # iteratively reweighted least squares, Cauchy weights
+    for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
         error = y - gain * x - offset
         scale = max(1.5 * float(np.median(np.abs(error))), 0.01)
         w = 1 / (1 + (error / scale) ** 2)

@@ -121,6 +121,7 @@ class TsdfVolume:
         self._unused: list[int] = []
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
+        self._packed: tuple[NDArray[np.float32], NDArray[np.int32]] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -340,22 +341,31 @@ class TsdfVolume:
             ],
             dtype=np.float32,
         )  # fmt: skip
-        images = (
-            np.append(depth.reshape(-1), np.float32(0)),
-            np.append(nearest_reading(depth).reshape(-1), np.float32(0)),
-            np.append(packed(color).reshape(-1), np.int32(0)),
-            np.append((self._weights(depth) if weights is None else weights).reshape(-1), np.uint8(0)),
-        )
+        readings, colors = self._pixels(depth, color, self._weights(depth) if weights is None else weights)
         state = np.empty((count, 2), dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate(
-                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, *images,
+                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, readings, colors,
                 self._geometry.reshape(-1), self._colors.reshape(-1), voxel, state,
             ),
             bands(count, 256),
         )  # fmt: skip
         if self.config.carving:
             self._release(visible[(state[:, 0] == 0) & (state[:, 1] == BLOCK**3)])
+
+    def _pixels(
+        self, depth: NDArray[np.float32], color: NDArray[np.uint8], weights: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
+        """Readings (H * W + 1, 2) and colours (H * W + 1,) as the fusion takes them; the last pixel has no reading."""
+        if self._packed is None:
+            self._packed = np.zeros((depth.size + 1, 2), dtype=np.float32), np.zeros(depth.size + 1, dtype=np.int32)
+        readings, colors = self._packed
+        rgb = np.ascontiguousarray(color)
+        run_bands(
+            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, readings, colors),
+            bands(depth.shape[0], 60),
+        )
+        return readings, colors
 
     def _weights(self, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Weights (H, W) of the readings: all alike, or by the angle of sight and the sensor's noise (eq. 4.20)."""
@@ -574,20 +584,6 @@ class TsdfVolume:
         self._slot_of = np.full(n, -1, dtype=np.int32)
         self._slot_of[entries] = np.arange(m, dtype=np.int32)
         self._origin = None
-
-
-def nearest_reading(depth: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Nearest reading (H, W) in the 3x3 neighbourhood of each pixel that has one; 0 elsewhere."""
-    import cv2
-
-    far = np.where(depth > 0, depth, np.float32(np.inf))
-    return np.where(depth > 0, cv2.erode(far, np.ones((3, 3), np.uint8)), np.float32(0)).astype(np.float32)
-
-
-def packed(color: NDArray[np.uint8]) -> NDArray[np.int32]:
-    """Colours (H, W, 3) as (H, W) int32 with ten bits per channel."""
-    c = color.astype(np.int32)
-    return (c[..., 0] << 22) | (c[..., 1] << 12) | (c[..., 2] << 2)
 
 
 def _grown(array: NDArray, capacity: int, value: int) -> NDArray:

@@ -133,6 +133,40 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
 
 
 @kernel
+def pack_pixels(row_start, row_stop, depth, rgb, weights, readings, colors):
+    """What the fusion loads of each pixel, in two words side by side and one more, so that it loads little.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (H, W) float32, metres, 0 = none.
+        rgb: (H, W, 3) uint8.
+        weights: (H, W) uint8, weight of each reading.
+        readings: (H * W + 1, 2) float32 out: the reading, and the nearest of the readings in its 3x3 neighbourhood,
+            which decides whether a voxel is surely seen empty; 0 = none. The last row stays as it is.
+        colors: (H * W + 1,) int32 out: r << 24 | g << 16 | b << 8 | weight. The last element stays as it is.
+    """
+    h, w = depth.shape
+    far = np.float32(1e9)
+    column = np.full(w + 2, far, np.float32)
+    for v in range(row_start, row_stop):
+        above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
+        for u in range(w):
+            a, b, c = above[u], middle[u], below[u]
+            a, b, c = a if a > 0 else far, b if b > 0 else far, c if c > 0 else far
+            column[np.uintp(u + 1)] = min(min(a, b), c)
+        row, shades = readings[v * w : v * w + w], colors[v * w : v * w + w]
+        source, gains = rgb[v].reshape(-1), weights[v]
+        for u in range(w):
+            k = np.uintp(u)
+            near = min(min(column[k], column[np.uintp(u + 1)]), column[np.uintp(u + 2)])
+            row[k, 0] = middle[k]
+            row[k, 1] = near if middle[k] > 0 else np.float32(0)
+        for u in range(w):
+            r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
+            shades[u] = (np.int32(r) << 24) | (np.int32(g) << 16) | (np.int32(b) << 8) | np.int32(gains[u])
+
+
+@kernel
 def integrate(
     start,
     stop,
@@ -141,10 +175,8 @@ def integrate(
     T,
     intrinsics,
     size,
-    depth,
-    near,
+    readings,
     colors,
-    weights,
     map_geometry,
     map_colors,
     voxel,
@@ -159,10 +191,7 @@ def integrate(
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
-        depth: (H * W + 1,) float32, metres, 0 = none; the last element is 0.
-        near: (H * W + 1,) float32, nearest reading around each pixel; decides whether a voxel is surely seen empty.
-        colors: (H * W + 1,) int32, 10 bits per channel.
-        weights: (H * W + 1,) uint8 weight of each pixel's observation.
+        readings, colors: See ``pack_pixels``.
         map_geometry, map_colors: (num_slots * 512,) int32.
         voxel: (10,) float32: voxel_size, sdf_unit, truncation, truncation_behind, truncation_noise, sigma_base,
             sigma_scale, max_weight, carve_rate, largest storable distance.
@@ -193,7 +222,6 @@ def integrate(
     seen = np.empty(512, np.float32)
     seen_near = np.empty(512, np.float32)
     seen_color = np.empty(512, np.int32)
-    seen_weight = np.empty(512, np.float32)
     max_u, max_v = np.float32(width), np.float32(height)
 
     for block in range(start, stop):
@@ -214,10 +242,9 @@ def integrate(
             voxel_z[n] = z
         for n in range(512):
             p = np.uintp(pixel[n])
-            seen[n] = depth[p]
-            seen_near[n] = near[p]
+            seen[n] = readings[p, 0]
+            seen_near[n] = readings[p, 1]
             seen_color[n] = colors[p]
-            seen_weight[n] = np.float32(weights[p])
         first = np.int64(slot) * 512
         surface = np.int32(0)
         known = np.int32(0)
@@ -236,7 +263,8 @@ def integrate(
             dn_sigma = noise * (base + scale * dn * dn)
             empty = observed & (dn > zero) & (dn - voxel_z[n] > min(max(front, dn_sigma), limit))
             holds = (old_weight > zero) & (old_sdf < tau * np.float32(0.9))
-            gain = seen_weight[n]
+            c = seen_color[n]
+            gain = np.float32(c & 0xFF)
             gain = gain * carve_rate if empty & holds else gain
             gain = gain if banded | empty else zero
             value = min(s, tau)
@@ -247,13 +275,12 @@ def integrate(
             q = np.floor(new_sdf * by_unit + half)
             # colour belongs to the surface: emptiness does not repaint it
             paint = gain / max(total, one) if banded else zero
-            c = seen_color[n]
             r0, g0, b0 = (
                 np.float32((old_color >> 20) & 0x3FF),
                 np.float32((old_color >> 10) & 0x3FF),
                 np.float32(old_color & 0x3FF),
             )
-            r1, g1, b1 = np.float32((c >> 20) & 0x3FF), np.float32((c >> 10) & 0x3FF), np.float32(c & 0x3FF)
+            r1, g1, b1 = np.float32((c >> 22) & 0x3FC), np.float32((c >> 14) & 0x3FC), np.float32((c >> 6) & 0x3FC)
             r1, g1, b1 = r0 + (r1 - r0) * paint, g0 + (g1 - g0) * paint, b0 + (b1 - b0) * paint
             new_color = (
                 (np.int32(r1 + half) << np.int32(20)) | (np.int32(g1 + half) << np.int32(10)) | np.int32(b1 + half)

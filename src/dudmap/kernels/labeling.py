@@ -101,18 +101,37 @@ def upsample(row_start, row_stop, low, low_depth, depth, stride, out):
         out: (H, W) uint8 out.
     """
     h, w = low.shape
+    width = depth.shape[1]
+    zero, mismatch = np.float32(0), np.float32(1e6)
+    # depth and label of the four low-size pixels whose centres surround each pixel, from above left to below right
+    around, marks = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
+    last = np.int64(-(2**31))
+    marked = False
     for v in range(row_start, row_stop):
-        for u in range(depth.shape[1]):
-            # the 2x2 low-size pixels whose centres surround this pixel
-            y = (2 * v + 1 - stride) // (2 * stride)
-            x = (2 * u + 1 - stride) // (2 * stride)
-            z = depth[v, u]
-            best, label = np.float32(np.inf), np.uint8(0)
+        y = (2 * v + 1 - stride) // (2 * stride)
+        if y != last:
+            last = y
+            upper, lower = min(max(y, 0), h - 1), min(max(y + 1, 0), h - 1)
+            marked = low[upper].any() or low[lower].any()
+            for u in range(width if marked else 0):
+                x = (2 * u + 1 - stride) // (2 * stride)
+                left, right = min(max(x, 0), w - 1), min(max(x + 1, 0), w - 1)
+                around[0, u], marks[0, u] = low_depth[upper, left], np.float32(low[upper, left])
+                around[1, u], marks[1, u] = low_depth[upper, right], np.float32(low[upper, right])
+                around[2, u], marks[2, u] = low_depth[lower, left], np.float32(low[lower, left])
+                around[3, u], marks[3, u] = low_depth[lower, right], np.float32(low[lower, right])
+        target = out[v]
+        if not marked:
+            target[:] = 0
+            continue
+        row = depth[v]
+        for u in range(width):
+            z = row[u]
+            best, label = np.float32(1e9), zero
             for k in range(4):
-                vn = min(max(y + (k >> 1), 0), h - 1)
-                un = min(max(x + (k & 1), 0), w - 1)
-                zn = low_depth[vn, un]
-                gap = abs(zn - z) if z > 0 and zn > 0 else np.float32(100) if (z > 0) != (zn > 0) else np.float32(0)
-                if gap < best or (gap == best and low[vn, un] > label):
-                    best, label = gap, low[vn, un]
-            out[v, u] = label
+                zn, candidate = around[k, u], marks[k, u]
+                gap = abs(zn - z) if (z > zero) == (zn > zero) else mismatch
+                better = (gap < best) | ((gap == best) & (candidate > label))
+                best = gap if better else best
+                label = candidate if better else label
+            target[u] = np.uint8(label)

@@ -28,7 +28,7 @@ def num_threads() -> int:
 
 @cache
 def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(num_threads(), thread_name_prefix="dudmap")
+    return ThreadPoolExecutor(max(1, num_threads() - 1), thread_name_prefix="dudmap")
 
 
 def bands(n: int, size: int) -> list[tuple[int, int]]:
@@ -39,6 +39,22 @@ def bands(n: int, size: int) -> list[tuple[int, int]]:
 def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *each: Sequence[Any]) -> list[Any]:
     """Results, in order, of ``function(start, stop, *items)`` over all ranges; ``each`` holds one item per range."""
     calls = list(zip(ranges, *each, strict=True))
-    if len(calls) == 1 or num_threads() == 1:
+    threads = min(num_threads(), len(calls))
+    if threads <= 1:
         return [function(*range_, *items) for range_, *items in calls]
-    return list(_pool().map(lambda call: function(*call[0], *call[1:]), calls))
+    results: list[Any] = [None] * len(calls)
+    order = iter(range(len(calls)))  # taken from by all threads: one Python call each, so none is given out twice
+
+    def work() -> None:
+        for n in order:
+            range_, *items = calls[n]
+            results[n] = function(*range_, *items)
+
+    # the calling thread works too: the pool is woken once per thread, not once per band
+    others = [_pool().submit(work) for _ in range(threads - 1)]
+    try:
+        work()
+    finally:
+        for other in others:
+            other.result()
+    return results
