@@ -12,7 +12,7 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
-from dudmap.kernels import hashing, integration, meshing, raycasting
+from dudmap.kernels import hashing, integration, meshing, raycasting, sampling, visibility
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 
@@ -250,7 +250,7 @@ class TsdfVolume:
         ranges = bands(depth.shape[0] // 2, 30)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
-            lambda start, stop, out: integration.mark_blocks(
+            lambda start, stop, out: visibility.mark_blocks(
                 2 * start, 2 * stop, 2, depth, self._intrinsics(), T, self._shape,
                 self._window, self._frame_number, self._stamps, self.noise_band(), out,
             ),
@@ -311,9 +311,9 @@ class TsdfVolume:
         return slots
 
     def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-        shape = tuple(-(-n // integration.TILE) for n in depth.shape)
+        shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
         tiles = tuple(np.empty(shape, dtype=np.float32) for _ in range(3))
-        integration.tile_ranges(depth, *tiles)
+        visibility.tile_ranges(depth, *tiles)
         return tiles
 
     def _fuse(
@@ -327,7 +327,7 @@ class TsdfVolume:
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
         visible = np.empty(len(self._near), dtype=np.int32)
-        count = integration.visible_slots(
+        count = visibility.visible_slots(
             self._near, self._slot_coords, T_camera_world, self._intrinsics(), size, np.float32(self.block_size),
             nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
         )  # fmt: skip
@@ -408,7 +408,7 @@ class TsdfVolume:
         ranges = bands(int(self._shape[0]) // 2, 8)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
-            lambda start, stop, out: integration.observe_free(
+            lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
                 self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
                 np.float32(self.depth_max), out,
@@ -439,7 +439,7 @@ class TsdfVolume:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
         T = self.lattice(T_world_camera)
         run_bands(
-            lambda start, stop: integration.sample_map(
+            lambda start, stop: sampling.sample_map(
                 start, stop, depth, intensity, intrinsics, T, window, cells, geometry,
                 np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
             ),
