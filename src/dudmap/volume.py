@@ -1,5 +1,6 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +17,7 @@ from dudmap.kernels import hashing, integration, meshing, raycasting, sampling, 
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 
+_BIRTHS = itertools.count()
 BLOCK = 8
 """Voxels along the edge of a block."""
 FULLEST = 0.8
@@ -71,6 +73,9 @@ class TsdfVolume:
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
 
+    Attributes:
+        born: Number of this map among all of the program; another one after the map was made anew.
+
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
@@ -121,6 +126,7 @@ class TsdfVolume:
         self._unused: list[int] = []
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
+        self.born = next(_BIRTHS)
         self._packed: tuple[NDArray[np.float32], NDArray[np.int32]] | None = None
 
     @property
