@@ -139,17 +139,31 @@ def speed(
     long: Annotated[
         bool, typer.Option("--long", help="Also walk through new space for 2000 frames: does the time grow?")
     ] = False,
+    open3d: Annotated[
+        Path | None,
+        typer.Option(
+            "--open3d", metavar="PYTHON", help="A Python that has open3d, to time its dense SLAM beside ours."
+        ),
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording for that comparison; default: a synthetic room.")
+    ] = None,
     quick: QuickOption = False,
 ) -> None:
     """Measure time and memory on this machine; leave it alone meanwhile."""
     import json
 
     from dudmap.benchmark import speed as timing
+    from dudmap.benchmark.interleaved import find_open3d
     from dudmap.metrics import machine, versions
 
     frames, long_frames = (20, 60) if quick else (120, 2000)
     figures = timing.speed_figures(
-        frames, long_frames if long else 0, lambda what: typer.echo(f"measuring {what}", err=True)
+        frames,
+        long_frames if long else 0,
+        lambda what: typer.echo(f"measuring {what}", err=True),
+        find_open3d(open3d),
+        recording,
     )
     text = timing.markdown(figures)
     out.mkdir(parents=True, exist_ok=True)
