@@ -87,6 +87,7 @@ def run(
     *,
     max_frames: int | None = None,
     save_masks: bool = False,
+    save_map: bool = True,
     masks: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
@@ -108,6 +109,7 @@ def run(
         out: The run folder; made if needed.
         max_frames: Stop after this many frames.
         save_masks: Write the dynamic mask of every frame.
+        save_map: Write map.npz.
         masks: Folder of masks from outside, <timestamp>.png with 255 = moves; they are added to what is found. Frames
             without one are counted.
         progress: Show a progress bar on a terminal.
@@ -155,7 +157,7 @@ def run(
             raise
         finally:
             display.working("writing")
-            report = _write(out, slam, record, sequence, config, stopped)
+            report = _write(out, slam, record, sequence, config, stopped, save_map=save_map)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -289,7 +291,16 @@ def _prepare(out: Path, *, save_masks: bool) -> None:
         raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
 
 
-def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", config: Config, stopped: str) -> RunReport:
+def _write(
+    out: Path,
+    slam: "Slam",
+    record: RunRecord,
+    sequence: "Sequence",
+    config: Config,
+    stopped: str,
+    *,
+    save_map: bool,
+) -> RunReport:
     """Write all files of the run folder; one that fails does not keep the others from being written.
 
     Raises:
@@ -324,7 +335,9 @@ def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", con
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))
     if not slam.volume.is_empty:
-        steps += [lambda: slam.volume.save(out / "map.npz"), save_mesh]
+        steps.append(save_mesh)
+        if save_map:
+            steps.append(lambda: slam.volume.save(out / "map.npz"))
     problems = []
     try:
         for step in steps:
