@@ -31,6 +31,11 @@ FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
     "residuals.npz", "movers.jsonl",
 )  # fmt: skip
+SCORES = (
+    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
+    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+)  # fmt: skip
+"""What `dudmap evaluate` writes beside a run; it would not belong to the next one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +139,7 @@ def run(
     known = None if masks is None else _open_masks(masks, sequence)
     slam = Slam(sequence.camera, config)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
-    _prepare(out, save_masks=save_masks)
+    _prepare(out, masks, save_masks=save_masks)
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:
@@ -270,18 +275,22 @@ def _save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
 
 
-def _prepare(out: Path, *, save_masks: bool) -> None:
-    """Make the run folder, prove that it can be written, and remove an earlier run's results.
+def _prepare(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
+    """Make the run folder, prove that it can be written, and remove an earlier run's results and their scores.
 
     Raises:
-        DudmapError: It cannot be made or written.
+        DudmapError: It cannot be made or written, or what is to be removed is a recording or the masks to be read.
     """
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+        raise DudmapError(f"{out} holds a recording, whose truth and masks a run would overwrite; name another folder")
+    if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
+        raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".dudmap-probe"
         probe.write_bytes(b"")
         probe.unlink()
-        for name in FILES:
+        for name in FILES + SCORES:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
