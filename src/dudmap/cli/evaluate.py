@@ -39,7 +39,7 @@ app = typer.Typer(
 )
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
-PlotsOption = Annotated[bool, typer.Option("--plots", help="Also draw PNG pictures, into the same folder as the figures.")]
+PlotsOption = Annotated[bool, typer.Option("--plots", help="Also draw PNG pictures, into the folder of the figures.")]
 OutOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the JSON file and the pictures; default: beside what is scored."),
