@@ -163,6 +163,9 @@ class DynamicsConfig(Part):
     """Decide per depth-connected region, not per pixel (EM only)."""
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; the nearest halving of the camera's image is taken."""
+    threshold: float = Field(default=0.07, gt=0)
+    """Distance to the map from which on the threshold rule calls a reading moving, metres (10 cm / sqrt 2 in the
+    ancestor's published code); with a stored band narrower than that, the rim of the band."""
     noise_threshold: float = Field(default=0.03, gt=0)
     """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)

@@ -109,6 +109,7 @@ def limits(
     """Find how much may move, how fast and from when on, before tracking and mapping break down.
 
     Writes heat maps (PNG) of ATE, mask IoU, ghost area and the share of frames lost, and limits.md, .csv and .json.
+    What the same code has measured before into the same folder is not measured again: a run that was stopped goes on.
     """
     from dudmap.benchmark import limits as sweeping
     from dudmap.benchmark.heatmaps import limits_table, save_heat_maps
@@ -118,10 +119,9 @@ def limits(
 
     wanted = find_systems(systems)
     sweeps = sweeping.QUICK_SWEEPS if quick else sweeping.SWEEPS
-    cells = sweeping.conditions(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
-    out.mkdir(parents=True, exist_ok=True)
-    with typer.progressbar(length=len(cells), label="conditions") as bar:
-        rows = sweeping.measure_conditions(cells, wanted, jobs, lambda condition: bar.update(1))
+    cells = sweeping.grid_cells(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
+    with typer.progressbar(length=len({cell.condition for cell in cells}), label="conditions") as bar:
+        rows = sweeping.measure_cells(cells, wanted, out / "measured", jobs, bar.update)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest share of the image that may move, ATE RMSE at most 2 cm and no frame lost:\n"
