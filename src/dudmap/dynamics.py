@@ -179,9 +179,7 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     return full_size(low > 0, level.depth, depth)
 
 
-def full_size(
-    low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]
-) -> NDArray[np.bool_]:
+def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask (h, w) at the size (H, W) of a depth image: each pixel takes after the nearby one with the depth most alike."""
     out = np.empty(depth.shape, dtype=np.uint8)
     stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)

@@ -28,6 +28,8 @@ FEWEST = 30
 REACH = 0.1
 """A pixel is judged by the corners within this share of its depth, in space."""
 NEIGHBOURS = 5
+WINDOW = 11
+"""Edge of the window a corner is recognised by, pixels."""
 GUESSES = 150
 SEVERAL = 0.02
 """Share of the readings that must move for it to be more than noise."""
@@ -106,7 +108,9 @@ def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> 
     support = float(surface[error < NOISE_PX].sum())
     path = np.linalg.norm(targets - pixels, axis=1)
     moves = error > MOVES_PX + MOVES_SHARE * path
-    depth_after = after.depth[_inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])]
+    depth_after = after.depth[
+        _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
+    ]
     seen = depth_after > 0
     points_after = _points(after.camera, targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
     return DominantMotion(
@@ -130,13 +134,20 @@ def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[n
     place = tiles.argmax(axis=1)
     rows = np.arange(height * width) // width * cell + place // cell
     columns = np.arange(height * width) % width * cell + place % cell
-    useful = (tiles.max(axis=1) > 1e-4) & (before.depth[rows, columns] > 0)
+    # a window that also shows something nearer follows that, not the surface behind
+    z = before.depth[rows, columns]
+    nearest = cv2.erode(
+        np.where(before.depth > 0, before.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8)
+    )
+    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
     pixels = np.stack([columns, rows], axis=1)[useful]
     if len(pixels) == 0:
         return pixels, np.empty((0, 2))
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(11, 11), maxLevel=3)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there.copy(), winSize=(11, 11), maxLevel=3)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
+    )
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
     return pixels[good], there[good, 0].astype(np.float64)
 
