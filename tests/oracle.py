@@ -5,13 +5,26 @@ import numpy as np
 from dudmap.camera import Camera
 
 
-def fuse(frames, T_camera_world_of, camera: Camera, points, truncation, behind, max_weight):
-    """Running average (eq. 4.18-4.23) of projective distances at world points (N, 3), constant weight, no carving.
+def fuse(
+    frames, T_camera_world_of, camera: Camera, points, truncation, behind, max_weight,
+    sigma=lambda z: 0.0, weights_of=None,
+):  # fmt: skip
+    """Running average (eq. 4.18-4.23) of projective distances at world points (N, 3), no faster carving.
 
-    Returns distance (N,) with NaN where never seen, weight (N,), colour (N, 3) float.
+    Args:
+        frames, T_camera_world_of: Depth and colour, and the pose of each.
+        camera: Of the frames.
+        points: (N, 3).
+        truncation, behind, max_weight: Band in front of and behind the surface, metres, and cap of the weight.
+        sigma: Least width of the band around a reading of depth z, metres.
+        weights_of: Weight (H, W) of the readings of each frame; 1 if None.
+
+    Returns:
+        Distance (N,) with NaN where never seen, weight (N,), colour (N, 3) float.
     """
     distance, weight, color = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
-    for frame, T in zip(frames, T_camera_world_of, strict=True):
+    weights_of = [np.ones(camera.shape)] * len(frames) if weights_of is None else weights_of
+    for frame, T, gains in zip(frames, T_camera_world_of, weights_of, strict=True):
         p = points @ T[:3, :3].T + T[:3, 3]
         for n, (x, y, z) in enumerate(p):
             if z <= 0.05:
@@ -20,20 +33,21 @@ def fuse(frames, T_camera_world_of, camera: Camera, points, truncation, behind, 
             v = int(np.floor(y / z * camera.fy + camera.cy + 0.5))
             if not (0 <= u < camera.width and 0 <= v < camera.height) or frame.depth[v, u] <= 0:
                 continue
-            s = frame.depth[v, u] - z
-            if s < -behind:
+            d = frame.depth[v, u]
+            s, band = d - z, max(truncation, sigma(d))
+            if s < -max(behind, sigma(d)):
                 continue
-            if s >= truncation:  # seen empty: the voxel is free, its colour stays
+            share = gains[v, u] / (weight[n] + gains[v, u])
+            if s >= band:  # seen empty: the voxel is free, its colour stays
                 near = frame.depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
-                if near[near > 0].min() - z <= truncation:
+                nearest = near[near > 0].min()
+                if nearest - z <= max(truncation, sigma(nearest)):
                     continue
-                s = truncation
-                paint = 0.0
+                s = band
             else:
-                paint = 1.0 / (weight[n] + 1)
-            color[n] += (frame.color[v, u] - color[n]) * paint
-            distance[n] = (distance[n] * weight[n] + s) / (weight[n] + 1)
-            weight[n] = min(weight[n] + 1, max_weight)
+                color[n] += (frame.color[v, u] - color[n]) * share
+            distance[n] += (s - distance[n]) * share
+            weight[n] = min(weight[n] + gains[v, u], max_weight)
     return np.where(weight > 0, distance, np.nan), weight, color
 
 

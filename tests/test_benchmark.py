@@ -179,17 +179,36 @@ def test_heat_maps_show_every_cell(rows, tmp_path):
 
 
 def test_the_grids_hold_what_is_asked_for():
-    cells = limits.conditions(limits.SWEEPS, 120)
+    cells = limits.grid_cells(limits.SWEEPS, 120)
     assert len(set(cells)) == len(cells)
-    speeds = {cell.speed for cell in cells if cell.sweep == "speed"}
+    speeds = {cell.condition.speed for cell in cells if cell.sweep == "speed"}
     assert min(speeds) <= 0.02
     assert max(speeds) >= 3
-    assert {0.0, 0.9} <= {cell.coverage for cell in cells if cell.sweep == "speed"}
-    assert {cell.camera_path for cell in cells if cell.sweep == "camera"} >= {"still", "fast"}
+    assert {0.0, 0.9} <= {cell.condition.coverage for cell in cells if cell.sweep == "speed"}
+    assert {cell.condition.camera_path for cell in cells if cell.sweep == "camera"} >= {"still", "fast"}
+    assert {cell.condition.start_share for cell in cells if cell.sweep == "start"} >= {0.25, 1.0}
+    nobody = {cell.condition for cell in cells if cell.sweep == "speed" and not cell.condition.coverage}
+    assert len(nobody) == 1
+
+
+def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
+    sweep = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.0,))
+    cells = limits.grid_cells((sweep,), 6)
+    wanted = systems("none")
+    first = limits.measure_cells(cells, wanted, tmp_path, 1)
+    assert [row["x"] for row in first] == [0.1, 1.0]
+    assert first[0]["copes"]
+    assert first[0]["ate_rmse_m"] == first[1]["ate_rmse_m"]
+    assert len(list(tmp_path.iterdir())) == 1
+    monkeypatch.setattr(limits, "in_own_process", lambda *_: pytest.fail("measured again"))
+    assert limits.measure_cells(cells, wanted, tmp_path, 1) == first
+    monkeypatch.setattr(limits, "in_own_process", lambda *_: {"error": "the process died"})
+    other = limits.measure_cells(cells, systems("em"), tmp_path, 2)
+    assert [row["error"] for row in other] == ["the process died"] * 2
 
 
 def test_people_who_leave_are_gone_afterwards():
-    sequence = limits.Condition("start", 0.5, 0.3, start_share=0.5, frames=6).sequence()
+    sequence = limits.Condition(0.3, start_share=0.5, frames=6).sequence()
     assert len(sequence) == 6
     assert sequence.mask(2).mean() > 0.05
     assert not sequence.mask(3).any()

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap import synthetic
+from dudmap.benchmark.systems import systems
 from dudmap.camera import Camera
 from dudmap.config import Config
 from dudmap.dynamics import BINS, LARGEST, Mixture, fit_mixture
@@ -119,7 +120,15 @@ def test_a_walking_person_is_labelled_as_a_whole(recording):
     assert overlap(recording) > 0.7
 
 
+def test_the_threshold_rule_leaves_an_empty_room_alone():
+    sequence = synthetic.sequence("room", movers=(), frames=20, camera=SMALL)
+    slam = Slam(sequence.camera, systems("threshold")["threshold"])
+    results = [slam.process(sequence[index]) for index in range(20)]
+    assert all(result.state == "tracked" for result in results)
+    assert max(result.dynamic_share for result in results) < 0.05
+
+
 def test_every_method_runs_and_none_labels_nothing(recording):
-    assert overlap(recording, "dynamics.method=threshold") > 0.1
+    assert overlap(recording, "dynamics.method=threshold", "dynamics.threshold=0.028") > 0.1
     assert overlap(recording, "dynamics.free_space=false", "dynamics.regions=false") > 0.05
     assert overlap(recording, "dynamics.method=none") == 0.0

@@ -120,3 +120,18 @@ def test_a_loaded_map_is_meshed_whole(volume, tmp_path):
     live._volume.integrate(wall(1.4), turned(60))
     live.update()
     assert_equal(live, live._volume)
+
+
+def test_a_map_made_anew_is_meshed_anew(volume):
+    live = LiveMesh(volume)
+    for angle in (0, 60):
+        volume.integrate(wall(1.5), turned(angle))
+    live.update()
+    before = set(live.chunks)
+    volume.__init__(CAMERA, CONFIG, depth_max=4.0)
+    assert set(live.update()) >= before
+    assert not live.chunks
+    for angle in (-60, -60, -60):
+        volume.integrate(wall(1.5), turned(angle))
+    live.update()
+    assert_equal(live, volume)

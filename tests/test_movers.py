@@ -100,6 +100,26 @@ def test_two_bodies_keep_their_numbers():
         assert left.id == first
 
 
+def test_bodies_that_touch_stay_two():
+    """Two boards meet at one depth, hang together for a while, and part again; each pixel stays with its board."""
+    tracker = MoverTracker(MoversConfig())
+    touched = 0
+    for i in range(90):
+        way = 0.7 * np.cos(2 * np.pi * i / 89)  # apart, together, apart
+        x = 0.26 + max(way, 0.0)
+        (left, a), (right, b) = board(-x, z=2.0), board(x - 0.02, z=2.01)
+        mask, level = joined((left, a), (right, b))
+        movers = tracker.update(i / 30, mask, level, np.eye(4))
+        touched += bool((left[:, :-1] & right[:, 1:]).any())
+        assert [mover.id for mover in movers] == [1, 2]
+        if i == 0:
+            first = min(movers, key=lambda mover: mover.centroid[0]).id
+        mover = next(mover for mover in movers if mover.id == first)
+        assert (mover.mask & right).sum() < 0.15 * mask.sum()
+        assert (mover.mask & left).sum() > 0.7 * left.sum()
+    assert touched > 10
+
+
 def test_a_body_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
     tracker = MoverTracker(MoversConfig(memory=0.5))
     mask, level = board(0.0)

@@ -235,9 +235,27 @@ def test_an_earlier_run_leaves_no_trace_in_the_folder(slam, recording, tmp_path)
     out = tmp_path / "out"
     go(recording, out, save_masks=True)
     (out / "notes.txt").write_text("mine")
+    for score in ("evaluation.json", "masks.evaluation.json", "mesh_error.ply", "error.png"):
+        (out / score).write_text("of the earlier run")
     go(recording, out, max_frames=2, save_masks=True)
     assert len(list((out / "masks").iterdir())) == 2
     assert (out / "notes.txt").exists()
+    assert not list(out.glob("*evaluation.json"))
+    assert not list(out.glob("*error.p*"))
+
+
+def test_neither_the_recording_nor_the_masks_given_are_overwritten(slam, recording, tmp_path):
+    folder = write_recording(tmp_path / "recording", 3)
+    (folder / "masks").mkdir()
+    (folder / "masks" / "0.png").write_bytes(b"truth")
+    with pytest.raises(DudmapError, match="holds a recording"):
+        go(recording, folder)
+    assert (folder / "masks" / "0.png").exists()
+    out = tmp_path / "out"
+    go(recording, out, save_masks=True)
+    with pytest.raises(DudmapError, match="lie in the run folder"):
+        go(recording, out, masks=out / "masks")
+    assert list((out / "masks").iterdir())
 
 
 def test_a_folder_that_cannot_be_written_is_found_before_the_work(slam, recording, tmp_path):

@@ -163,12 +163,18 @@ class DynamicsConfig(Part):
     """Decide per depth-connected region, not per pixel (EM only)."""
     width: int = Field(default=160, ge=40, le=1280)
     """Width of the label image, pixels; the nearest halving of the camera's image is taken."""
+    threshold: float = Field(default=0.07, gt=0)
+    """Distance to the map from which on the threshold rule calls a reading moving, metres (10 cm / sqrt 2 in the
+    ancestor's published code); with a stored band narrower than that, the rim of the band."""
     noise_threshold: float = Field(default=0.03, gt=0)
     """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
     """The same in standard deviations of the reading; the larger of both counts."""
     max_share: float = Field(default=0.9, gt=0, le=1)
     """A frame of whose readings more than this share seems to move is not believed, but reported as lost."""
+    start_seconds: float = Field(default=1.0, ge=0)
+    """Time from the first frame on in which movers are also found from image to image (parallax), since the map does
+    not know free space yet; prolonged while that finds what the map does not. 0 turns it off. EM only."""
     margin_px: int = Field(default=5, ge=0, le=50)
     """Pixels around a moving region that are not fused either."""
 

@@ -102,14 +102,14 @@ class DynamicDetector:
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
         histogram, edges = np.histogram(np.minimum(counted, LARGEST - 1e-3), bins=BINS, range=(0, LARGEST))
+        noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
         if self.config.method == "threshold":
-            dynamic = self._threshold_and_flood(volume, level, sample)
+            dynamic = self._threshold_and_flood(volume, level, sample, noise)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, edges)
         evidence = np.zeros(level.depth.shape, dtype=np.float32)
         near = sample.place == SURFACE
         evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
-        noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
         fits = near & (np.abs(sample.distance) < noise)  # eq. 4.57: below the noise nothing is called motion
         evidence[fits] = np.maximum(evidence[fits], 1)
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
@@ -143,17 +143,23 @@ class DynamicDetector:
         whole[0] = some[0] = False
         return whole[labels] | (some[labels] & seeds)
 
-    def _threshold_and_flood(self, volume: TsdfVolume, level: Level, sample: MapSample) -> NDArray[np.bool_]:
-        """The simple rule: far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019)."""
+    def _threshold_and_flood(
+        self, volume: TsdfVolume, level: Level, sample: MapSample, noise: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """The simple rule: far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019).
+
+        The flood stops at what fits the map: over depth alone it runs from a foot over the floor through the room.
+        """
         import cv2
 
-        marked = (np.abs(np.nan_to_num(sample.distance)) > volume.truncation / np.sqrt(2)) | (sample.place == FREE)
+        distance = np.abs(np.nan_to_num(sample.distance))
+        free = sample.place == FREE
+        marked = (distance > min(self.config.threshold, 0.95 * volume.truncation)) | free
         scale = level.camera.width / 640
         core = cv2.erode(marked.astype(np.uint8), _ellipse(15 * scale)) > 0
         labels = np.empty(marked.shape, dtype=np.int32)
-        everywhere = np.ones_like(marked)
         tolerance = np.float32(0.007 / scale) * level.depth
-        labeling.grow(core & (level.depth > 0), everywhere, level.depth, tolerance, labels)
+        labeling.grow(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance, labels)
         return cv2.dilate((labels > 0).astype(np.uint8), _ellipse(10 * scale)) > 0
 
 
@@ -168,12 +174,17 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     """Moving pixels (H, W) bool at full size; holes in the depth inside a moving region belong to it."""
     import cv2
 
-    stride = depth.shape[1] // level.depth.shape[1]
     low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, _ellipse(2))
     low[(level.depth > 0) & ~labels.dynamic] = 0
+    return full_size(low > 0, level.depth, depth)
+
+
+def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Mask (h, w) at the size (H, W) of a depth image: each pixel takes after the nearby one with the depth most alike."""
     out = np.empty(depth.shape, dtype=np.uint8)
+    stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)
     run_bands(
-        lambda start, stop: labeling.upsample(start, stop, low, level.depth, depth, stride, out),
+        lambda start, stop: labeling.upsample(start, stop, marks, low_depth, depth, stride, out),
         bands(depth.shape[0], 60),
     )
     return out > 0

@@ -34,6 +34,7 @@ class LiveMesh:
     def __init__(self, volume: "TsdfVolume") -> None:
         self.chunks: dict[Chunk, Mesh] = {}
         self._volume = volume
+        self._born = volume.born
         self._seen = -1
         self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
 
@@ -42,6 +43,11 @@ class LiveMesh:
 
         A chunk that is returned and is not in ``chunks`` has no surface any more.
         """
+        forgotten: list[Chunk] = []
+        if self._volume.born != self._born:  # the map was cleared: its frames count from zero again
+            forgotten = list(self.chunks)
+            self.chunks.clear()
+            self._born, self._seen, self._coords_of = self._volume.born, -1, self._coords_of[:0]
         slots, coords = self._volume.written_since(self._seen)
         self._seen = self._volume.num_integrated
         known = slots[slots < len(self._coords_of)]
@@ -53,7 +59,7 @@ class LiveMesh:
         self._coords_of[slots] = coords
         stale = _touched(changed)
         if len(stale) == 0:
-            return []
+            return forgotten
         meshes = self._extract(stale)
         keys: list[Chunk] = [(int(i), int(j), int(k)) for i, j, k in stale]
         for key, mesh in zip(keys, meshes, strict=True):
@@ -61,7 +67,7 @@ class LiveMesh:
                 self.chunks[key] = mesh
             else:
                 self.chunks.pop(key, None)
-        return keys
+        return keys + [key for key in forgotten if key not in self.chunks]
 
     def mesh(self) -> Mesh:
         """All chunks as one mesh."""

@@ -31,6 +31,11 @@ FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
     "residuals.npz", "movers.jsonl",
 )  # fmt: skip
+SCORES = (
+    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
+    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+)  # fmt: skip
+"""What `dudmap evaluate` writes beside a run; it would not belong to the next one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,6 +92,7 @@ def run(
     *,
     max_frames: int | None = None,
     save_masks: bool = False,
+    save_map: bool = True,
     masks: str | Path | None = None,
     progress: bool = True,
     ahead: int = AHEAD,
@@ -108,6 +114,7 @@ def run(
         out: The run folder; made if needed.
         max_frames: Stop after this many frames.
         save_masks: Write the dynamic mask of every frame.
+        save_map: Write map.npz.
         masks: Folder of masks from outside, <timestamp>.png with 255 = moves; they are added to what is found. Frames
             without one are counted.
         progress: Show a progress bar on a terminal.
@@ -132,7 +139,7 @@ def run(
     known = None if masks is None else _open_masks(masks, sequence)
     slam = Slam(sequence.camera, config)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
-    _prepare(out, save_masks=save_masks)
+    _prepare(out, masks, save_masks=save_masks)
     stopped = ""
     with RunProgress(count, bar=progress) as display:
         try:
@@ -155,7 +162,7 @@ def run(
             raise
         finally:
             display.working("writing")
-            report = _write(out, slam, record, sequence, config, stopped)
+            report = _write(out, slam, record, sequence, config, stopped, save_map=save_map)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -268,18 +275,22 @@ def _save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
 
 
-def _prepare(out: Path, *, save_masks: bool) -> None:
-    """Make the run folder, prove that it can be written, and remove an earlier run's results.
+def _prepare(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
+    """Make the run folder, prove that it can be written, and remove an earlier run's results and their scores.
 
     Raises:
-        DudmapError: It cannot be made or written.
+        DudmapError: It cannot be made or written, or what is to be removed is a recording or the masks to be read.
     """
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+        raise DudmapError(f"{out} holds a recording, whose truth and masks a run would overwrite; name another folder")
+    if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
+        raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".dudmap-probe"
         probe.write_bytes(b"")
         probe.unlink()
-        for name in FILES:
+        for name in FILES + SCORES:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
@@ -289,7 +300,16 @@ def _prepare(out: Path, *, save_masks: bool) -> None:
         raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
 
 
-def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", config: Config, stopped: str) -> RunReport:
+def _write(
+    out: Path,
+    slam: "Slam",
+    record: RunRecord,
+    sequence: "Sequence",
+    config: Config,
+    stopped: str,
+    *,
+    save_map: bool,
+) -> RunReport:
     """Write all files of the run folder; one that fails does not keep the others from being written.
 
     Raises:
@@ -324,7 +344,9 @@ def _write(out: Path, slam: "Slam", record: RunRecord, sequence: "Sequence", con
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))
     if not slam.volume.is_empty:
-        steps += [lambda: slam.volume.save(out / "map.npz"), save_mesh]
+        steps.append(save_mesh)
+        if save_map:
+            steps.append(lambda: slam.volume.save(out / "map.npz"))
     problems = []
     try:
         for step in steps:

@@ -12,11 +12,12 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.camera import Camera
 from dudmap.config import Config
-from dudmap.dynamics import DynamicDetector, Labels, full_mask, grown_mask
+from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
+from dudmap.parallax import Parallax
 from dudmap.preprocess import Observation, Preprocessor, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
@@ -82,6 +83,8 @@ class Slam:
         self.health = TrackingHealth()
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self.movers = MoverTracker(self.config.movers)
+        self.parallax = Parallax(self.config.dynamics.start_seconds)
+        self._first: tuple[Observation, NDArray[np.bool_]] | None = None  # until a second frame shows what moves in it
         self._poses: list[tuple[float, NDArray[np.float64]]] = []
         self._T_world_fused: NDArray[np.float64] | None = None
         self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
@@ -109,8 +112,9 @@ class Slam:
             levels = self._levels(observation)
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.volume.is_empty:
-            return self._as_recorded(self._start(frame, observation, known, clock))
-        tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), known, clock)
+            return self._as_recorded(self._start(observation, levels, known, clock))
+        T_init, known = self._expect(observation, levels, known, clock)
+        tracked, labels = self._register(levels, T_init, known, clock)
         reason = (
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
@@ -131,6 +135,7 @@ class Slam:
         self.motion.update(frame.timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
         self._moved = None if labels is None else labels.dynamic
+        self._compare_with_next(frame.timestamp, levels)
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
@@ -148,23 +153,61 @@ class Slam:
         return replace(result, dynamic_mask=self.preprocess.distorted(result.dynamic_mask))
 
     def _start(
-        self, frame: Frame, observation: Observation, known: NDArray[np.bool_] | None, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> FrameResult:
-        """The first frame with readings is the world: identity pose, everything not known to move taken as static."""
+        """The first frame with readings is the world: identity pose, what is not known to move is taken as static."""
         nothing = np.zeros(observation.depth.shape, dtype=bool) if known is None else known
         readings = np.count_nonzero(observation.depth[~nothing])
         reason = "" if readings >= 0.02 * observation.depth.size else "the depth image holds hardly any readings"
         T = np.eye(4)
         if not reason:
-            self.motion.update(frame.timestamp, T)
-            self._poses.append((frame.timestamp, T))
+            self.motion.update(observation.timestamp, T)
+            self._poses.append((observation.timestamp, T))
             self._remember(observation, T, nothing, clock)
             with clock("integrate"):
                 self._integrate(observation, T, nothing)
+            if self.config.dynamics.method == "em":
+                self.parallax.start(observation.timestamp)
+                self._first = observation, nothing
+            self._compare_with_next(observation.timestamp, levels)
         return FrameResult(
-            frame.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
+            observation.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
             nothing, _share(nothing, observation), np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
         )  # fmt: skip
+
+    def _expect(
+        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
+    ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
+        """First guess of the pose, and what is known to move: while the map is young, from the last image to this."""
+        T_init = self.motion.predict(observation.timestamp)
+        if not self.parallax.active(observation.timestamp):
+            return T_init, known
+        with clock("parallax"):
+            level, small = self._compared(levels)
+            motion = self.parallax.compare(observation.timestamp, level, small)
+            if motion is None:
+                return T_init, known
+            if self._first is not None:
+                self._start_again(*self._first, motion.moving_before, small)
+            T_init = self._poses[-1][1] @ se3.inverse(motion.T_after_before)
+            moving = full_size(motion.moving_after, small.depth, observation.depth)
+            return T_init, moving if known is None else known | moving
+
+    def _start_again(
+        self, first: Observation, known: NDArray[np.bool_], moving: NDArray[np.bool_], level: Level
+    ) -> None:
+        """Make the map of the first frame anew without what the second shows to move in it."""
+        self._first = None
+        small = pyramid(first, self._level(self.config.dynamics.width))[0]
+        if np.count_nonzero(moving) > 0:
+            self.volume.clear()
+            self._integrate(first, np.eye(4), known | full_size(moving, small, first.depth))
+
+    def _compared(self, levels: dict[int, Level]) -> tuple[Level, Level]:
+        return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
+
+    def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
+        self.parallax.remember(timestamp, *self._compared(levels))
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"

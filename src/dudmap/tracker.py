@@ -148,7 +148,9 @@ class Tracker:
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
             T_trial = moved(T, step)
-            if np.linalg.norm(step) < self.config.stop:  # the step is known to be small before it is tried: take it and be done
+            if (
+                np.linalg.norm(step) < self.config.stop
+            ):  # the step is known to be small before it is tried: take it and be done
                 T = T_trial
                 break
             trial = self.linearize(volume, level, T_trial, weights)

@@ -1,5 +1,6 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,14 +13,15 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
-from dudmap.kernels import hashing, integration, meshing, raycasting
+from dudmap.kernels import hashing, integration, meshing, raycasting, sampling, visibility
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 
+_BIRTHS = itertools.count()
 BLOCK = 8
 """Voxels along the edge of a block."""
-FULLEST = 0.7
-"""Largest share of the hash table that may be taken: 13 ns per insertion, 5 ns at half of that."""
+FULLEST = 0.8
+"""Largest share of the hash table that may be taken: 16 ns per insertion then, 9 ns after it has grown."""
 FORMAT = "dudmap map 1"
 STEEPEST = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
@@ -71,6 +73,9 @@ class TsdfVolume:
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
 
+    Attributes:
+        born: Number of this map among all of the program; another one after the map was made anew.
+
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
@@ -121,6 +126,7 @@ class TsdfVolume:
         self._unused: list[int] = []
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
+        self.born = next(_BIRTHS)
         self._packed: tuple[NDArray[np.float32], NDArray[np.int32]] | None = None
 
     @property
@@ -150,6 +156,12 @@ class TsdfVolume:
         entries = sum(_row_bytes(array) for array in (self._coords, self._slot_of, self._free_count))
         slots += _row_bytes(self._written)
         return self._num_slots * slots + self._num_entries * entries + self._table.nbytes
+
+    @property
+    def entry_bytes(self) -> float:
+        """Memory that knowing a block costs without voxels, such as free space: its entry and its share of the hash."""
+        entries = sum(_row_bytes(array) for array in (self._coords, self._slot_of, self._free_count))
+        return entries + self._table.nbytes / max(self._num_entries, 1)
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
@@ -226,6 +238,10 @@ class TsdfVolume:
         if self.config.carving:
             self._observe_free(T_camera_world, tiles, count)
 
+    def clear(self) -> None:
+        """Forget everything."""
+        self.__init__(self.camera, self.config, self.sensor, self.depth_max)
+
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
@@ -249,7 +265,7 @@ class TsdfVolume:
         ranges = bands(depth.shape[0] // 2, 30)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
-            lambda start, stop, out: integration.mark_blocks(
+            lambda start, stop, out: visibility.mark_blocks(
                 2 * start, 2 * stop, 2, depth, self._intrinsics(), T, self._shape,
                 self._window, self._frame_number, self._stamps, self.noise_band(), out,
             ),
@@ -279,14 +295,14 @@ class TsdfVolume:
                 f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
                 f"{self.voxel_size} m it cannot be larger: set volume.voxel_size to a larger value"
             )
-        needed = self._num_entries + len(cells)
+        needed = self._num_entries + int(np.count_nonzero(self._window[cells] == -1))
         if needed > len(self._coords):
             capacity = max(needed, 2 * len(self._coords))
             self._coords = _grown(self._coords, capacity, 0)
             self._slot_of = _grown(self._slot_of, capacity, -1)
             self._free_count = _grown(self._free_count, capacity, 0)
         if needed > FULLEST * len(self._table):
-            size = 1 << int(2 * needed - 1).bit_length()  # a full table would be searched for ever
+            size = max(int(needed / FULLEST), len(self._table)) * 3 // 2  # a full table would be searched for ever
             self._table = np.full(size, hashing.EMPTY, dtype=np.int32)
             hashing.rebuild(self._table, self._coords, self._num_entries)
         entries, self._num_entries = hashing.insert_all(
@@ -310,9 +326,9 @@ class TsdfVolume:
         return slots
 
     def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-        shape = tuple(-(-n // integration.TILE) for n in depth.shape)
+        shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
         tiles = tuple(np.empty(shape, dtype=np.float32) for _ in range(3))
-        integration.tile_ranges(depth, *tiles)
+        visibility.tile_ranges(depth, *tiles)
         return tiles
 
     def _fuse(
@@ -326,7 +342,7 @@ class TsdfVolume:
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
         visible = np.empty(len(self._near), dtype=np.int32)
-        count = integration.visible_slots(
+        count = visibility.visible_slots(
             self._near, self._slot_coords, T_camera_world, self._intrinsics(), size, np.float32(self.block_size),
             nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
         )  # fmt: skip
@@ -409,7 +425,7 @@ class TsdfVolume:
         ranges = bands(int(self._shape[0]) // 2, 8)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
-            lambda start, stop, out: integration.observe_free(
+            lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
                 self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
                 np.float32(self.depth_max), out,
@@ -439,7 +455,7 @@ class TsdfVolume:
         intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
         T = self.lattice(T_world_camera)
         run_bands(
-            lambda start, stop: integration.sample_map(
+            lambda start, stop: sampling.sample_map(
                 start, stop, depth, intensity, intrinsics, T, window, cells, geometry,
                 np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
             ),
@@ -576,7 +592,7 @@ class TsdfVolume:
         colors: NDArray[np.int32],
     ) -> None:
         n, m = len(coords), len(entries)
-        self._table = np.full(max(1 << 14, 1 << (2 * n).bit_length()), hashing.EMPTY, dtype=np.int32)
+        self._table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
         self._coords, self._free_count, self._num_entries = coords.astype(np.int16), free_count.copy(), n
         hashing.rebuild(self._table, self._coords, n)
         self._geometry, self._colors, self._num_slots = geometry.copy(), colors.copy(), m

@@ -4,11 +4,14 @@ Three sweeps over synthetic worlds: mover coverage against mover speed, against 
 movers are present from the start, and against camera speed. ``docs/limits.md`` defines the figures.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import hashlib
+import json
+from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import lru_cache
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import astuple, dataclass, replace
+from functools import cache, lru_cache
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +22,8 @@ from dudmap.errors import DudmapError
 from dudmap.metrics import SCORED_COVERAGE
 
 if TYPE_CHECKING:
+    from dudmap.evaluation.surface import Surface
     from dudmap.frame import Frame
-    from dudmap.mesh import Mesh
     from dudmap.synthetic.recording import SyntheticSequence
     from dudmap.trajectory import Trajectory
 
@@ -48,27 +51,34 @@ class Sweep(NamedTuple):
     xs: tuple[float | str, ...]
     coverages: tuple[float, ...]
 
+    @property
+    def varied(self) -> str:
+        """Attribute of a condition that the horizontal axis stands for."""
+        return {"speed": "speed", "start": "start_share", "camera": "camera_path"}[self.name]
+
 
 SWEEPS = (
-    Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 3.0), (0.0, 0.3, 0.6, 0.9)),
+    Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9)),
     Sweep("start", "share of frames with movers, from the first on", (0.25, 0.5, 1.0), (0.1, 0.3, 0.5)),
-    Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.6)),
+    Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.5, 0.7)),
 )
 QUICK_SWEEPS = (
     Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.3, 0.8)),
     Sweep("start", "share of frames with movers, from the first on", (0.25, 1.0), (0.15,)),
     Sweep("camera", "camera path", ("still", "fast"), (0.4,)),
 )
-FRAMES, QUICK_FRAMES = 120, 80
+FRAMES, QUICK_FRAMES = 90, 60
+SAMPLES = 40_000
+"""Points drawn on each surface: a share of 1 % is then known to 0.05 % (standard error)."""
+PART = 6
+"""Conditions measured in one process: one that dies takes few with it."""
 
 
 @dataclass(frozen=True)
 class Condition:
-    """One cell of a grid.
+    """What the systems are put through.
 
     Attributes:
-        sweep: Name of the sweep it belongs to.
-        x: Value along the horizontal axis.
         coverage: Share of the image that the crowd hides on average once it is there.
         speed: Of the people, m/s.
         camera_path: Name of the built-in path.
@@ -76,8 +86,6 @@ class Condition:
         frames: Number of frames.
     """
 
-    sweep: str
-    x: float | str
     coverage: float
     speed: float = 1.0
     camera_path: str = HANDHELD
@@ -93,7 +101,7 @@ class Condition:
             camera_path=self.camera_path,
             frames=self.frames,
             fps=FPS,
-            speed=self.speed if self.coverage else None,
+            speed=self.speed,
             coverage=self.coverage,
             start_dynamic=self.start_share is not None,
             camera=DEFAULT_CAMERA.resized(*SIZE),
@@ -159,90 +167,127 @@ class Kept:
         return float(steps.sum() / (self.timestamps[-1] - self.timestamps[0]))
 
 
-def conditions(sweeps: tuple[Sweep, ...], frames: int) -> list[Condition]:
-    """All cells of all grids."""
+class Cell(NamedTuple):
+    """One cell of a grid: the sweep's name, its value along the horizontal axis, and the condition there."""
+
+    sweep: str
+    x: float | str
+    condition: Condition
+
+
+def grid_cells(sweeps: tuple[Sweep, ...], frames: int) -> list[Cell]:
+    """All cells of all grids; some have the same condition, as the speed of nobody is the same at any speed."""
     out = []
     for sweep in sweeps:
         for x in sweep.xs:
             for coverage in sweep.coverages:
-                key = {"speed": "speed", "start": "start_share", "camera": "camera_path"}[sweep.name]
-                varied: dict[str, Any] = {key: x}
-                out.append(Condition(sweep.name, x, coverage, frames=frames, **varied))
+                condition = Condition(coverage, frames=frames)
+                if coverage > 0 or sweep.varied != "speed":
+                    condition = replace(condition, **{sweep.varied: x})
+                out.append(Cell(sweep.name, x, condition))
     return out
 
 
-def measure_conditions(
-    cells: list[Condition],
+def measure_cells(
+    cells: list[Cell],
     systems: Mapping[str, Config],
+    kept: Path,
     workers: int,
-    done: Callable[[Condition], None] = lambda condition: None,
+    done: Callable[[int], None] = lambda count: None,
 ) -> list[Row]:
-    """One row per condition and system.
+    """One row per cell and system.
 
-    Conditions are shared out among ``workers`` processes at a time.
+    Args:
+        cells: Of the grids.
+        systems: Configurations by name.
+        kept: Folder of what has been measured: what the same code, configuration and condition gave before is not
+            measured again.
+        workers: Processes at a time.
+        done: Called with the number of conditions that are finished in addition.
     """
-    batches = [cells[start::workers] for start in range(min(workers, len(cells)))]
-    rows: dict[Condition, list[Row]] = {}
+    kept.mkdir(parents=True, exist_ok=True)
+    found = sorted({cell.condition for cell in cells}, key=lambda condition: condition.camera_path)
+    files = {(c, name): kept / f"{_fingerprint(c, config)}.json" for c in found for name, config in systems.items()}
+    wanted = [
+        (condition, {name: (systems[name], files[condition, name]) for name in missing})
+        for condition in found
+        if (missing := [name for name in systems if not files[condition, name].is_file()])
+    ]
+    done(len(found) - len(wanted))
+    errors: dict[Condition, object] = {}
 
-    def one(batch: list[Condition]) -> None:
-        for part in _parts(batch, 8):
-            answer = in_own_process(_measure_batch, (part, dict(systems)))
-            for condition in part:
-                known = {"sweep": condition.sweep, "x": condition.x, "coverage": condition.coverage}
-                failed = [{**known, "system": name, "error": answer.get("error")} for name in systems]
-                rows[condition] = answer.get(condition, failed)  # type: ignore[call-overload]
-                done(condition)
+    def one(part: list[Job]) -> None:
+        answer = in_own_process(_measure_part, part)
+        errors.update((condition, answer.get("error")) for condition, _ in part)
+        done(len(part))
 
     with ThreadPoolExecutor(workers) as pool:
-        list(pool.map(one, batches))
-    return [row for condition in cells for row in rows[condition]]
+        list(pool.map(one, [wanted[start : start + PART] for start in range(0, len(wanted), PART)]))
+    return [
+        {"sweep": cell.sweep, "x": cell.x, "coverage": cell.condition.coverage, "system": name}
+        | (json.loads(file.read_text()) if file.is_file() else {"error": errors.get(cell.condition)})
+        for cell in cells
+        for name in systems
+        for file in [files[cell.condition, name]]
+    ]
 
 
-def _parts(batch: list[Condition], size: int) -> Iterator[list[Condition]]:
-    """Pieces of a list: a process that dies takes few conditions with it."""
-    for start in range(0, len(batch), size):
-        yield batch[start : start + size]
+Job = tuple[Condition, dict[str, tuple[Config, Path]]]
+"""A condition, and the configurations that it is measured with and the files for what they gave."""
 
 
-def _measure_batch(job: tuple[list[Condition], dict[str, Config]]) -> dict[Any, list[Row]]:
-    cells, systems = job
-    return {condition: measure_condition(condition, systems) for condition in cells}
+def _fingerprint(condition: Condition, config: Config) -> str:
+    """Name for what this code measures: any change of code, configuration or condition gives another."""
+    text = f"{_code()}{astuple(condition)}{SIZE}{FPS}{LARGEST_ATE}{SAMPLES}{config.to_toml()}"
+    return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
-def measure_condition(condition: Condition, systems: Mapping[str, Config]) -> list[Row]:
-    """Every system on the same frames of one condition."""
+@cache
+def _code() -> str:
+    import dudmap
+
+    sources = sorted(Path(dudmap.__file__).parent.rglob("*.py"))
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
+
+
+def _measure_part(part: list[Job]) -> Row:
+    for condition, systems in part:
+        measure_condition(condition, systems)
+    return {}
+
+
+def measure_condition(condition: Condition, systems: Mapping[str, tuple[Config, Path]]) -> None:
+    """Every system on the same frames of one condition; the figures go into the system's file."""
     recording = Kept(condition.sequence())
     surfaces = _surfaces(condition.camera_path, condition.frames)
     known = {
-        "sweep": condition.sweep,
-        "x": condition.x,
-        "coverage": condition.coverage,
         "coverage_measured": round(recording.coverage(), 4),
         "camera_speed": round(recording.camera_speed(), 4),
     }
-    rows = []
-    for name, config in systems.items():
-        row: Row = {**known, "system": name}
+    for config, file in systems.values():
+        row: Row = dict(known)
         try:
-            row |= measure_sequence(recording, config, surfaces)
+            row |= measure_sequence(recording, config, surfaces, samples=SAMPLES)
         except DudmapError as error:
             row["error"] = str(error)
         else:
             row["lost_share"] = round(1 - row["tracked_share"], 4)
             row["copes"] = row["lost"] == 0 and row.get("ate_rmse_m") is not None and row["ate_rmse_m"] <= LARGEST_ATE
-        rows.append(row)
-    return rows
+        part = file.with_suffix(".part")
+        part.write_text(json.dumps(row), encoding="utf-8")
+        part.rename(file)
 
 
 @lru_cache(maxsize=4)
-def _surfaces(camera_path: str, frames: int) -> "tuple[Mesh, Mesh]":
+def _surfaces(camera_path: str, frames: int) -> "tuple[Surface, Surface]":
     """True surface, whole and as far as the camera would see it if nobody were there."""
+    from dudmap.evaluation.surface import Surface
     from dudmap.synthetic import sequence
     from dudmap.synthetic.recording import DEFAULT_CAMERA
 
     camera = DEFAULT_CAMERA.resized(*SIZE)
     empty = sequence(camera_path=camera_path, frames=frames, fps=FPS, coverage=0.0, camera=camera)
-    return empty.surface(), empty.surface(observed=True)
+    return Surface(empty.surface(), "the true surface"), Surface(empty.surface(observed=True), "what was seen of it")
 
 
 def limit(rows: list[Row], sweep: str, system: str, x: float | str) -> float | None:

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.benchmark.entries import Entry
+from dudmap.benchmark.score import SAMPLES, score_mesh, score_trajectory
 from dudmap.config import Config
 from dudmap.errors import DatasetError, DudmapError
 
 if TYPE_CHECKING:
+    from dudmap.evaluation.surface import Surface
     from dudmap.mesh import Mesh
     from dudmap.sequences import Sequence
 
@@ -52,9 +54,10 @@ def measure(job: Job) -> Row:
 def measure_sequence(
     sequence: "Sequence",
     config: Config,
-    surfaces: "tuple[Mesh, Mesh] | None",
+    surfaces: "tuple[Mesh | Surface, Mesh | Surface] | None",
     out: Path | None = None,
     max_frames: int | None = None,
+    samples: int = SAMPLES,
 ) -> Row:
     """Figures of one run: those of its metrics.json, and how trajectory and mesh compare with the truth.
 
@@ -64,11 +67,11 @@ def measure_sequence(
         surfaces: True static surface, whole and as far as it was seen, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
         max_frames: Use only the first frames.
+        samples: Points drawn on each surface.
 
     Raises:
         DudmapError: The recording cannot be used, or nothing could be tracked.
     """
-    from dudmap.benchmark.score import score_mesh, score_trajectory
     from dudmap.mesh import Mesh
     from dudmap.run import AHEAD, run
     from dudmap.synthetic.recording import SyntheticSequence
@@ -76,7 +79,10 @@ def measure_sequence(
     ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would take the cores from the system
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = out or Path(temporary)
-        report = run(sequence, config, folder, max_frames=max_frames, progress=False, ahead=ahead)
+        report = run(
+            sequence, config, folder,
+            max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None,
+        )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)
         truth = sequence.ground_truth
@@ -84,7 +90,7 @@ def measure_sequence(
             row |= score_trajectory(report.trajectory, truth)
         if truth is not None and surfaces is not None and report.metrics["mesh_triangles"]:
             try:
-                row |= score_mesh(Mesh.load(report.out / "mesh.ply"), report.trajectory, truth, *surfaces)
+                row |= score_mesh(Mesh.load(report.out / "mesh.ply"), report.trajectory, truth, *surfaces, samples)
             except DatasetError as error:
                 row["mesh_missing"] = str(error)
     return row

@@ -7,6 +7,7 @@ from dudmap.metrics import accuracy
 from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from dudmap.evaluation.surface import Surface
     from dudmap.mesh import Mesh
 
 COMPLETE_WITHIN = 0.02
@@ -33,7 +34,14 @@ def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
     return out
 
 
-def score_mesh(mesh: "Mesh", estimate: Trajectory, truth: Trajectory, whole: "Mesh", seen: "Mesh") -> dict[str, Any]:
+def score_mesh(
+    mesh: "Mesh",
+    estimate: Trajectory,
+    truth: Trajectory,
+    whole: "Mesh | Surface",
+    seen: "Mesh | Surface",
+    samples: int = SAMPLES,
+) -> dict[str, Any]:
     """How the mesh compares with the true static surface.
 
     The mesh is moved by the motion that brings the first estimated pose onto the true one, and not fitted: a bent or
@@ -45,6 +53,7 @@ def score_mesh(mesh: "Mesh", estimate: Trajectory, truth: Trajectory, whole: "Me
         truth: True poses.
         whole: True static surface, in the frame of ``truth``; accuracy and ghosts are measured against it.
         seen: The part of it that the camera saw; completeness is measured on it.
+        samples: Points drawn on each surface.
 
     Raises:
         DatasetError: The trajectories have fewer than three poses in common.
@@ -55,7 +64,7 @@ def score_mesh(mesh: "Mesh", estimate: Trajectory, truth: Trajectory, whole: "Me
     from dudmap.evaluation.trajectory import ate
 
     T = ate(estimate, truth, align="origin").T_reference_estimate
-    result = compare_surfaces(moved(mesh, T), whole, observed=seen, thresholds=(COMPLETE_WITHIN,), samples=SAMPLES)
+    result = compare_surfaces(moved(mesh, T), whole, observed=seen, thresholds=(COMPLETE_WITHIN,), samples=samples)
     return {
         "mesh_accuracy_m": round(result.accuracy.mean, 6),
         "mesh_completeness": round(result.scores[0].recall, 5),

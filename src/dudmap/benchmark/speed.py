@@ -20,6 +20,8 @@ from dudmap.config import Config
 from dudmap.errors import DudmapError
 
 if TYPE_CHECKING:
+    from dudmap.frame import Frame
+    from dudmap.sequences import Sequence
     from dudmap.slam import Slam
 
 WARM_UP = 10
@@ -27,22 +29,30 @@ WARM_UP = 10
 
 
 class Figure(NamedTuple):
-    """One line of the table: what was measured, in which unit, at most how much is wanted, and what came out."""
+    """One line of the table: what was measured, its unit, the largest value wanted (None = any), what came out."""
 
     what: str
     unit: str
-    target: float
+    target: float | None
     measured: float | None
     remark: str = ""
 
 
-def speed_figures(frames: int, long_frames: int = 0, say: Callable[[str], None] = lambda text: None) -> list[Figure]:
+def speed_figures(
+    frames: int,
+    long_frames: int = 0,
+    say: Callable[[str], None] = lambda text: None,
+    open3d: str | None = None,
+    recording: Path | None = None,
+) -> list[Figure]:
     """All figures, each measured in a fresh process.
 
     Args:
         frames: Length of the recordings that are timed.
         long_frames: Length of the walk through new space that shows whether time per frame grows; 0 leaves it out.
         say: Called with what is measured next.
+        open3d: A Python that has open3d, whose dense SLAM is then timed beside ours; None leaves it out.
+        recording: Recording for that; None takes a synthetic room in which nothing moves.
 
     Raises:
         DudmapError: A measurement failed.
@@ -55,10 +65,7 @@ def speed_figures(frames: int, long_frames: int = 0, say: Callable[[str], None] 
         figures.append(Figure(f"{name}, median", "ms", median, row["median"]))
         if p95 is not None:
             figures.append(Figure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
-            figures.append(Figure("map memory per occupied block", "KB", 4.2, row["bytes_per_block"] / 1000))
-            figures.append(
-                Figure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles")
-            )
+            figures += _map_figures(row)
             figures.append(Figure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
     say("one registration iteration on one thread")
     with _environment(DUDMAP_THREADS="1"):
@@ -71,6 +78,37 @@ def speed_figures(frames: int, long_frames: int = 0, say: Callable[[str], None] 
         row = _ask(_time_walk, long_frames)
         remark = f"{long_frames} frames, {row['first_ms']:.1f} to {row['last_ms']:.1f} ms"
         figures.append(Figure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
+        remark = f"{row['stale']} chunks; all of the map takes {row['mesh_ms']:.0f} ms"
+        figures.append(Figure("mesh again after one frame, end of the walk", "ms", None, row["again_ms"], remark))
+    if open3d is not None:
+        say("Open3D's dense SLAM and ours in turn")
+        figures += _open3d_figures(open3d, recording, frames)
+    return figures
+
+
+def _map_figures(row: Row) -> list[Figure]:
+    again = f"{row['stale']} chunks; all of the map takes {1000 * row['mesh_whole_s']:.0f} ms"
+    return [
+        Figure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, row["bytes_per_block"] / 1024),
+        Figure("free space, share of what its voxels would cost", "%", 1.0, 100 * row["free_share"]),
+        Figure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
+        Figure("mesh again after one frame", "ms", None, row["again_ms"], again),
+    ]
+
+
+def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[Figure]:
+    from dudmap.benchmark.interleaved import compare_with_open3d
+
+    static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
+    entry = static_room if recording is None else Entry(recording.resolve().name, recording)
+    result = compare_with_open3d(python, entry, frames)
+    name, times = f"{entry.name}, {result.frames} frames", f"{result.ours_ms:.1f} to {result.theirs_ms:.1f} ms"
+    figures = [
+        Figure("frame, over Open3D's dense SLAM", "x", 1 / 3, result.ours_ms / result.theirs_ms, f"{name}, {times}")
+    ]
+    if result.ours_ate is not None and result.theirs_ate is not None:
+        errors = f"{100 * result.ours_ate:.2f} to {100 * result.theirs_ate:.2f} cm; Open3D {result.version}"
+        figures.append(Figure("ATE, over Open3D's dense SLAM", "x", 1.0, result.ours_ate / result.theirs_ate, errors))
     return figures
 
 
@@ -79,14 +117,18 @@ def markdown(figures: list[Figure]) -> str:
     body = [
         [
             figure.what,
-            f"<= {figure.target:g} {figure.unit}",
+            "" if figure.target is None else f"<= {figure.target:.3g} {figure.unit}",
             "nothing" if figure.measured is None else f"{figure.measured:.3g} {figure.unit}",
-            "yes" if figure.measured is not None and figure.measured <= figure.target else "NO",
+            "" if figure.target is None else "yes" if _reached(figure.measured, figure.target) else "NO",
             figure.remark,
         ]
         for figure in figures
     ]
     return grid(["what", "target", "measured", "reached", "remark"], body, words=1)
+
+
+def _reached(measured: float | None, target: float) -> bool:
+    return measured is not None and measured <= target
 
 
 def _ask(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
@@ -110,11 +152,14 @@ def _environment(**variables: str) -> Iterator[None]:
                 os.environ[name] = value
 
 
-def _processed(config: Config, frames: int) -> "Iterator[tuple[Slam, float]]":
-    """The system and the milliseconds of every frame of a room with a person; rendering is not timed."""
+def _room(frames: int) -> "Sequence":
+    return Entry("room-person", parameters={"frames": frames, "start_dynamic": False}).open()
+
+
+def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
+    """The system and the milliseconds of every frame of a recording; rendering is not timed."""
     from dudmap.slam import Slam
 
-    sequence = Entry("room-person", parameters={"frames": frames, "start_dynamic": False}).open()
     slam = Slam(sequence.camera, config)
     for index in range(frames):
         frame = sequence[index]
@@ -126,18 +171,31 @@ def _processed(config: Config, frames: int) -> "Iterator[tuple[Slam, float]]":
 def _time_frames(job: tuple[float, int]) -> Row:
     """Frames, then mesh and view of the map they left; every time is the best of what a warm program gives."""
     voxel, frames = job
-    slam, times = None, []
-    for slam, ms in _processed(Config().override([f"volume.voxel_size={voxel}"]), frames):  # noqa: B007
+    slam, times, sequence = None, [], _room(frames + 1)
+    for slam, ms in _processed(Config().override([f"volume.voxel_size={voxel}"]), sequence, frames):  # noqa: B007
         times.append(ms)
     assert slam is not None
     timed = np.array(times[WARM_UP:] or times)
     row: Row = {"median": float(np.median(timed)), "p95": float(np.percentile(timed, 95))}
     row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
+    row["free_share"] = slam.volume.entry_bytes / (2 * 512 * 4)
     pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
     seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
-    row |= {"triangles": len(mesh.faces), "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
+    row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
     row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
-    return row
+    return row | _time_again(slam, sequence[frames])
+
+
+def _time_again(slam: "Slam", frame: "Frame") -> Row:
+    """Extraction of what one more frame changed in the mesh, and how many chunks that are."""
+    from dudmap.live_mesh import LiveMesh
+
+    live = LiveMesh(slam.volume)
+    live.update()
+    slam.process(frame)
+    start = time.perf_counter()
+    stale = live.update()
+    return {"again_ms": 1000 * (time.perf_counter() - start), "stale": len(stale)}
 
 
 def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
@@ -155,9 +213,9 @@ def _time_iteration(frames: int) -> Row:
     from dudmap.preprocess import pyramid
     from dudmap.tracker import Level
 
-    sequence = Entry("room-person", parameters={"frames": frames}).open()
+    sequence = _room(frames)
     slam = None
-    for slam, _ in _processed(Config(), frames):  # noqa: B007
+    for slam, _ in _processed(Config(), sequence, frames):  # noqa: B007
         pass
     assert slam is not None
     halvings = round(np.log2(slam.camera.width / 320))
@@ -172,19 +230,17 @@ def _time_iteration(frames: int) -> Row:
 def _time_walk(frames: int) -> Row:
     """Median time of the first and the last tenth of a walk through space that is always new."""
     from dudmap.benchmark.passage import passage
-    from dudmap.slam import Slam
 
-    sequence = passage(frames)
-    slam, times = Slam(sequence.camera, Config()), []
-    for index in range(frames):
-        frame = sequence[index]
-        start = time.perf_counter()
-        slam.process(frame)
-        times.append(1000 * (time.perf_counter() - start))
+    sequence, slam, times = passage(frames + 1), None, []
+    for slam, ms in _processed(Config(), sequence, frames):  # noqa: B007
+        times.append(ms)
+    assert slam is not None
     timed = times[min(60, frames // 4) :]
     tenth = max(len(timed) // 10, 1)
     first, last = statistics.median(timed[:tenth]), statistics.median(timed[-tenth:])
-    return {"first_ms": first, "last_ms": last, "growth": last / first}
+    row: Row = {"first_ms": first, "last_ms": last, "growth": last / first}
+    row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
+    return row | _time_again(slam, sequence[frames])
 
 
 FIRST_POSE = """

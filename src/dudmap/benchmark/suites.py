@@ -9,8 +9,9 @@ from dudmap.errors import ConfigError, DatasetError
 TUM = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download"
 BONN = "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/"
 ICL_NUIM = "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html"
+# These two as public code that uses the recordings names them; whether the servers still answer was not tried.
 CORBS = "http://corbs.dfki.uni-kl.de/"
-VOLUMEDEFORM = "https://www.niessnerlab.org/projects/innmann2016deform.html"
+VOLUMEDEFORM = "https://cloud9.cs.fau.de/index.php/s/46qcNZSNePHx08A"
 ICL_CAMERA = "481.2,480,319.5,239.5,640,480,5000"
 
 SUITES: dict[str, str] = {

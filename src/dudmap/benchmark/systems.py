@@ -8,12 +8,17 @@ from dudmap.errors import ConfigError
 SYSTEMS: dict[str, tuple[str, ...]] = {
     "dudmap": (),
     "thesis": ("preset=thesis",),
-    "threshold": ("dynamics.method=threshold",),
+    "threshold": (
+        "dynamics.method=threshold",
+        "volume.truncation_voxels=10",
+        "volume.truncation_behind_voxels=10",
+    ),
     "none": ("dynamics.method=none",),
     "em": ("dynamics.free_space=false", "dynamics.regions=false"),
 }
 """What each differs in from the default configuration: the default itself, the thesis' values, the threshold-and-flood
-rule of the thesis' ancestor, no dynamic handling at all, and EM on the residuals alone."""
+rule of the thesis' ancestor with its threshold of 7 cm and the band of 10 cm that this needs, no dynamic handling at
+all, and EM on the residuals alone."""
 
 
 def system(name: str) -> tuple[str, Config]:

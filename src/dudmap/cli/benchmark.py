@@ -109,6 +109,7 @@ def limits(
     """Find how much may move, how fast and from when on, before tracking and mapping break down.
 
     Writes heat maps (PNG) of ATE, mask IoU, ghost area and the share of frames lost, and limits.md, .csv and .json.
+    What the same code has measured before into the same folder is not measured again: a run that was stopped goes on.
     """
     from dudmap.benchmark import limits as sweeping
     from dudmap.benchmark.heatmaps import limits_table, save_heat_maps
@@ -118,10 +119,9 @@ def limits(
 
     wanted = find_systems(systems)
     sweeps = sweeping.QUICK_SWEEPS if quick else sweeping.SWEEPS
-    cells = sweeping.conditions(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
-    out.mkdir(parents=True, exist_ok=True)
-    with typer.progressbar(length=len(cells), label="conditions") as bar:
-        rows = sweeping.measure_conditions(cells, wanted, jobs, lambda condition: bar.update(1))
+    cells = sweeping.grid_cells(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
+    with typer.progressbar(length=len({cell.condition for cell in cells}), label="conditions") as bar:
+        rows = sweeping.measure_cells(cells, wanted, out / "measured", jobs, bar.update)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest share of the image that may move, ATE RMSE at most 2 cm and no frame lost:\n"
@@ -139,17 +139,31 @@ def speed(
     long: Annotated[
         bool, typer.Option("--long", help="Also walk through new space for 2000 frames: does the time grow?")
     ] = False,
+    open3d: Annotated[
+        Path | None,
+        typer.Option(
+            "--open3d", metavar="PYTHON", help="A Python that has open3d, to time its dense SLAM beside ours."
+        ),
+    ] = None,
+    recording: Annotated[
+        Path | None, typer.Option("--recording", help="Recording for that comparison; default: a synthetic room.")
+    ] = None,
     quick: QuickOption = False,
 ) -> None:
     """Measure time and memory on this machine; leave it alone meanwhile."""
     import json
 
     from dudmap.benchmark import speed as timing
+    from dudmap.benchmark.interleaved import find_open3d
     from dudmap.metrics import machine, versions
 
     frames, long_frames = (20, 60) if quick else (120, 2000)
     figures = timing.speed_figures(
-        frames, long_frames if long else 0, lambda what: typer.echo(f"measuring {what}", err=True)
+        frames,
+        long_frames if long else 0,
+        lambda what: typer.echo(f"measuring {what}", err=True),
+        find_open3d(open3d),
+        recording,
     )
     text = timing.markdown(figures)
     out.mkdir(parents=True, exist_ok=True)

@@ -39,7 +39,7 @@ app = typer.Typer(
 )
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
-PlotsOption = Annotated[bool, typer.Option("--plots", help="Draw PNG pictures into the output folder.")]
+PlotsOption = Annotated[bool, typer.Option("--plots", help="Also draw PNG pictures, into the folder of the figures.")]
 OutOption = Annotated[
     Path | None,
     typer.Option("--out", help="Folder for the JSON file and the pictures; default: beside what is scored."),
@@ -88,13 +88,13 @@ def trajectory(
         figures |= compare(found, true, align, max_difference)
         if plots:
             pictures = _draw_trajectory(target, found, true, align, max_difference)
-    elif plots:
-        raise DatasetError("there is nothing to draw without a reference; name one with --reference")
     if plots and folder is not None and (folder / "residuals.npz").is_file():
         from dudmap.evaluation.plots import plot_residuals
 
         plot_residuals(target / "residuals.png", folder / "residuals.npz")
         pictures.append(target / "residuals.png")
+    if plots and not pictures:
+        raise DatasetError("there is nothing to draw without a reference; name one with --reference")
     name = "evaluation.json" if folder is not None else f"{file.stem}.evaluation.json"
     _report(figures, target / name, pictures, as_json=as_json, title="trajectory")
 

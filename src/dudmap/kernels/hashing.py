@@ -1,6 +1,6 @@
 """Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
 
-Open addressing with linear probing over a power-of-two table; a cell holds an entry's number or -1. Entries are
+Open addressing with linear probing over a table of any size; a cell holds an entry's number or -1. Entries are
 never removed: a block that becomes free space keeps its entry and gives back its voxels.
 """
 
@@ -12,20 +12,21 @@ EMPTY = -1
 
 
 @kernel
-def _cell(x, y, z, mask):
-    return ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) & mask
+def _cell(x, y, z, size):
+    """First cell of block (x, y, z): the thesis' hash, mixed (Knuth's multiplicative method), scaled to the table."""
+    mixed = ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) * np.int64(-7046029254386353131)
+    return (((mixed >> 32) & 0xFFFFFFFF) * size) >> 32
 
 
 @kernel
 def find(table, coords, x, y, z):
     """Entry of block (x, y, z), or -1."""
-    mask = table.size - 1
-    cell = _cell(x, y, z, mask)
+    cell = _cell(x, y, z, table.size)
     while table[cell] != EMPTY:
         entry = table[cell]
         if coords[entry, 0] == x and coords[entry, 1] == y and coords[entry, 2] == z:
             return entry
-        cell = (cell + 1) & mask
+        cell = cell + 1 if cell + 1 < table.size else 0
     return EMPTY
 
 
@@ -44,18 +45,17 @@ def insert_all(table, coords, num_entries, wanted):
 
     ``table`` and ``coords`` must have room for all of them.
     """
-    mask = table.size - 1
     out = np.empty(len(wanted), np.int32)
     for n in range(len(wanted)):
         x, y, z = np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2])
-        cell = _cell(x, y, z, mask)
+        cell = _cell(x, y, z, table.size)
         entry = -1
         while table[cell] != EMPTY:
             other = table[cell]
             if coords[other, 0] == x and coords[other, 1] == y and coords[other, 2] == z:
                 entry = other
                 break
-            cell = (cell + 1) & mask
+            cell = cell + 1 if cell + 1 < table.size else 0
         if entry < 0:
             entry = num_entries
             num_entries += 1
@@ -68,11 +68,10 @@ def insert_all(table, coords, num_entries, wanted):
 @kernel
 def rebuild(table, coords, num_entries):
     """Fill an all-empty ``table`` with entries 0 to ``num_entries``."""
-    mask = table.size - 1
     for entry in range(num_entries):
-        cell = _cell(np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2]), mask)
+        cell = _cell(np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2]), table.size)
         while table[cell] != EMPTY:
-            cell = (cell + 1) & mask
+            cell = cell + 1 if cell + 1 < table.size else 0
         table[cell] = entry
 
 

@@ -45,7 +45,7 @@ def ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz):
 
 
 @njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
-def capsule_depth(ox, oy, oz, dx, dy, dz, radius, half):
+def capsule_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     """First hit of a capsule: all points within ``radius`` of the segment from -half to half on the z axis."""
     squared = radius * radius
     a = dx * dx + dy * dy
@@ -68,7 +68,7 @@ def capsule_depth(ox, oy, oz, dx, dy, dz, radius, half):
 
 
 @njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
-def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, half):
+def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, _, half):
     """First hit of a closed cylinder of the given radius along z, |z| <= half."""
     squared = radius * radius
     a = dx * dx + dy * dy
@@ -84,7 +84,7 @@ def cylinder_depth(ox, oy, oz, dx, dy, dz, radius, half):
 
 
 @njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
-def torus_depth(ox, oy, oz, dx, dy, dz, ring, tube):
+def torus_depth(ox, oy, oz, dx, dy, dz, ring, _, tube):
     """First hit of a torus around z by sphere tracing its distance field down to a micrometre."""
     length = np.sqrt(dx * dx + dy * dy + dz * dz)
     middle = -(ox * dx + oy * dy + oz * dz) / (length * length)
@@ -111,10 +111,23 @@ def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
     if kind == ELLIPSOID:
         return ellipsoid_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
     if kind == CAPSULE:
-        return capsule_depth(ox, oy, oz, dx, dy, dz, hx, hz)
+        return capsule_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
     if kind == CYLINDER:
-        return cylinder_depth(ox, oy, oz, dx, dy, dz, hx, hz)
-    return torus_depth(ox, oy, oz, dx, dy, dz, hx, hz)
+        return cylinder_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
+    return torus_depth(ox, oy, oz, dx, dy, dz, hx, hy, hz)
+
+
+@njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
+def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
+    """Take primitive p over in one line of a tile, from column u0 on, where it is nearer than what was found before."""
+    best, found = out
+    for k in range(best.size):
+        x = (u0 + k - cx) / fx
+        dx, dy, dz = ray[0] + step[0] * x, ray[1] + step[1] * x, ray[2] + step[2] * x
+        t = depth_of(origin[0], origin[1], origin[2], dx, dy, dz, half[0], half[1], half[2])
+        nearer = t < best[k]
+        best[k] = t if nearer else best[k]
+        found[k] = np.int16(p) if nearer else found[k]
 
 
 @njit(nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
@@ -148,45 +161,24 @@ def trace(
                     continue
                 kind = kinds[p]
                 R = rotations[p]
-                ox, oy, oz = origins[p, 0], origins[p, 1], origins[p, 2]
-                hx, hy, hz = halves[p, 0], halves[p, 1], halves[p, 2]
-                number = np.int16(p)
+                origin = (origins[p, 0], origins[p, 1], origins[p, 2])
+                half = (halves[p, 0], halves[p, 1], halves[p, 2])
                 for v in range(v0, v1):
                     y = (v - cy) / fy
-                    bx, by, bz = R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2]
+                    ray = (R[0, 1] * y + R[0, 2], R[1, 1] * y + R[1, 2], R[2, 1] * y + R[2, 2])
+                    step = (R[0, 0], R[1, 0], R[2, 0])
                     line = (v - v0) * TILE_WIDTH
+                    out = (best[line : line + count], found[line : line + count])
                     if kind == BOX:
-                        for k in range(count):
-                            x = (u0 + k - cx) / fx
-                            t = box_depth(ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz)
-                            nearer = t < best[line + k]
-                            best[line + k] = t if nearer else best[line + k]
-                            found[line + k] = number if nearer else found[line + k]
+                        trace_row(box_depth, p, u0, fx, cx, origin, ray, step, half, out)
                     elif kind == ELLIPSOID:
-                        for k in range(count):
-                            x = (u0 + k - cx) / fx
-                            t = ellipsoid_depth(
-                                ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz
-                            )
-                            nearer = t < best[line + k]
-                            best[line + k] = t if nearer else best[line + k]
-                            found[line + k] = number if nearer else found[line + k]
+                        trace_row(ellipsoid_depth, p, u0, fx, cx, origin, ray, step, half, out)
                     elif kind == CAPSULE:
-                        for k in range(count):
-                            x = (u0 + k - cx) / fx
-                            t = capsule_depth(ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hz)
-                            nearer = t < best[line + k]
-                            best[line + k] = t if nearer else best[line + k]
-                            found[line + k] = number if nearer else found[line + k]
+                        trace_row(capsule_depth, p, u0, fx, cx, origin, ray, step, half, out)
+                    elif kind == CYLINDER:
+                        trace_row(cylinder_depth, p, u0, fx, cx, origin, ray, step, half, out)
                     else:
-                        for k in range(count):
-                            x = (u0 + k - cx) / fx
-                            t = primitive_depth(
-                                kind, ox, oy, oz, bx + R[0, 0] * x, by + R[1, 0] * x, bz + R[2, 0] * x, hx, hy, hz
-                            )
-                            if t < best[line + k]:
-                                best[line + k] = t
-                                found[line + k] = number
+                        trace_row(torus_depth, p, u0, fx, cx, origin, ray, step, half, out)
                 farthest = 0.0
                 for v in range(v1 - v0):
                     for k in range(count):

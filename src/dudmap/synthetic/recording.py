@@ -237,7 +237,7 @@ class SyntheticSequence:
         return self._renderer.render(self.camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
 
 
-def make_sequence(
+def sequence(
     scene: str = "room",
     movers: Sequence[str] | None = None,
     camera_path: str | Path | None = None,
@@ -253,7 +253,29 @@ def make_sequence(
     motion_blur: float = 0.0,
     exposure_change: float = 0.0,
 ) -> SyntheticSequence:
-    """See ``dudmap.synthetic.sequence``."""
+    """Make a synthetic recording; frames are rendered when they are asked for.
+
+    Args:
+        scene: Name of a world (``names()["scenes"]``).
+        movers: Names of the things that move, () for none; None for one person, or what the situation needs.
+        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or the
+            situation's.
+        frames: Number of frames.
+        fps: Frames per second.
+        noise: Sensor: ``kinect``, ``realsense`` or ``none`` (exact depth).
+        speed: Speed of the movers in m/s; None takes what is natural for each.
+        coverage: Share of the image, 0 to 0.95, that a stream of people hides on average; it replaces the movers,
+            0 means nobody.
+        start_dynamic: Whether the movers are in view from the first frame on.
+        situation: Name of a difficult situation (``names()["situations"]``).
+        seed: Chooses path, looks and noise; the same seed gives the same frames.
+        camera: Intrinsics; None for 640x480 with 525 px focal length.
+        motion_blur: Share of the frame interval during which the shutter is open.
+        exposure_change: Relative amplitude of a slow change of brightness.
+
+    Raises:
+        ConfigError: An argument is not acceptable; the message names the known values.
+    """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)
     _check("motion_blur", motion_blur, 0, 1)

@@ -1,0 +1,248 @@
+"""What moves between two images, while the map cannot tell yet.
+
+In the first second nothing is known of free space, and whoever is in view is part of the map. Corners are followed
+from image to image (Lucas and Kanade 1981) and explained by one rigid motion (RANSAC, Fischler and Bolles 1981): what does not follow the motion of most of the visible surface moves. Errors are counted in pixels, so that a
+near person counts no more than a far wall.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.kernels import labeling
+from dudmap.tracker import Level
+
+CELLS = 40
+"""Corners across the image: the strongest of each cell."""
+NOISE_PX = 0.7
+"""A corner fits a motion if it lies within this of where the motion puts it, pixels."""
+MOVES_PX = 1.0
+"""A corner farther off than this,"""
+MOVES_SHARE = 0.08
+"""and than this share of its own path (motion blur, rolling shutter), moves."""
+FEWEST = 30
+"""With fewer corners no motion is believed."""
+REACH = 0.1
+"""A pixel is judged by the corners within this share of its depth, in space."""
+NEIGHBOURS = 5
+WINDOW = 11
+"""Edge of the window a corner is recognised by, pixels."""
+GUESSES = 150
+SEVERAL = 0.02
+"""Share of the readings that must move for it to be more than noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class DominantMotion:
+    """The rigid motion of most of the visible surface between two images, and what does not follow it.
+
+    Attributes:
+        T_after_before: (4, 4) the static world's motion from the first camera's frame to the second's.
+        moving_before, moving_after: (h, w) bool, pixels with a reading that do not follow it, in either image.
+        share: Share of the corners, each counted by the surface it stands for, that follow it.
+    """
+
+    T_after_before: NDArray[np.float64]
+    moving_before: NDArray[np.bool_]
+    moving_after: NDArray[np.bool_]
+    share: float
+
+
+class Parallax:
+    """Finds movers from image to image as long as the map is too young to know them.
+
+    Args:
+        seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self._until, self._longest = -np.inf, -np.inf
+        self._before: tuple[Level, Level] | None = None
+
+    def start(self, timestamp: float) -> None:
+        """Begin with the first frame of a map."""
+        self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
+
+    def active(self, timestamp: float) -> bool:
+        """Whether a frame is to be compared with the one before it."""
+        return self._before is not None and timestamp < self._until
+
+    def remember(self, timestamp: float, level: Level, small: Level) -> None:
+        """Take a tracked frame as the one to compare the next with."""
+        self._before = (level, small) if timestamp < self._until else None
+
+    def compare(self, timestamp: float, level: Level, small: Level) -> DominantMotion | None:
+        """The static world's motion since the remembered frame, and what does not follow it."""
+        assert self._before is not None
+        motion = dominant_motion(self._before[0], level, (self._before[1], small))
+        if motion is not None and np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
+            self._until = min(timestamp + self.seconds, self._longest)
+        return motion
+
+
+def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> DominantMotion | None:
+    """Explain the corners' paths from one image to the next by one rigid motion; None where too few are left.
+
+    The static world is what covers most *surface*, so that each corner counts by its depth squared: a crowd may fill
+    half of the image, but hardly ever half of the visible square metres.
+
+    Args:
+        before, after: Both images at the resolution in which corners are followed.
+        small: Both at the resolution of the result.
+    """
+    pixels, targets = _followed(before, after)
+    if len(pixels) < FEWEST:
+        return None
+    columns, rows = pixels.T
+    z = before.depth[rows, columns].astype(np.float64)
+    points = _points(before.camera, columns, rows, z)
+    surface = z**2
+    T = _rigid_motion(points, targets, surface, before.camera)
+    error = _reprojection_error(T, points, targets, before.camera)
+    if np.count_nonzero(error < NOISE_PX) < FEWEST:
+        return None
+    support = float(surface[error < NOISE_PX].sum())
+    path = np.linalg.norm(targets - pixels, axis=1)
+    moves = error > MOVES_PX + MOVES_SHARE * path
+    depth_after = after.depth[
+        _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
+    ]
+    seen = depth_after > 0
+    points_after = _points(after.camera, targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
+    return DominantMotion(
+        T,
+        _spread(small[0], points, moves),
+        _spread(small[1], points_after[seen], moves[seen]),
+        support / float(surface.sum()),
+    )
+
+
+def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Corners (n, 2) int of the first image and their places (n, 2) in the second, found there and back."""
+    import cv2
+
+    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
+    strength = cv2.cornerMinEigenVal(first, 5)
+    cell = max(6, first.shape[1] // CELLS)
+    height, width = first.shape[0] // cell, first.shape[1] // cell
+    tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
+    tiles = tiles.reshape(height * width, cell * cell)
+    place = tiles.argmax(axis=1)
+    rows = np.arange(height * width) // width * cell + place // cell
+    columns = np.arange(height * width) % width * cell + place % cell
+    # a window that also shows something nearer follows that, not the surface behind
+    z = before.depth[rows, columns]
+    nearest = cv2.erode(
+        np.where(before.depth > 0, before.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8)
+    )
+    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
+    pixels = np.stack([columns, rows], axis=1)[useful]
+    if len(pixels) == 0:
+        return pixels, np.empty((0, 2))
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
+    )
+    good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
+    return pixels[good], there[good, 0].astype(np.float64)
+
+
+def _rigid_motion(
+    points: NDArray[np.float64], targets: NDArray[np.float64], surface: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Motion (4, 4) that brings most surface to its target pixels.
+
+    Three corners give the six numbers of a small motion, linearly (Longuet-Higgins and Prazdny 1980); of many such
+    guesses the one that explains most surface, counted as in MSAC (Torr and Zisserman 2000), is refined on all
+    corners that follow it, with the exact projection.
+
+    Args:
+        points: (n, 3) metres, first camera's frame.
+        targets: (n, 2) their pixels in the second image.
+        surface: (n,) what each of them counts.
+        camera: Camera of both images.
+    """
+    flow = targets - _projected(np.eye(4), points, camera)
+    J = _flow_jacobian(points, camera)
+    rng = np.random.default_rng(0)
+    n = len(points)
+    draws = np.concatenate([
+        rng.integers(0, n, (GUESSES, 3)),
+        rng.choice(n, (GUESSES, 3), p=surface / surface.sum()),
+    ])  # fmt: skip
+    A = J[draws].reshape(-1, 6, 6)
+    A = A + 1e-9 * np.eye(6)  # corners drawn twice define nothing; such guesses explain nothing either
+    guesses = np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0]
+    guesses = guesses[np.linalg.norm(guesses, axis=1) < 0.5]
+    guesses = np.concatenate([np.zeros((1, 6)), guesses])
+    error = flow[None] - np.einsum("nij,gj->gni", J, guesses)
+    square = np.minimum((error**2).sum(axis=2) / NOISE_PX**2, 1.0)
+    T = se3.exp(guesses[int(np.argmax((1 - square) @ surface))])
+    for scale in (3.0, 2.0, 1.0, 1.0, 1.0):
+        residual = targets - _projected(T, points, camera)
+        kept = np.linalg.norm(residual, axis=1) < scale * NOISE_PX
+        if np.count_nonzero(kept) < 6:
+            break
+        moved = points[kept] @ T[:3, :3].T + T[:3, 3]
+        Jk = _flow_jacobian(moved, camera).reshape(-1, 6)
+        step = np.linalg.lstsq(Jk, residual[kept].reshape(-1), rcond=None)[0]
+        T = se3.exp(step) @ T
+    return T
+
+
+def _flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Change (n, 2, 6) of the pixels of points (n, 3) by a small twist (v, omega) of theirs."""
+    z = np.maximum(points[:, 2], 1e-6)
+    x, y, one, zero = points[:, 0] / z, points[:, 1] / z, np.ones_like(z), np.zeros_like(z)
+    du = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
+    dv = camera.fy * np.stack([zero, one / z, -y / z, -1 - y * y, x * y, x], axis=1)
+    return np.stack([du, dv], axis=1)
+
+
+def _projected(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Pixels (n, 2) of moved points (n, 3)."""
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    z = np.maximum(moved[:, 2], 1e-6)
+    return np.stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy], axis=1)
+
+
+def _reprojection_error(
+    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Distance (n,) in pixels of each target from where the motion puts its point."""
+    return np.linalg.norm(_projected(T, points, camera) - targets, axis=1)
+
+
+def _spread(level: Level, points: NDArray[np.float64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Moving pixels (h, w): those whose neighbours in space among the corners mostly move."""
+    from scipy.spatial import cKDTree
+
+    out = np.zeros(level.depth.shape, dtype=np.uint8)
+    if np.count_nonzero(moves) < 4:
+        return out > 0
+    stride = 2
+    coarse = np.ascontiguousarray(level.depth[stride // 2 :: stride, stride // 2 :: stride])
+    rows, columns = np.nonzero(coarse > 0)
+    z = coarse[rows, columns].astype(np.float64)
+    places = _points(level.camera, columns * stride + stride // 2, rows * stride + stride // 2, z)
+    distance, index = cKDTree(points).query(places, k=min(NEIGHBOURS, len(points)))
+    near = distance < REACH * z[:, None]
+    votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
+    low = np.zeros(coarse.shape, dtype=np.uint8)
+    low[rows, columns] = votes > 0
+    labeling.upsample(0, out.shape[0], low, coarse, level.depth, stride, out)
+    return (out > 0) & (level.depth > 0)
+
+
+def _points(camera: Camera, u: NDArray, v: NDArray, z: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (n, 3) in the camera's frame, metres."""
+    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
+
+
+def _inside(coordinate: NDArray[np.float64], size: int) -> NDArray[np.int64]:
+    return np.clip(np.rint(coordinate), 0, size - 1).astype(np.int64)
