@@ -100,6 +100,12 @@ class History:
         self._write(PENDING)
         return True
 
+    def drop_last(self) -> None:
+        """Forget the frame kept last."""
+        self._write(0)
+        for column in (self.timestamps, self.Ts_world_camera, self.counts, self.submaps, self._places):
+            column.pop()
+
     def __getitem__(self, number: int) -> StoredFrame:
         """The frame of a number, 0 the oldest."""
         import cv2

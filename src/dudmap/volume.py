@@ -242,6 +242,10 @@ class TsdfVolume:
         """Forget everything."""
         self.__init__(self.camera, self.config, self.sensor, self.depth_max)
 
+    def take_over(self, other: "TsdfVolume") -> None:
+        """Become the map that ``other`` is; ``other`` must not be used afterwards."""
+        self.__dict__.update(other.__dict__)
+
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
