@@ -210,6 +210,40 @@ class RelocalizationConfig(Part):
     """or turn it, degrees."""
 
 
+class LoopsConfig(Part):
+    """Correcting the map when a known place is seen again after drift."""
+
+    enabled: bool = True
+    """Compare new views with places not seen for a while, and correct the trajectory and the map."""
+    min_age: float = Field(default=5.0, gt=0)
+    """A place counts as seen again if the camera has not been near for this long, seconds."""
+    gap: int = Field(default=20, ge=1)
+    """Frames between two attempts at least."""
+    min_distance: float = Field(default=0.02, ge=0)
+    """Smaller corrections than this, metres,"""
+    min_angle_deg: float = Field(default=0.7, ge=0)
+    """and than this, degrees, are noise: nothing is done."""
+    max_drift: float = Field(default=0.1, gt=0)
+    """Largest believable drift: share of the path since the place was last seen, a turn by one radian counting 1 m."""
+    keep_distance: float = Field(default=0.08, gt=0)
+    """A fused frame this far from the last kept one is kept on disk, metres,"""
+    keep_angle_deg: float = Field(default=5.0, gt=0)
+    """or turned by this, degrees,"""
+    keep_gap: int = Field(default=15, ge=1)
+    """or this many fused frames after it."""
+
+
+class SubmapsConfig(Part):
+    """Going on in a new map where the camera is lost and recognises nothing."""
+
+    enabled: bool = True
+    """Start a new submap after a while without a known place; join it with the others when one is recognised."""
+    patience: float = Field(default=1.0, ge=0)
+    """Time without a recognised place before a new submap is started, seconds."""
+    min_readings: float = Field(default=0.2, ge=0, le=1)
+    """Share of the pixels of its first frame that must have a reading."""
+
+
 class MoversConfig(Part):
     """Moving bodies with identity and velocity, as a result; they never influence the pose."""
 
@@ -239,6 +273,8 @@ class Config(Part):
     tracker: TrackerConfig = TrackerConfig()
     dynamics: DynamicsConfig = DynamicsConfig()
     relocalization: RelocalizationConfig = RelocalizationConfig()
+    loops: LoopsConfig = LoopsConfig()
+    submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
 
     @classmethod
@@ -322,6 +358,8 @@ PRESETS: dict[str, dict[str, Any]] = {
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         "dynamics": {"method": "em", "free_space": False, "regions": False, "start_seconds": 0.0},
         "relocalization": {"enabled": False},
+        "loops": {"enabled": False},
+        "submaps": {"enabled": False},
         "movers": {"enabled": False},
     },
 }

@@ -29,18 +29,20 @@ class TrackingHealth:
 
         Args:
             tracked: The registration.
-            recognised: Whether features put the camera there too; then the distances alone need not be as usual.
+            recognised: Whether features put the camera there too; then the distances alone need not be as usual, and
+                less of the view need be known: where the camera looks now, a young map may end.
         """
         if len(self._residuals) < 5:
             return ""
+        strict = self.recovering or recognised
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
-        worst = 4.0 if not self.recovering else 2.5 if recognised else 1.6
+        worst = 4.0 if not strict else 2.5 if recognised else 1.6
         if tracked.residual > worst * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
-        if self.recovering and tracked.inlier_share < 0.6 * share:
+        if self.recovering and not recognised and tracked.inlier_share < 0.6 * share:
             return f"only {tracked.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
         # one wall fits another of the same room, but it does not look like it
-        if tracked.color_residual > (max(0.02, 2.5 * color) if self.recovering else max(0.03, 4.0 * color)):
+        if tracked.color_residual > (max(0.02, 2.5 * color) if strict else max(0.03, 4.0 * color)):
             return f"the image differs by {tracked.color_residual:.1%} from the map, {color:.1%} were usual"
         return ""
 

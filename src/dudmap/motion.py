@@ -39,6 +39,10 @@ class MotionModel:
         self._known, self._velocity = False, np.zeros(6)
         self.update(timestamp, T_world_camera)
 
+    def moved(self, T_new_old: NDArray[np.float64]) -> None:
+        """Follow a correction of the world; the velocity, in camera axes, stays."""
+        self._T_world_camera = T_new_old @ self._T_world_camera
+
     def implausible(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
         """Sentence on a jump that no camera makes, empty if there is none."""
         motion = se3.inverse(self._T_world_camera) @ T_world_camera

@@ -4,7 +4,7 @@ SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic
 over three pairs of points (Fischler and Bolles 1981) with the closed form of Kabsch (1976) and Umeyama (1991).
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -44,13 +44,38 @@ class PlacedFeatures:
     points: NDArray[np.float64]
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Keyframe:
-    """A tracked frame that is remembered."""
+    """A tracked frame that is remembered.
+
+    Attributes:
+        timestamp: Seconds.
+        T_world_camera: (4, 4) in the world of its submap; moves when the map is corrected.
+        features: What it is recognised by.
+        submap: Number of the map it belongs to.
+        last_seen: When the camera was last near, seconds.
+    """
 
     timestamp: float
     T_world_camera: NDArray[np.float64]
     features: PlacedFeatures
+    submap: int = 0
+    last_seen: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class Place:
+    """A keyframe that a frame was recognised to show.
+
+    Attributes:
+        keyframe: It.
+        T_world_camera: (4, 4) pose of the frame in the world of the keyframe's submap.
+        support: Matches that agree.
+    """
+
+    keyframe: Keyframe
+    T_world_camera: NDArray[np.float64]
+    support: int
 
 
 class Keyframes:
@@ -69,12 +94,14 @@ class Keyframes:
         self.keyframes: list[Keyframe] = []
         self._detector: Any = None
         self._since_last = config.keyframe_gap
+        self._latest: tuple[Observation, PlacedFeatures] | None = None
 
     def add(
         self,
         observation: Observation,
         T_world_camera: NDArray[np.float64],
         static_mask: NDArray[np.bool_] | None = None,
+        submap: int = 0,
     ) -> bool:
         """Make a tracked frame a keyframe if the camera has been nowhere near; call with every tracked frame.
 
@@ -82,48 +109,73 @@ class Keyframes:
             observation: The frame.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool, pixels that do not move; None = all.
+            submap: Number of the map it belongs to.
 
         Returns:
             Whether it became one.
         """
         self._since_last += 1
-        if self._since_last <= self.config.keyframe_gap or self._near(T_world_camera):
+        if self._since_last <= self.config.keyframe_gap or self._near(T_world_camera, submap):
             return False
         self._since_last = 0
-        features = self._features(observation, static_mask)
+        features = self.features(observation, static_mask)
         if len(features.points) < self.config.min_inliers:
             return False
-        self.keyframes.append(Keyframe(observation.timestamp, T_world_camera.copy(), features))
+        stamp = observation.timestamp
+        self.keyframes.append(Keyframe(stamp, T_world_camera.copy(), features, submap, stamp))
         if len(self.keyframes) > self.config.max_keyframes:
             self._forget_one()
         return True
 
-    def find(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> list[NDArray[np.float64]]:
-        """Candidates (4, 4) for T_world_camera of a frame that shows a known place, the best supported first."""
-        if not self.keyframes:
+    def find(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> list[Place]:
+        """Known places that a frame may show, the best supported first."""
+        return self.match(self._features(observation, static_mask), self.keyframes) if self.keyframes else []
+
+    def features(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
+        """Features of a frame; the same frame again costs nothing."""
+        if self._latest is None or self._latest[0] is not observation:
+            self._latest = observation, self._features(observation, static_mask)
+        return self._latest[1]
+
+    def match(self, features: PlacedFeatures, among: Sequence[Keyframe]) -> list[Place]:
+        """Keyframes among these that a frame with such features may show, the best supported first."""
+        if len(features.points) < self.config.min_inliers or not among:
             return []
-        features = self._features(observation, static_mask)
-        if len(features.points) < self.config.min_inliers:
-            return []
-        found: list[tuple[int, NDArray[np.float64]]] = []
-        for number in self._most_alike(features):
-            keyframe = self.keyframes[number]
+        found: list[Place] = []
+        for keyframe in _most_alike(features, among):
             pairs = matches(features.descriptors, keyframe.features.descriptors, self.config.ratio)
+            if len(pairs) < self.config.min_inliers:
+                continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
             T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b))
             count = int(np.count_nonzero(inliers))
             if count >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
-                found.append((count, keyframe.T_world_camera @ T_keyframe_camera))
-        found.sort(key=lambda candidate: -candidate[0])
-        candidates: list[NDArray[np.float64]] = []
-        for _, T in found:
-            if not any(agree(T, other, *SAME_PLACE) for other in candidates):
-                candidates.append(T)
-        return candidates
+                found.append(Place(keyframe, keyframe.T_world_camera @ T_keyframe_camera, count))
+        found.sort(key=lambda place: -place.support)
+        places: list[Place] = []
+        for place in found:
+            if not any(
+                place.keyframe.submap == other.keyframe.submap
+                and agree(place.T_world_camera, other.T_world_camera, *SAME_PLACE)
+                for other in places
+            ):
+                places.append(place)
+        return places
 
-    def _near(self, T_world_camera: NDArray[np.float64]) -> bool:
-        distance, angle = self.config.keyframe_distance, self.config.keyframe_angle_deg
-        return any(agree(known.T_world_camera, T_world_camera, distance, angle) for known in self.keyframes)
+    def near(
+        self, T_world_camera: NDArray[np.float64], submap: int, distance: float, angle_deg: float
+    ) -> list[Keyframe]:
+        """Keyframes of a submap closer to a pose than a distance (m) and an angle (deg)."""
+        if not self.keyframes:
+            return []
+        places = np.array([known.T_world_camera for known in self.keyframes])
+        close = np.linalg.norm(places[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
+        cosine = (np.einsum("iab,ab->i", places[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
+        close &= np.degrees(np.arccos(np.clip(cosine, -1, 1))) < angle_deg
+        return [self.keyframes[n] for n in np.flatnonzero(close) if self.keyframes[n].submap == submap]
+
+    def _near(self, T_world_camera: NDArray[np.float64], submap: int) -> bool:
+        return bool(self.near(T_world_camera, submap, self.config.keyframe_distance, self.config.keyframe_angle_deg))
 
     def _forget_one(self) -> None:
         """Drop the older of the two keyframes that lie nearest to each other."""
@@ -132,19 +184,10 @@ class Keyframes:
         cosine = (np.einsum("iab,jab->ij", places[:, :3, :3], places[:, :3, :3]) - 1) / 2
         turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
         gap = np.maximum(apart / self.config.keyframe_distance, turned / self.config.keyframe_angle_deg)
+        submaps = np.array([known.submap for known in self.keyframes])
+        gap[submaps[:, None] != submaps] = np.inf
         gap[np.tril_indices(len(places))] = np.inf
         del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
-
-    def _most_alike(self, features: PlacedFeatures) -> Iterable[int]:
-        """Numbers of the keyframes whose strongest features resemble the frame's most, the best first."""
-        if len(self.keyframes) <= LOOKED_AT:
-            return range(len(self.keyframes))
-        parts = [known.features.descriptors[:COMPARED] for known in self.keyframes]
-        starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
-        similarity = np.concatenate(parts) @ features.descriptors.T
-        best = np.maximum.reduceat(similarity, starts, axis=0)  # of each keyframe, for each feature
-        unusual = np.clip(best - np.median(best, axis=0), 0, None)  # what many places show says nothing
-        return np.argsort(-unusual.sum(axis=1), kind="stable")[:LOOKED_AT]
 
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest believable error (n,) of a feature's place, metres."""
@@ -177,6 +220,18 @@ class Keyframes:
         points = np.stack([(u - self.camera.cx) / self.camera.fx * z, (v - self.camera.cy) / self.camera.fy * z, z], -1)
         root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-9))
         return PlacedFeatures(root.astype(np.float32), points)
+
+
+def _most_alike(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
+    """Keyframes whose strongest features resemble the frame's most, the best first."""
+    if len(among) <= LOOKED_AT:
+        return among
+    parts = [known.features.descriptors[:COMPARED] for known in among]
+    starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    similarity = np.concatenate(parts) @ features.descriptors.T
+    best = np.maximum.reduceat(similarity, starts, axis=0)  # of each keyframe, for each feature
+    unusual = np.clip(best - np.median(best, axis=0), 0, None)  # what many places show says nothing
+    return [among[n] for n in np.argsort(-unusual.sum(axis=1), kind="stable")[:LOOKED_AT]]
 
 
 def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:

@@ -10,11 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap import se3
+from dudmap.atlas import Atlas
 from dudmap.camera import Camera
 from dudmap.config import Config
 from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
+from dudmap.history import History
+from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
 from dudmap.parallax import Parallax
@@ -45,6 +48,8 @@ class FrameResult:
         tracking: The registration's full outcome, None for the first frame.
         timings: Milliseconds per stage.
         movers: The moving bodies, by number; none in a lost frame.
+        submap: Number of the map that the pose belongs to, 0 the first.
+        corrected: Whether a known place was seen again here and all poses so far have moved.
     """
 
     timestamp: float
@@ -61,6 +66,8 @@ class FrameResult:
     timings: dict[str, float] = field(default_factory=dict)
     relocalized: bool = False
     movers: tuple[Mover, ...] = ()
+    submap: int = 0
+    corrected: bool = False
 
 
 class Slam:
@@ -78,35 +85,44 @@ class Slam:
         self.config = config or Config()
         self.preprocess = Preprocessor(camera, self.config.preprocess)
         self.camera = self.preprocess.camera
-        self.volume = TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
         self.tracker = Tracker(self.config.tracker, self.config.sensor)
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
         self.health = TrackingHealth()
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
+        self.atlas = Atlas(self._empty_volume, self.keyframes, self._history())
+        self._knowledge: TsdfVolume | None = None  # the map of a first pass, and where it saw the frames
+        self._seen: dict[float, NDArray[np.float64]] = {}
+        if first_pass is not None:
+            main = first_pass.atlas.by_size()[0]
+            self.keyframes = first_pass.keyframes
+            self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
+            self._knowledge = first_pass.atlas.volumes[main]
+            self._seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
+        self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = MoverTracker(self.config.movers)
         self.parallax = Parallax(self.config.dynamics.start_seconds)
         self._first: tuple[Observation, NDArray[np.bool_]] | None = None  # until a second frame shows what moves in it
-        self._seen: dict[float, NDArray[np.float64]] = {}
-        if first_pass is not None:
-            self.keyframes = first_pass.keyframes
-            self._seen = dict(first_pass._poses)
-        self._first_pass = first_pass
-        self._poses: list[tuple[float, NDArray[np.float64]]] = []
+        self._lost_since: float | None = None
         self._T_world_fused: NDArray[np.float64] | None = None
         self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
         self._untested = 0  # frames that are still fused without the similarity test
 
     @property
+    def volume(self) -> TsdfVolume:
+        """The map that is tracked; another one after a new submap was started or two were joined."""
+        return self.atlas.volume
+
+    @property
     def reference(self) -> TsdfVolume:
         """The map that frames are compared with: the own one, or in a second pass that of the first."""
-        return self.volume if self._first_pass is None else self._first_pass.volume
+        return self._knowledge or self.volume
 
     @property
     def trajectory(self) -> Trajectory:
-        """Poses of all frames tracked so far."""
-        return Trajectory.from_poses(self._poses)
+        """Poses of all frames tracked so far in the submap with the most frames, as they are known now."""
+        return self.atlas.trajectory(self.atlas.by_size()[0])
 
     def process(self, frame: Frame, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
@@ -139,17 +155,18 @@ class Slam:
             (tracked, labels), reason = recognised, ""
             self.motion.restart(frame.timestamp, tracked.T_world_camera)
         if reason:
-            self.motion.lost()
-            self.health.lost()
-            self._moved = None
+            self._lose(frame.timestamp)
+            if self._start_submap(observation):
+                return self._as_recorded(self._start(observation, levels, known, clock))
             return self._as_recorded(
                 self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
             )
         self.motion.update(frame.timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
+        self._lost_since = None
         self._moved = None if labels is None else labels.dynamic
         self._compare_with_next(frame.timestamp, levels)
-        self._poses.append((frame.timestamp, tracked.T_world_camera))
+        self.atlas.add_pose(frame.timestamp, tracked.T_world_camera)
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
         result = self._result(
@@ -159,7 +176,7 @@ class Slam:
         if not redundant:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
-        return self._as_recorded(result)
+        return self._as_recorded(self._close_loop(observation, levels, result, clock))
 
     def _as_recorded(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
@@ -175,7 +192,7 @@ class Slam:
         T = np.eye(4)
         if not reason:
             self.motion.update(observation.timestamp, T)
-            self._poses.append((observation.timestamp, T))
+            self.atlas.add_pose(observation.timestamp, T)
             self._remember(observation, T, nothing, clock)
             with clock("integrate"):
                 self._integrate(observation, T, nothing)
@@ -186,6 +203,7 @@ class Slam:
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
             nothing, _share(nothing, observation), np.full((1, 1), np.nan, np.float32), None, None, clock.timings,
+            submap=self.atlas.current,
         )  # fmt: skip
 
     def _expect(
@@ -202,7 +220,7 @@ class Slam:
                 return T_init, known
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
-            T_init = self._poses[-1][1] @ se3.inverse(motion.T_after_before)
+            T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
             moving = full_size(motion.moving_after, small.depth, observation.depth)
             return T_init, moving if known is None else known | moving
 
@@ -214,6 +232,8 @@ class Slam:
         small = pyramid(first, self._level(self.config.dynamics.width))[0]
         if np.count_nonzero(moving) > 0:
             self.volume.clear()
+            if self.atlas.history is not None:
+                self.atlas.history.drop_last()
             self._integrate(first, np.eye(4), known | full_size(moving, small, first.depth))
 
     def _compared(self, levels: dict[int, Level]) -> tuple[Level, Level]:
@@ -283,7 +303,7 @@ class Slam:
         """Keep the frame as a keyframe if the camera has been nowhere near."""
         if self.config.relocalization.enabled:
             with clock("keyframe"):
-                self.keyframes.add(observation, T_world_camera, ~dynamic_mask)
+                self.keyframes.add(observation, T_world_camera, ~dynamic_mask, self.atlas.current)
 
     def _recognise(
         self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
@@ -300,7 +320,9 @@ class Slam:
         readings = max(np.count_nonzero(levels[self._level(self.config.dynamics.width)].depth), 1)
         with clock("recognise"):
             candidates = self.keyframes.find(observation, None if known is None else ~known)
-        for T_world_camera in candidates:
+        lost_in = self.atlas.current
+        for place in candidates:
+            T_world_camera, self.atlas.current = place.T_world_camera, place.keyframe.submap
             tracked, labels = self._register(levels, T_world_camera, known, clock)
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
@@ -310,7 +332,59 @@ class Slam:
                 and agree(tracked.T_world_camera, T_world_camera, config.max_distance, config.max_angle_deg)
             ):
                 return tracked, labels
+        self.atlas.current = lost_in
         return None
+
+    def _lose(self, timestamp: float) -> None:
+        self.motion.lost()
+        self.health.lost()
+        self._moved = None
+        self._lost_since = timestamp if self._lost_since is None else self._lost_since
+
+    def _start_submap(self, observation: Observation) -> bool:
+        """Go on in a new, empty map if nothing has been recognised for a while and this frame shows enough."""
+        config = self.config.submaps
+        if not config.enabled or self.atlas.history is None or self._lost_since is None:
+            return False
+        if observation.timestamp - self._lost_since < config.patience:
+            return False
+        if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
+            return False
+        if len(self.keyframes.features(observation).points) < self.config.relocalization.min_inliers:
+            return False
+        self.atlas.start_submap()
+        self.motion, self.health = MotionModel(self.config.tracker), TrackingHealth()
+        self._T_world_fused, self._lost_since = None, None
+        return True
+
+    def _close_loop(
+        self, observation: Observation, levels: dict[int, Level], result: FrameResult, clock: "Clock"
+    ) -> FrameResult:
+        """Look for a place seen before; where the tracking has drifted since, everything moves."""
+        tracked = result.tracking
+        if self.atlas.history is None or tracked is None:
+            return result
+        with clock("loops"):
+            tracked_levels = self._tracked(levels)
+            weights = None if result.labels is None else self._weights(result.labels, tracked_levels)
+            view = View(observation, tracked_levels, weights, ~result.dynamic_mask, tracked)
+            correction = self.loops.close(view, self.health)
+        if correction is None:
+            return result
+        self.motion.moved(correction)
+        if self._T_world_fused is not None:
+            self._T_world_fused = correction @ self._T_world_fused
+        T = correction @ tracked.T_world_camera
+        return replace(result, T_world_camera=T, submap=self.atlas.current, corrected=True)
+
+    def _empty_volume(self) -> TsdfVolume:
+        return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
+
+    def _history(self) -> History | None:
+        loops = self.config.loops
+        if not self.config.relocalization.enabled or not (loops.enabled or self.config.submaps.enabled):
+            return None
+        return History(self.camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
 
     def _levels(self, observation: Observation) -> dict[int, Level]:
         """Image pyramid by number of halvings."""
@@ -378,6 +452,8 @@ class Slam:
         static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
         fused = Frame(observation.timestamp, observation.depth, exposed_color(observation.rgb, exposure))
         self.volume.integrate(fused, T_world_camera, static)
+        if self.atlas.history is not None:
+            self.atlas.history.add(fused, static, T_world_camera, self.atlas.current)
         self._T_world_fused = T_world_camera
         if self.config.similarity.enabled:
             self.similarity.accept(observation.rgb)
@@ -413,7 +489,7 @@ class Slam:
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
-            clock.timings, relocalized, movers,
+            clock.timings, relocalized, movers, self.atlas.current,
         )  # fmt: skip
 
 

@@ -202,6 +202,7 @@ class TsdfVolume:
         T_world_camera: NDArray[np.float64],
         static_mask: NDArray[np.bool_] | None = None,
         weights: NDArray[np.uint8] | None = None,
+        count: int = 1,
     ) -> None:
         """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
 
@@ -210,6 +211,7 @@ class TsdfVolume:
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
             weights: (H, W) uint8 weight of each reading; None takes what the configuration says.
+            count: Number of like frames that it stands for: their weights and observations of emptiness add up.
 
         Raises:
             MapError: The images do not have the camera's size.
@@ -229,13 +231,20 @@ class TsdfVolume:
         self._allocate(depth, T_world_camera)
         T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
         tiles = self._tiles(depth)
+        if count > 1:
+            weights = self._weights(depth) if weights is None else weights
+            weights = np.minimum(weights.astype(np.int32) * count, 255).astype(np.uint8)
         self._fuse(depth, frame.color, weights, T_camera_world, tiles)
         if self.config.carving:
-            self._observe_free(T_camera_world, tiles)
+            self._observe_free(T_camera_world, tiles, count)
 
     def clear(self) -> None:
         """Forget everything."""
         self.__init__(self.camera, self.config, self.sensor, self.depth_max)
+
+    def take_over(self, other: "TsdfVolume") -> None:
+        """Become the map that ``other`` is; ``other`` must not be used afterwards."""
+        self.__dict__.update(other.__dict__)
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
@@ -406,8 +415,10 @@ class TsdfVolume:
         self._unused.extend(int(slot) for slot in slots[::-1])
         self._near = self._near[self._entry_of[self._near] >= 0]
 
-    def _observe_free(self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]]) -> None:
-        """Count one more observation of emptiness for blocks without voxels in front of the depth image.
+    def _observe_free(
+        self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]], count: int
+    ) -> None:
+        """Count ``count`` more observations of emptiness for blocks without voxels in front of the depth image.
 
         Each call visits every second plane of the window, so that the cost is spread over two frames.
         """
@@ -430,8 +441,7 @@ class TsdfVolume:
             return
         entries = self._entries_of(cells) if np.any(self._window[cells] == -1) else -2 - self._window[cells]
         self._window[cells] = -2 - entries
-        counts_now = self._free_count[entries]
-        self._free_count[entries] = np.where(counts_now < 255, counts_now + 1, counts_now)
+        self._free_count[entries] = np.minimum(self._free_count[entries].astype(np.int32) + count, 255)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
