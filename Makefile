@@ -5,13 +5,16 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check
 
-.PHONY: demo test check clean
+.PHONY: demo test test-all check clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
 
 test: .venv/developed check
 	$(BIN)/pytest
+
+test-all: .venv/developed check
+	$(BIN)/pytest -m "slow or not slow"
 
 check: .venv/developed
 	$(BIN)/ruff check

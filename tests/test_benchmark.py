@@ -10,7 +10,7 @@ from typer.testing import CliRunner
 from dudmap import se3
 from dudmap.benchmark import limits, measure, report
 from dudmap.benchmark.entries import Entry
-from dudmap.benchmark.heatmaps import limits_table, save_heat_maps, values
+from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
 from dudmap.benchmark.published import published
 from dudmap.benchmark.suites import SUITES, find_suite
 from dudmap.benchmark.systems import systems
@@ -166,6 +166,14 @@ def test_the_limit_is_the_largest_coverage_below_the_first_failure(rows):
     assert limits.limit(rows, "speed", "dudmap", 0.1) is None
     assert "| 0.1 | none |" in limits_table(rows, [SWEEP], ["dudmap"])
     assert "| 1.0 | 50 % |" in limits_table(rows, [SWEEP], ["dudmap"])
+
+
+def test_the_table_of_cells_marks_what_is_coped_with(rows):
+    rows[1] |= {"lost": 3, "lost_share": 0.25}
+    lines = cells_table(rows, [SWEEP], ["dudmap", "none"]).splitlines()
+    assert "| 0.1 | 10 % | **0.5** |  |" in lines
+    assert "| 0.1 | 30 % | 3.0 (25 % lost) |  |" in lines
+    assert len(lines) == 3 + len(SWEEP.xs) * len(SWEEP.coverages)
 
 
 def test_heat_maps_show_every_cell(rows, tmp_path):

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.errors import DatasetError, DudmapError
+from dudmap.errors import ConfigError, DatasetError, DudmapError
 from dudmap.mesh import Mesh
 from dudmap.run import read_ahead, run
 from dudmap.sequences import open_sequence
@@ -53,13 +53,17 @@ class Volume:
         return TRIANGLE
 
 
+SECOND = 1000
+"""Added to a frame number of the script: that frame of a second pass."""
+
+
 class StandIn:
     """Moves 1 cm per frame along x; ``script`` holds what happens at a frame number."""
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config):
-        self.volume, self.poses, self.frames = Volume(), [], []
+    def __init__(self, camera, config, first_pass=None):
+        self.volume, self.poses, self.frames, self.first_pass = Volume(), [], [], first_pass
 
     @property
     def trajectory(self):
@@ -68,7 +72,7 @@ class StandIn:
     def process(self, frame):
         index = len(self.frames)
         self.frames.append(frame)
-        event = self.script.get(index)
+        event = self.script.get(index if self.first_pass is None else index + SECOND)
         if isinstance(event, BaseException):
             raise event
         if event == "lost":
@@ -211,6 +215,29 @@ def test_what_was_computed_is_written_whatever_happens(slam, recording, tmp_path
     assert metrics["complete"] is False
     assert metrics["stopped_by"]
     assert metrics["tracked"] == 3
+
+
+def test_the_second_pass_is_what_is_written(slam, recording, tmp_path):
+    slam.script = {2: "lost", SECOND + 5: "similar"}
+    seen = []
+    go(recording, tmp_path / "out", passes=2, save_masks=True, observe=lambda index, *_: seen.append(index))
+    metrics = metrics_of(tmp_path / "out")
+    assert (metrics["frames"], metrics["tracked"], metrics["lost"], metrics["skipped_similar"]) == (8, 8, 0, 1)
+    assert seen == list(range(8))
+    assert len(list((tmp_path / "out/masks").iterdir())) == 8
+
+
+def test_a_second_pass_that_is_interrupted_costs_nothing(slam, recording, tmp_path):
+    slam.script = {SECOND + 3: KeyboardInterrupt()}
+    with pytest.raises(KeyboardInterrupt, match="of the second pass; the trajectory and the map of the first pass are"):
+        go(recording, tmp_path / "out", passes=2)
+    assert len(Trajectory.load(tmp_path / "out/trajectory.txt")) == 8
+
+
+@pytest.mark.parametrize("options", [{"passes": 0}, {"passes": 3}, {"passes": 2, "live": True}])
+def test_only_one_or_two_passes(slam, recording, tmp_path, options):
+    with pytest.raises(ConfigError, match="expected 1, or 2 for a recording at rest"):
+        go(recording, tmp_path / "out", **options)
 
 
 def test_one_file_that_cannot_be_written_does_not_cost_the_others(slam, recording, tmp_path, monkeypatch):

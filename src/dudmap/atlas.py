@@ -32,6 +32,7 @@ class Atlas:
         make_volume: Makes an empty map.
         keyframes: Places that can be recognised.
         history: The fused frames, to build maps again; None where neither loops nor submaps are wanted.
+        number: Of the first submap.
 
     Attributes:
         volumes: Map by number of the submap.
@@ -39,12 +40,18 @@ class Atlas:
         poses: Of all tracked frames, in time.
     """
 
-    def __init__(self, make_volume: Callable[[], TsdfVolume], keyframes: Keyframes, history: History | None) -> None:
+    def __init__(
+        self,
+        make_volume: Callable[[], TsdfVolume],
+        keyframes: Keyframes,
+        history: History | None,
+        number: int = 0,
+    ) -> None:
         self.make_volume = make_volume
         self.keyframes = keyframes
         self.history = history
-        self.volumes = {0: make_volume()}
-        self.current = 0
+        self.volumes = {number: make_volume()}
+        self.current = number
         self.poses: list[TimedPose] = []
 
     @property

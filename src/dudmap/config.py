@@ -356,7 +356,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         },
         "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
-        "dynamics": {"method": "em", "free_space": False, "regions": False},
+        "dynamics": {"method": "em", "free_space": False, "regions": False, "start_seconds": 0.0},
         "relocalization": {"enabled": False},
         "loops": {"enabled": False},
         "submaps": {"enabled": False},

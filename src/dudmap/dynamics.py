@@ -180,7 +180,7 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (h, w) at the size (H, W) of a depth image: each pixel takes after the nearby one with the depth most alike."""
+    """Mask (h, w) at the size (H, W) of a depth image: a pixel takes after the nearby one whose depth is most alike."""
     out = np.empty(depth.shape, dtype=np.uint8)
     stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)
     run_bands(

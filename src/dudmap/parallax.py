@@ -1,8 +1,9 @@
 """What moves between two images, while the map cannot tell yet.
 
 In the first second nothing is known of free space, and whoever is in view is part of the map. Corners are followed
-from image to image (Lucas and Kanade 1981) and explained by one rigid motion (RANSAC, Fischler and Bolles 1981): what does not follow the motion of most of the visible surface moves. Errors are counted in pixels, so that a
-near person counts no more than a far wall.
+from image to image (Lucas and Kanade 1981) and explained by one rigid motion (RANSAC, Fischler and Bolles 1981): what
+does not follow the motion of most of the visible surface moves. Errors are counted in pixels, so that a near person
+counts no more than a far wall.
 """
 
 from dataclasses import dataclass
@@ -25,6 +26,8 @@ MOVES_SHARE = 0.08
 """and than this share of its own path (motion blur, rolling shutter), moves."""
 FEWEST = 30
 """With fewer corners no motion is believed."""
+LEAST_SHARE = 0.3
+"""Nor with a smaller share of the surface that follows it."""
 REACH = 0.1
 """A pixel is judged by the corners within this share of its depth, in space."""
 NEIGHBOURS = 5
@@ -105,7 +108,9 @@ def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> 
     error = _reprojection_error(T, points, targets, before.camera)
     if np.count_nonzero(error < NOISE_PX) < FEWEST:
         return None
-    support = float(surface[error < NOISE_PX].sum())
+    share = float(surface[error < NOISE_PX].sum() / surface.sum())
+    if share < LEAST_SHARE:
+        return None
     path = np.linalg.norm(targets - pixels, axis=1)
     moves = error > MOVES_PX + MOVES_SHARE * path
     depth_after = after.depth[
@@ -117,7 +122,7 @@ def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> 
         T,
         _spread(small[0], points, moves),
         _spread(small[1], points_after[seen], moves[seen]),
-        support / float(surface.sum()),
+        share,
     )
 
 
@@ -191,7 +196,7 @@ def _rigid_motion(
         moved = points[kept] @ T[:3, :3].T + T[:3, 3]
         Jk = _flow_jacobian(moved, camera).reshape(-1, 6)
         step = np.linalg.lstsq(Jk, residual[kept].reshape(-1), rcond=None)[0]
-        T = se3.exp(step) @ T
+        T = se3.exp(step.astype(np.float64)) @ T
     return T
 
 
@@ -220,7 +225,7 @@ def _reprojection_error(
 
 def _spread(level: Level, points: NDArray[np.float64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Moving pixels (h, w): those whose neighbours in space among the corners mostly move."""
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
     out = np.zeros(level.depth.shape, dtype=np.uint8)
     if np.count_nonzero(moves) < 4:
@@ -230,7 +235,7 @@ def _spread(level: Level, points: NDArray[np.float64], moves: NDArray[np.bool_])
     rows, columns = np.nonzero(coarse > 0)
     z = coarse[rows, columns].astype(np.float64)
     places = _points(level.camera, columns * stride + stride // 2, rows * stride + stride // 2, z)
-    distance, index = cKDTree(points).query(places, k=min(NEIGHBOURS, len(points)))
+    distance, index = KDTree(points).query(places, k=min(NEIGHBOURS, len(points)))
     near = distance < REACH * z[:, None]
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
     low = np.zeros(coarse.shape, dtype=np.uint8)

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.errors import DatasetError, DudmapError, FrameError, MapError
+from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError, MapError
 from dudmap.frame import Frame
 from dudmap.metrics import RunRecord, accuracy, machine, versions
 from dudmap.progress import RunProgress
@@ -97,6 +97,7 @@ def run(
     progress: bool = True,
     ahead: int = AHEAD,
     live: bool = False,
+    passes: int = 1,
     observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -122,9 +123,12 @@ def run(
             rendered frames, and would disturb the times. The result does not depend on it.
         live: Frames arrive as their times tell, from when the kernels are loaded; the newest that has arrived is
             processed, and those that there is no time for are dropped and counted. Nothing queues.
+        passes: 2 goes over the recording twice: the second time every frame is compared with the map of the whole
+            first time, so that people at the start leave the map too. What is written is the last finished pass.
         observe: Called after each processed frame with its number, reading and result.
 
     Raises:
+        ConfigError: ``passes`` is not 1 or 2, or 2 with ``live``.
         DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
         KeyboardInterrupt: ctrl-C, after writing; the message says what is saved where.
     """
@@ -136,38 +140,64 @@ def run(
         raise DatasetError(
             f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
         )
+    if passes not in (1, 2) or (live and passes == 2):
+        raise ConfigError(
+            f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 for a recording at rest"
+        )
     known = None if masks is None else _open_masks(masks, sequence)
     slam = Slam(sequence.camera, config)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
+    finished: tuple[Slam, RunRecord] | None = None
     _prepare(out, masks, save_masks=save_masks)
     stopped = ""
-    with RunProgress(count, bar=progress) as display:
+    with RunProgress(count * passes, bar=progress) as display:
         try:
             if live:
                 display.working("loading kernels")
                 _load_kernels(Slam(sequence.camera, config), sequence, count)
-            with closing(_live(sequence, count, known) if live else _waiting(sequence, count, ahead, known)) as turns:
-                for turn in turns:
-                    _process(turn, slam, record, display, out if save_masks else None, observe)
+            for number in range(passes):
+                if number > 0:
+                    finished = slam, record
+                    slam = Slam(sequence.camera, config, first_pass=slam)
+                    record = RunRecord(masked=record.masked and 0, dropped=None)
+                last = number == passes - 1
+                with closing(
+                    _live(sequence, count, known) if live else _waiting(sequence, count, ahead, known)
+                ) as turns:
+                    for turn in turns:
+                        _process(
+                            turn, slam, record, display, out if save_masks and last else None, observe if last else None
+                        )
             if record.dropped:
                 display.note(f"live: {record.dropped} of {count} frames dropped; the newest was always taken")
         except KeyboardInterrupt:
-            stopped = f"interrupted after {len(record.rows)} frames"
-            raise KeyboardInterrupt(f"{stopped}; the trajectory and the map up to there are in {out}") from None
+            stopped = f"interrupted after {len(record.rows)} frames{_of_second(finished)}"
+            raise KeyboardInterrupt(f"{stopped}; {_saved(finished)} in {out}") from None
         except DudmapError as error:
             stopped = str(error)
-            raise type(error)(f"{stopped}; the trajectory and the map up to there are in {out}") from error
+            raise type(error)(f"{stopped}; {_saved(finished)} in {out}") from error
         except BaseException as error:
             stopped = repr(error)
             raise
         finally:
             display.working("writing")
+            if stopped and finished is not None:  # the first pass is whole, the second is not
+                slam, record = finished
             report = _write(out, slam, record, sequence, config, stopped, save_map=save_map)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
         raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
     return report
+
+
+def _of_second(finished: object) -> str:
+    return " of the second pass" if finished else ""
+
+
+def _saved(finished: object) -> str:
+    whole = "the trajectory and the map of the first pass are"
+    return whole if finished else "the trajectory and the map up to there are"
 
 
 def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":

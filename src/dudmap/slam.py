@@ -76,9 +76,12 @@ class Slam:
     Args:
         camera: Camera of the frames that will come.
         config: All parameters; None = defaults.
+        first_pass: A system that has seen the whole recording. The frames, given once more from the first on, are
+            then registered and labelled with its map, which knows the end, and make a map of their own: what was
+            taken for static before it moved, or before it was seen through, is left out.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None) -> None:
+    def __init__(self, camera: Camera, config: Config | None = None, first_pass: "Slam | None" = None) -> None:
         self.config = config or Config()
         self.preprocess = Preprocessor(camera, self.config.preprocess)
         self.camera = self.preprocess.camera
@@ -89,6 +92,14 @@ class Slam:
         self.health = TrackingHealth()
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self.atlas = Atlas(self._empty_volume, self.keyframes, self._history())
+        self._knowledge: TsdfVolume | None = None  # the map of a first pass, and where it saw the frames
+        self._seen: dict[float, NDArray[np.float64]] = {}
+        if first_pass is not None:
+            main = first_pass.atlas.by_size()[0]
+            self.keyframes = first_pass.keyframes
+            self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
+            self._knowledge = first_pass.atlas.volumes[main]
+            self._seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = MoverTracker(self.config.movers)
         self.parallax = Parallax(self.config.dynamics.start_seconds)
@@ -102,6 +113,11 @@ class Slam:
     def volume(self) -> TsdfVolume:
         """The map that is tracked; another one after a new submap was started or two were joined."""
         return self.atlas.volume
+
+    @property
+    def reference(self) -> TsdfVolume:
+        """The map that frames are compared with: the own one, or in a second pass that of the first."""
+        return self._knowledge or self.volume
 
     @property
     def trajectory(self) -> Trajectory:
@@ -124,7 +140,7 @@ class Slam:
             observation = self.preprocess(frame)
             levels = self._levels(observation)
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
-        if self.volume.is_empty:
+        if self.reference.is_empty:
             return self._as_recorded(self._start(observation, levels, known, clock))
         T_init, known = self._expect(observation, levels, known, clock)
         tracked, labels = self._register(levels, T_init, known, clock)
@@ -194,7 +210,7 @@ class Slam:
         self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
         """First guess of the pose, and what is known to move: while the map is young, from the last image to this."""
-        T_init = self.motion.predict(observation.timestamp)
+        T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
         if not self.parallax.active(observation.timestamp):
             return T_init, known
         with clock("parallax"):
@@ -237,19 +253,19 @@ class Slam:
         unmasked = None if known is None else [(~_reduced(known, level)).astype(np.float32) for level in tracked_levels]
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
-                tracked = self.tracker.align(self.volume, tracked_levels, T_init, unmasked)
+                tracked = self.tracker.align(self.reference, tracked_levels, T_init, unmasked)
             if self.config.dynamics.method == "none":
                 return tracked, None
             return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
             weights = self._expected(tracked_levels, unmasked)
-            tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, weights)
+            tracked = self.tracker.align(self.reference, tracked_levels[:split], T_init, weights)
         labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             again = tracked_levels[split - 1 :]
             tracked = self.tracker.align(
-                self.volume,
+                self.reference,
                 again,
                 tracked.T_world_camera,
                 self._weights(labels, again),
@@ -328,7 +344,7 @@ class Slam:
     def _start_submap(self, observation: Observation) -> bool:
         """Go on in a new, empty map if nothing has been recognised for a while and this frame shows enough."""
         config = self.config.submaps
-        if not (config.enabled and self.config.relocalization.enabled) or self._lost_since is None:
+        if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
         if observation.timestamp - self._lost_since < config.patience:
             return False
@@ -391,7 +407,7 @@ class Slam:
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            labels = self.detector.detect(self.volume, level, tracked.T_world_camera)
+            labels = self.detector.detect(self.reference, level, tracked.T_world_camera)
             if known is None:
                 return labels
             masked = _reduced(known, level)

@@ -12,7 +12,6 @@ from dudmap.kernels import registration
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.volume import TsdfVolume
 
-
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 

@@ -48,7 +48,8 @@ def values(rows: Listing[Row], sweep: Sweep, system: str, key: str) -> NDArray[n
 def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path: Path) -> None:
     """One picture per sweep: a line of maps per figure, a column per system; green is good.
 
-    A frame around a cell: the system copes (ATE within the limit and nothing lost). Grey: no figure.
+    A frame around a cell: the system copes (ATE within the limit and nothing lost). Grey: no figure. A star: some
+    frames were lost, and the error is that of the others.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -61,11 +62,12 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
     for line, quantity in zip(axes, QUANTITIES, strict=True):
         for axis, system in zip(line, systems, strict=True):
             shown = values(rows, sweep, system, quantity.key) * quantity.factor
-            copes = values(rows, sweep, system, "copes")
+            copes, lost = (values(rows, sweep, system, key) for key in ("copes", "lost"))
             axis.set_facecolor(NOT_KNOWN)
             axis.imshow(_colors(shown, quantity), origin="lower", aspect="auto")
             for (r, c), value in np.ndenumerate(shown):
                 text = "–" if np.isnan(value) else quantity.form.format(value)
+                text += "*" if quantity.key == "ate_rmse_m" and lost[r, c] > 0 else ""
                 axis.text(c, r, text, ha="center", va="center", fontsize=7)
                 if copes[r, c] == 1:
                     axis.add_patch(Rectangle((c - 0.46, r - 0.44), 0.92, 0.88, fill=False, lw=1.2))
@@ -74,9 +76,11 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
                 range(len(sweep.coverages)), [f"{100 * share:.0f} %" for share in sweep.coverages], fontsize=7
             )
             axis.set_title(f"{system}: {quantity.heading}", fontsize=8)
-            axis.set_xlabel(sweep.x, fontsize=7)
-            axis.set_ylabel("mover coverage", fontsize=7)
-    figure.suptitle(f"Limit of dynamics; framed: ATE RMSE ≤ {100 * LARGEST_ATE:g} cm and no frame lost", fontsize=9)
+        line[0].set_ylabel("mover coverage", fontsize=7)
+    for axis in axes[-1]:
+        axis.set_xlabel(sweep.x, fontsize=7)
+    copes_if = f"framed: ATE RMSE ≤ {100 * LARGEST_ATE:g} cm and no frame lost"
+    figure.suptitle(f"Limit of dynamics; {copes_if}; *: error of the frames not lost", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
 
@@ -91,7 +95,7 @@ def _colors(shown: NDArray[np.float64], quantity: Quantity) -> NDArray[np.float6
     else:
         share = (shown - quantity.low) / (quantity.high - quantity.low)
     colors = colormaps["RdYlGn_r" if quantity.good_is_low else "RdYlGn"](np.nan_to_num(share))
-    colors[..., :3] = 0.25 + 0.75 * colors[..., :3]  # pale, so that the numbers can be read
+    colors[..., :3] = 0.35 + 0.65 * colors[..., :3]  # pale, so that the numbers can be read
     colors[np.isnan(shown), 3] = 0.0
     return colors
 
@@ -106,3 +110,24 @@ def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[st
             body.append([str(x), *("none" if share is None else f"{100 * share:.0f} %" for share in reached)])
         text += f"\n{grid([sweep.x, *systems], body, words=1)}"
     return text
+
+
+def cells_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
+    """Every cell of every sweep as Markdown: ATE in cm and the share of frames lost; bold where the system copes."""
+    text = ""
+    for sweep in sweeps:
+        found = {(row["x"], row["coverage"], row["system"]): row for row in rows if row["sweep"] == sweep.name}
+        body = [
+            [str(x), f"{100 * coverage:.0f} %", *(_cell(found.get((x, coverage, name), {})) for name in systems)]
+            for x in sweep.xs
+            for coverage in sweep.coverages
+        ]
+        text += f"\n{grid([sweep.x, 'coverage', *systems], body)}"
+    return text
+
+
+def _cell(row: Row) -> str:
+    if row.get("ate_rmse_m") is None:
+        return "no pose" if row.get("error") else ""
+    text = f"{100 * row['ate_rmse_m']:.1f}" + (f" ({100 * row['lost_share']:.0f} % lost)" if row["lost"] else "")
+    return f"**{text}**" if row["copes"] else text

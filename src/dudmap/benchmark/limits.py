@@ -59,8 +59,8 @@ class Sweep(NamedTuple):
 
 SWEEPS = (
     Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9)),
-    Sweep("start", "share of frames with movers, from the first on", (0.25, 0.5, 1.0), (0.1, 0.3, 0.5)),
-    Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.5, 0.7)),
+    Sweep("start", "share of frames with movers, from the first on", (0.25, 0.5, 1.0), (0.2, 0.4, 0.6)),
+    Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.7)),
 )
 QUICK_SWEEPS = (
     Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.3, 0.8)),
@@ -206,7 +206,7 @@ def measure_cells(
         done: Called with the number of conditions that are finished in addition.
     """
     kept.mkdir(parents=True, exist_ok=True)
-    found = sorted({cell.condition for cell in cells}, key=lambda condition: condition.camera_path)
+    found = sorted(dict.fromkeys(cell.condition for cell in cells), key=lambda condition: condition.camera_path)
     files = {(c, name): kept / f"{_fingerprint(c, config)}.json" for c in found for name, config in systems.items()}
     wanted = [
         (condition, {name: (systems[name], files[condition, name]) for name in missing})

@@ -14,7 +14,7 @@ SYSTEMS: dict[str, tuple[str, ...]] = {
         "volume.truncation_behind_voxels=10",
     ),
     "none": ("dynamics.method=none",),
-    "em": ("dynamics.free_space=false", "dynamics.regions=false"),
+    "em": ("dynamics.free_space=false", "dynamics.regions=false", "dynamics.start_seconds=0"),
 }
 """What each differs in from the default configuration: the default itself, the thesis' values, the threshold-and-flood
 rule of the thesis' ancestor with its threshold of 7 cm and the band of 10 cm that this needs, no dynamic handling at

@@ -112,7 +112,7 @@ def limits(
     What the same code has measured before into the same folder is not measured again: a run that was stopped goes on.
     """
     from dudmap.benchmark import limits as sweeping
-    from dudmap.benchmark.heatmaps import limits_table, save_heat_maps
+    from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
     from dudmap.benchmark.systems import systems as find_systems
     from dudmap.benchmark.table import save
     from dudmap.metrics import machine, versions
@@ -126,6 +126,8 @@ def limits(
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest share of the image that may move, ATE RMSE at most 2 cm and no frame lost:\n"
     text += limits_table(rows, sweeps, list(wanted))
+    text += "\nATE RMSE in cm, and the share of frames lost; bold: the system copes:\n"
+    text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     typer.echo(text)
     typer.echo(f"written to {out}")

@@ -44,6 +44,10 @@ def run(
         bool,
         typer.Option("--live", help="Frames arrive at the sensor's rate; those there is no time for are dropped."),
     ] = False,
+    passes: Annotated[
+        int,
+        typer.Option("--passes", min=1, max=2, help="2: once more with what the whole recording tells; no ghosts."),
+    ] = 1,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -59,7 +63,7 @@ def run(
     out = out or free_folder(Path("runs") / recording.name)
     report = run_sequence(
         recording, parameters, out,
-        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live,
+        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

@@ -1,0 +1,119 @@
+"""Motion from image to image against the truth of synthetic worlds and against numerical derivatives."""
+
+import numpy as np
+import pytest
+
+from dudmap import se3, synthetic
+from dudmap.camera import Camera
+from dudmap.config import Config
+from dudmap.kernels import labeling
+from dudmap.parallax import _flow_jacobian, _projected, dominant_motion
+from dudmap.slam import Slam
+
+CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+
+
+@pytest.fixture(scope="module")
+def crowd():
+    """People who hide about half of the image from the first frame on."""
+    return synthetic.sequence("room", coverage=0.5, start_dynamic=True, frames=22, camera=CAMERA, noise="kinect")
+
+
+def levels(sequence, index):
+    slam = Slam(sequence.camera, Config())
+    return slam._compared(slam._levels(slam.preprocess(sequence[index])))
+
+
+def test_the_flow_jacobian_is_the_derivative_of_the_projection():
+    rng = np.random.default_rng(3)
+    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (20, 3))
+    J = _flow_jacobian(points, CAMERA)
+    for axis in range(6):
+        step = 1e-6 * np.eye(6)[axis]
+        numeric = (_projected(se3.exp(step), points, CAMERA) - _projected(se3.exp(-step), points, CAMERA)) / 2e-6
+        np.testing.assert_allclose(J[:, :, axis], numeric, rtol=1e-5, atol=1e-4)
+
+
+@pytest.mark.parametrize("index", [0, 6, 20])
+def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
+    (before, small), (after, small_after) = levels(crowd, index), levels(crowd, index + 1)
+    motion = dominant_motion(before, after, (small, small_after))
+    truth = crowd.ground_truth.Ts_world_camera
+    off = motion.T_after_before @ se3.inverse(truth[index]) @ truth[index + 1]
+    assert np.linalg.norm(off[:3, 3]) < 0.006
+    assert np.degrees(se3.rotation_angle(off)) < 0.15
+    mask = crowd.mask(index)[1::2, 1::2] & (small.depth > 0)
+    assert mask.mean() > 0.3
+    assert np.count_nonzero(motion.moving_before & mask) > 0.85 * np.count_nonzero(mask)
+    assert np.count_nonzero(motion.moving_before & ~mask) < 0.05 * mask.size
+
+
+def test_nothing_moves_in_a_still_room():
+    room = synthetic.sequence("room", movers=(), frames=8, camera=CAMERA, noise="kinect")
+    (before, small), (after, small_after) = levels(room, 4), levels(room, 5)
+    motion = dominant_motion(before, after, (small, small_after))
+    assert motion.share > 0.9
+    assert motion.moving_after.mean() < 0.01
+
+
+def test_images_without_corners_tell_nothing(crowd):
+    before, small = levels(crowd, 0)
+    from dataclasses import replace
+
+    blank = replace(before, intensity=np.full_like(before.intensity, 0.5))
+    assert dominant_motion(blank, blank, (small, small)) is None
+
+
+def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
+    truth = crowd.ground_truth.Ts_world_camera
+    largest = {}
+    for seconds in (1.0, 0.0):
+        slam = Slam(crowd.camera, Config().override([f"dynamics.start_seconds={seconds}"]))
+        results = [slam.process(crowd[index]) for index in range(len(crowd))]
+        off = [
+            (se3.inverse(truth[0]) @ truth[index])[:3, 3] - result.T_world_camera[:3, 3]
+            for index, result in enumerate(results)
+            if result.T_world_camera is not None
+        ]
+        largest[seconds] = np.linalg.norm(off, axis=1).max()
+    assert largest[1.0] < 0.02
+    assert largest[0.0] > 0.1  # so that it was the parallax that helped
+
+
+def test_a_second_pass_knows_what_the_first_frames_could_not():
+    people = synthetic.sequence("room", coverage=0.3, start_dynamic=True, frames=60, camera=CAMERA, noise="kinect")
+    frames, masks = [people[index] for index in range(60)], [people.mask(index) for index in range(60)]
+
+    def overlap(results):
+        both = sum(np.count_nonzero(r.dynamic_mask & m) for r, m in zip(results, masks, strict=False))
+        return both / sum(np.count_nonzero(r.dynamic_mask | m) for r, m in zip(results, masks, strict=False))
+
+    first = Slam(people.camera)
+    once = [first.process(frame) for frame in frames]
+    second = Slam(people.camera, first_pass=first)
+    twice = [second.process(frame) for frame in frames]
+    assert {result.state for result in twice} == {"tracked"}
+    assert overlap(twice[:10]) > overlap(once[:10])
+    assert overlap(twice) > 0.85  # the target for people
+
+
+def test_labels_at_full_size_take_after_the_low_pixel_most_alike_in_depth():
+    rng = np.random.default_rng(0)
+    depth = rng.uniform(0.5, 4, (48, 64)).astype(np.float32)
+    depth[rng.random(depth.shape) < 0.2] = 0
+    low_depth = np.ascontiguousarray(depth[2::4, 2::4])
+    low = (rng.random(low_depth.shape) < 0.3).astype(np.uint8)
+    low[:4] = 0
+    out = np.empty(depth.shape, np.uint8)
+    labeling.upsample(0, 48, low, low_depth, depth, 4, out)
+    for v in range(48):
+        for u in range(64):
+            y, x = (2 * v - 3) // 8, (2 * u - 3) // 8  # centre of low pixel k: 4 k + 1.5
+            best, label = np.inf, 0
+            for i, j in ((y, x), (y, x + 1), (y + 1, x), (y + 1, x + 1)):
+                i, j = min(max(i, 0), 11), min(max(j, 0), 15)
+                a, b = low_depth[i, j], depth[v, u]
+                gap = abs(a - b) if (a > 0) == (b > 0) else 1e6
+                if gap < best or (gap == best and low[i, j] > label):
+                    best, label = gap, low[i, j]
+            assert out[v, u] == label
