@@ -428,20 +428,19 @@ class TsdfVolume:
         parity = self._frame_number % 2
         ranges = bands(int(self._shape[0]) // 2, 8)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
-        counts = run_bands(
+        numbers = run_bands(
             lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
                 self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
-                np.float32(self.depth_max), out,
+                np.float32(self.depth_max), self._free_count, count, out,
             ),
             ranges, found,
         )  # fmt: skip
-        cells = np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)])
-        if len(cells) == 0:
-            return
-        entries = self._entries_of(cells) if np.any(self._window[cells] == -1) else -2 - self._window[cells]
-        self._window[cells] = -2 - entries
-        self._free_count[entries] = np.minimum(self._free_count[entries].astype(np.int32) + count, 255)
+        cells = np.concatenate([out[:number] for out, number in zip(found, numbers, strict=True)])
+        if len(cells) > 0:
+            entries = self._entries_of(cells)
+            self._window[cells] = -2 - entries
+            self._free_count[entries] = min(count, 255)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 

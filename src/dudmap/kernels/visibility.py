@@ -134,9 +134,26 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
 
 @kernel
 def observe_free(
-    x_start, x_stop, x_step, window, shape, origin, T, intrinsics, size, edge, nearest, valid, bands, depth_max, found
+    x_start,
+    x_stop,
+    x_step,
+    window,
+    shape,
+    origin,
+    T,
+    intrinsics,
+    size,
+    edge,
+    nearest,
+    valid,
+    bands,
+    depth_max,
+    counts,
+    more,
+    found,
 ):
-    """Window cells without voxels that lie wholly in front of everything a depth image shows.
+    """Count more observations of emptiness for window cells without voxels that lie wholly in front of everything
+    a depth image shows; those that nothing is known of yet are listed instead.
 
     Works on columns of the window, so that only the view frustum is visited.
 
@@ -151,7 +168,9 @@ def observe_free(
         nearest, valid: Depth tiles, see ``tile_ranges``.
         bands: See ``mark_blocks``.
         depth_max: Farthest reading, metres.
-        found: (n,) int32 out.
+        counts: (entries,) uint8, observations of emptiness by entry; changed here.
+        more: Observations that are counted.
+        found: (n,) int32 out, cells without an entry.
 
     Returns:
         How many cells were found; never more than ``len(found)``.
@@ -218,7 +237,12 @@ def observe_free(
                         tiles += 1
                 if share < np.float32(0.6) * np.float32(tiles):
                     continue
-                if z + radius < near - max(front, noise * (base + scale * near * near)) and count < len(found):
-                    found[count] = cell
-                    count += 1
+                if z + radius < near - max(front, noise * (base + scale * near * near)):
+                    known = window[cell]
+                    if known <= -2:
+                        entry = np.uintp(-2 - known)
+                        counts[entry] = min(np.int64(counts[entry]) + more, 255)
+                    elif count < len(found):
+                        found[count] = cell
+                        count += 1
     return count
