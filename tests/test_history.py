@@ -6,6 +6,7 @@ import pytest
 import dudmap.synthetic
 from dudmap import se3
 from dudmap.camera import Camera
+from dudmap.errors import MapError
 from dudmap.frame import Frame
 from dudmap.history import DEPTH_UNIT, History
 from dudmap.volume import TsdfVolume
@@ -56,6 +57,17 @@ def test_like_frames_count_towards_the_last_kept_one():
     turn = shifted(0.09) @ se3.exp([0, 0, 0, 0, np.radians(5.5), 0])
     assert history.add(frame, everything, turn)
     assert history.add(frame, everything, turn, submap=1)  # another map
+
+
+def test_a_full_disk_is_one_sentence(monkeypatch):
+    def full(*args, **kwargs):
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("dudmap.history.tempfile.TemporaryFile", full)
+    history = History(CAMERA, gap=1)
+    history.add(smooth_frame(np.random.default_rng(3), 0.0), np.ones((120, 160), dtype=bool), shifted(0))
+    with pytest.raises(MapError, match=r"No space left.*TMPDIR"):
+        history[0]
 
 
 @pytest.fixture(scope="module")

@@ -152,7 +152,7 @@ def test_lines_of_the_file(tmp_path):
     for stamp, found in [(1.5, movers), (1.6, ())]:
         record.add(
             SimpleNamespace(
-                timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, movers=found,
+                timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False, movers=found,
                 dynamic_share=0.1, timings={}, labels=None,
             ), 1.0, 1.0, None,
         )  # fmt: skip

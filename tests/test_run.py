@@ -36,6 +36,7 @@ class Result:
     fused: bool = True
     skipped_similar: bool = False
     relocalized: bool = False
+    corrected: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None
@@ -68,6 +69,10 @@ class StandIn:
     @property
     def trajectory(self):
         return Trajectory.from_poses(self.poses)
+
+    @property
+    def maps(self):
+        return [(self.trajectory, self.volume)]
 
     def process(self, frame):
         index = len(self.frames)

@@ -217,7 +217,7 @@ class LoopsConfig(Part):
     """Compare new views with places not seen for a while, and correct the trajectory and the map."""
     min_age: float = Field(default=5.0, gt=0)
     """A place counts as seen again if the camera has not been near for this long, seconds."""
-    gap: int = Field(default=20, ge=1)
+    gap: int = Field(default=15, ge=1)
     """Frames between two attempts at least."""
     min_distance: float = Field(default=0.02, ge=0)
     """Smaller corrections than this, metres,"""

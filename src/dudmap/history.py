@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dudmap import se3
 from dudmap.camera import Camera
+from dudmap.errors import MapError
 from dudmap.frame import Frame
 from dudmap.volume import TsdfVolume
 
@@ -153,12 +154,18 @@ class History:
         """Bring packed frames to the file until at most so many are left."""
         while self._pending and (len(self._pending) > may_wait or self._pending[0].done()):
             parts = self._pending.popleft().result()
-            if self._file is None:
-                self._file = tempfile.TemporaryFile(prefix="dudmap-")
-                weakref.finalize(self, self._file.close)
-            start = self._file.seek(0, 2)
-            for part in parts:
-                self._file.write(part)
+            try:
+                if self._file is None:
+                    self._file = tempfile.TemporaryFile(prefix="dudmap-")
+                    weakref.finalize(self, self._file.close)
+                start = self._file.seek(0, 2)
+                for part in parts:
+                    self._file.write(part)
+            except OSError as error:
+                raise MapError(
+                    f"fused frames cannot be kept in {tempfile.gettempdir()}: {error}; make room there, name another "
+                    "folder in the environment variable TMPDIR, or switch off loops.enabled and submaps.enabled"
+                ) from error
             self._places.append((start, len(parts[0]), len(parts[1]), len(parts[2])))
 
 

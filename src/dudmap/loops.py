@@ -1,5 +1,7 @@
 """Known places seen again: the drift since then is measured, spread over the trajectory, and taken out of the map."""
 
+import weakref
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -19,7 +21,9 @@ from dudmap.volume import TsdfVolume
 NEAR = 0.5, 30.0
 """A keyframe within this distance (m) and angle (deg) is being seen; frames that close to it show its place."""
 EVERY = 5
-"""Frames from one look at which keyframes are near to the next."""
+"""Frames from one look at which keyframes are near to the next, and from a comparison of features to its outcome."""
+SAME = 0.03, 1.0
+"""Corrections measured by two frames are the same if they differ by less than this, metres and degrees."""
 LOCAL = 8
 """Kept frames that the map of a place is built of, to register a frame against it."""
 COMPARED = 12
@@ -51,6 +55,23 @@ class View:
     tracked: TrackingResult
 
 
+@dataclass(frozen=True, eq=False)
+class Search:
+    """A frame that is being compared with keyframes.
+
+    Attributes:
+        view: The frame.
+        submap: That it was tracked in.
+        places: What it is found to show.
+        due: Number of the frame at which that is decided on.
+    """
+
+    view: View
+    submap: int
+    places: "Future[list[Place]]"
+    due: int
+
+
 class LoopCloser:
     """Looks for places seen before, and corrects what the tracking has drifted since.
 
@@ -70,38 +91,54 @@ class LoopCloser:
         self.tracker = tracker
         self.closed = 0
         self._count = 0
-        self._last_attempt = -config.loops.gap
+        self._next_attempt = 0
+        self._failures = 0
         self._num_keyframes = 0
+        self._search: Search | None = None
+        self._searcher: ThreadPoolExecutor | None = None
         self._pending: tuple[int, NDArray[np.float64]] | None = None  # submap and correction a first frame measured
         self._edges: list[Edge] = []
 
     def close(self, view: View, health: TrackingHealth) -> NDArray[np.float64] | None:
-        """Correct the atlas if this frame shows a place from which the tracking has drifted, or of another submap.
+        """Correct the atlas if a frame shows a place from which the tracking has drifted, or one of another submap.
+
+        The features are compared beside the next frames; a frame's places are decided on a fixed number of frames
+        later, so that the same recording always gives the same result.
 
         Returns:
             (4, 4) motion of the frame's pose by the correction, None where nothing was corrected.
         """
-        keyframes = self.atlas.keyframes.keyframes
         self._count += 1
+        if self._search is not None:
+            if self._count < self._search.due:
+                return None
+            search, self._search = self._search, None
+            if search.submap == self.atlas.current:
+                return self._decide(search, health)
+        keyframes = self.atlas.keyframes.keyframes
         new_keyframe, self._num_keyframes = len(keyframes) > self._num_keyframes, len(keyframes)
         if not new_keyframe and self._count % EVERY:
             return None
-        now, T = view.observation.timestamp, view.tracked.T_world_camera
-        near = self.atlas.keyframes.near(T, self.atlas.current, *NEAR)
+        now = view.observation.timestamp
+        near = self.atlas.keyframes.near(view.tracked.T_world_camera, self.atlas.current, *NEAR)
         returned = any(self._old(keyframe, now) for keyframe in near)
         among = [keyframe for keyframe in keyframes if self._candidate(keyframe, now)]
-        due = self._count - self._last_attempt >= (EVERY if self._pending else self.config.loops.gap)
         wanted = new_keyframe or returned or self._pending or len(self.atlas.volumes) > 1
-        if among and wanted and due:
-            self._last_attempt = self._count
-            correction, confirmed = self._attempt(view, among, health)
-            if correction is not None:
-                return correction
-            returned = returned and not confirmed
+        if among and wanted and self._count >= self._next_attempt:
+            self._look(view, among)
         if not returned:  # what has come back stays unseen until it is decided
-            for keyframe in near:
-                keyframe.last_seen = now
+            _see(near, now)
         return None
+
+    def _look(self, view: View, among: list[Keyframe]) -> None:
+        """Compare a frame with these keyframes, in a thread of its own."""
+        if self._searcher is None:
+            self._searcher = ThreadPoolExecutor(1, thread_name_prefix="dudmap-loops")
+            weakref.finalize(self, self._searcher.shutdown, wait=False)
+        features = self.atlas.keyframes.features(view.observation, view.static_mask)
+        places = self._searcher.submit(self.atlas.keyframes.match, features, among)
+        self._search = Search(view, self.atlas.current, places, self._count + EVERY)
+        self._next_attempt = self._count + self.config.loops.gap
 
     def _old(self, keyframe: Keyframe, now: float) -> bool:
         return now - keyframe.last_seen > self.config.loops.min_age
@@ -111,41 +148,39 @@ class LoopCloser:
             return self.config.submaps.enabled
         return self.config.loops.enabled and self._old(keyframe, now)
 
-    def _attempt(
-        self, view: View, among: list[Keyframe], health: TrackingHealth
-    ) -> tuple[NDArray[np.float64] | None, bool]:
-        """Correction that was made, None if none; and whether the place was recognised where it should be."""
-        places = self.atlas.keyframes.match(self.atlas.keyframes.features(view.observation, view.static_mask), among)
-        T = view.tracked.T_world_camera
-        for place in places[:2]:
+    def _decide(self, search: "Search", health: TrackingHealth) -> NDArray[np.float64] | None:
+        """Correction by the places that a frame was found to show, None if none was made."""
+        view, T = search.view, search.view.tracked.T_world_camera
+        pending, self._pending = self._pending, None
+        for place in search.places.result()[:2]:
             submap = place.keyframe.submap
             same = submap == self.atlas.current
             noise = 1.5 * self.config.loops.min_distance, 1.5 * self.config.loops.min_angle_deg
             if same and agree(place.T_world_camera, T, *noise):
-                return None, self._confirm(place, view)
+                return self._confirm(place, view)
             if same and not self._believable(place, T):
                 continue
             T_found = self._registered(place, view, health)
-            if T_found is None:
+            if T_found is None:  # in vain, and dear: the next time later
+                self._failures += 1
+                self._next_attempt = self._count + self._failures * self.config.loops.gap
                 continue
+            self._failures = 0
             if same and agree(T_found, T, self.config.loops.min_distance, self.config.loops.min_angle_deg):
-                return None, self._confirm(place, view)
+                return self._confirm(place, view)
             correction = T_found @ se3.inverse(T)
-            pending, self._pending = self._pending, (submap, correction)
-            if pending is None or pending[0] != submap or not agree(pending[1] @ T, T_found, 0.03, 1.0):
-                return None, False  # a second frame must say the same
-            self._pending = None
-            if not same:
-                return self._join(submap, correction), True
-            return self._correct(place, view, T_found), True
-        self._pending = None
-        return None, False
+            if pending is None or pending[0] != submap or not agree(pending[1] @ T, T_found, *SAME):
+                self._pending = submap, correction  # a second frame must say the same
+                self._next_attempt = self._count
+                return None
+            return self._correct(place, view, T_found) if same else self._join(submap, correction)
+        return None
 
-    def _confirm(self, place: Place, view: View) -> bool:
+    def _confirm(self, place: Place, view: View) -> None:
         """Remember that there was no drift between a place and now: later corrections leave that part alone."""
-        self._pending = None
-        self._edges += self._edge(place, view, view.tracked.T_world_camera)
-        return True
+        T = view.tracked.T_world_camera
+        self._edges += self._edge(place, view, T)
+        _see(self.atlas.keyframes.near(T, self.atlas.current, *NEAR), view.observation.timestamp)
 
     def _edge(self, place: Place, view: View, T_world_camera: NDArray[np.float64]) -> list[Edge]:
         """Measured motion from a kept frame of a place to the newest kept frame; none if they are the same."""
@@ -266,6 +301,11 @@ class LoopCloser:
             return T_other_current
         self.atlas.join(other, current, se3.inverse(T_other_current))
         return np.eye(4)
+
+
+def _see(keyframes: list[Keyframe], now: float) -> None:
+    for keyframe in keyframes:
+        keyframe.last_seen = now
 
 
 def _tracked_edge(i: int, Ts: NDArray[np.float64]) -> Edge:

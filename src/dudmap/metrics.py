@@ -50,6 +50,7 @@ class RunRecord:
     fused: int = 0
     skipped_similar: int = 0
     relocalized: int = 0
+    corrected: int = 0
     masked: int | None = None
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -82,6 +83,7 @@ class RunRecord:
         self.fused += result.fused
         self.skipped_similar += result.skipped_similar
         self.relocalized += result.relocalized
+        self.corrected += result.corrected
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -129,6 +131,7 @@ class RunRecord:
             "skipped_similar": self.skipped_similar,
             "lost": len(self.lost),
             "relocalized": self.relocalized,
+            "corrected": self.corrected,
             "unreadable": len(self.unreadable),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),

@@ -7,6 +7,7 @@ from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -106,8 +107,10 @@ def run(
     metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it),
     movers.jsonl (one JSON object per frame with moving bodies: timestamp and, of each body, id, centroid, box,
     velocity, speed and pixels; metres, m/s, world frame), the true trajectory as groundtruth.txt where it is known
-    and, if asked for, masks/<timestamp>.png (255 = dynamic). Results of an earlier run in the same folder are removed
-    first. If anything stops the run, what was computed so far is written all the same.
+    and, if asked for, masks/<timestamp>.png (255 = dynamic). Where the camera was lost and what it showed then was
+    never joined with the rest, the largest map is written, and the others as trajectory-2.txt and mesh-2.ply and so on,
+    each in a world of its own. Results of an earlier run in the same folder are removed first. If anything stops the
+    run, what was computed so far is written all the same.
 
     Args:
         sequence: The recording; its ground truth and masks are used for scoring only.
@@ -168,6 +171,8 @@ def run(
                         _process(
                             turn, slam, record, display, out if save_masks and last else None, observe if last else None
                         )
+            if len(slam.maps) > 1:
+                display.note(_apart(slam))
             if record.dropped:
                 display.note(f"live: {record.dropped} of {count} frames dropped; the newest was always taken")
         except KeyboardInterrupt:
@@ -189,6 +194,13 @@ def run(
     if not record.rows:
         raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
     return report
+
+
+def _apart(slam: "Slam") -> str:
+    """Sentence on maps that are not connected."""
+    main, *others = (len(trajectory) for trajectory, _ in slam.maps)
+    names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
+    return f"places were not recognised after a loss: the main map has {main} frames; beside it there is {names}"
 
 
 def _of_second(finished: object) -> str:
@@ -324,6 +336,8 @@ def _prepare(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
+        for part in (*out.glob("trajectory-[0-9]*.txt"), *out.glob("mesh-[0-9]*.ply")):
+            part.unlink()
         if save_masks:
             (out / "masks").mkdir(exist_ok=True)
     except OSError as error:
@@ -345,14 +359,15 @@ def _write(
     Raises:
         DudmapError: A file could not be written.
     """
-    trajectory = slam.trajectory
+    (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= record.metrics()
-    sizes = {"map_blocks": slam.volume.num_blocks, "map_bytes": slam.volume.num_bytes}
+    sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
+    metrics["maps"] = len(others) + 1
 
     def save_mesh() -> None:
-        mesh = slam.volume.extract_mesh()
+        mesh = volume.extract_mesh()
         metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
         mesh.save(out / "mesh.ply")
 
@@ -373,10 +388,15 @@ def _write(
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))
-    if not slam.volume.is_empty:
+    if not volume.is_empty:
         steps.append(save_mesh)
         if save_map:
-            steps.append(lambda: slam.volume.save(out / "map.npz"))
+            steps.append(lambda: volume.save(out / "map.npz"))
+    for number, (path, part) in enumerate(others, start=2):
+        steps += [
+            partial(path.save, out / f"trajectory-{number}.txt"),
+            lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
+        ]
     problems = []
     try:
         for step in steps:

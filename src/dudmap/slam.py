@@ -124,6 +124,11 @@ class Slam:
         """Poses of all frames tracked so far in the submap with the most frames, as they are known now."""
         return self.atlas.trajectory(self.atlas.by_size()[0])
 
+    @property
+    def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
+        """Trajectory and map of each submap, that with the most frames first; each has a world of its own."""
+        return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
     def process(self, frame: Frame, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
 
@@ -321,6 +326,7 @@ class Slam:
         with clock("recognise"):
             candidates = self.keyframes.find(observation, None if known is None else ~known)
         lost_in = self.atlas.current
+        candidates.sort(key=lambda place: place.keyframe.submap != lost_in)  # rather stay than change the map
         for place in candidates:
             T_world_camera, self.atlas.current = place.T_world_camera, place.keyframe.submap
             tracked, labels = self._register(levels, T_world_camera, known, clock)

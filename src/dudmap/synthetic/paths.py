@@ -113,6 +113,17 @@ def _dolly(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     return _shaken(_aimed(scene, eyes, np.tile(scene.target, (len(times), 1))), _tremor(rng, times, np.radians(0.06)))
 
 
+def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
+    """Turn once round about the vertical and 45 degrees on, so that the end shows the start again."""
+    share = times / max(times[-1], 1e-9)
+    angle = np.radians(405.0) * share
+    offset = scene.target - scene.home[:3, 3]
+    c, s = np.cos(angle), np.sin(angle)
+    aims = np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1)
+    eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, 0.1 * scene.mover_scale))
+    return _shaken(_aimed(scene, eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
+
+
 def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: Mover) -> Array:
     """Keep a mover in the middle of the image, with the delay of a hand; look at the target while it is away."""
 
@@ -135,6 +146,7 @@ PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {
     "pan": _pan,
     "orbit": _orbit,
     "dolly": _dolly,
+    "round": _round,
 }
 FOLLOW = "follow"
 

@@ -1,0 +1,194 @@
+"""Loops and submaps: drift that is found and taken out, maps that are joined, and nothing where there is nothing."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+import dudmap.synthetic
+from dudmap import se3
+from dudmap.atlas import Atlas, at_time
+from dudmap.camera import Camera
+from dudmap.config import Config, RelocalizationConfig
+from dudmap.evaluation.reconstruction import compare_surfaces
+from dudmap.evaluation.surface import moved
+from dudmap.frame import Frame
+from dudmap.history import History
+from dudmap.relocalization import Keyframe, Keyframes, PlacedFeatures
+from dudmap.run import run
+from dudmap.slam import Slam
+from dudmap.synthetic.recording import SyntheticSequence
+from dudmap.trajectory import Trajectory
+from dudmap.volume import TsdfVolume
+
+SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=29.5, width=80, height=60)
+
+
+def shifted(x, y=0.0):
+    T = np.eye(4)
+    T[:2, 3] = x, y
+    return T
+
+
+def test_motions_between_those_known():
+    stamps, Ts = np.array([1.0, 3.0]), np.stack([shifted(0.0), shifted(0.2)])
+    for time, x in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.05), (3.0, 0.2), (9.0, 0.2)):
+        np.testing.assert_allclose(at_time(stamps, Ts, time), shifted(x), atol=1e-12)
+
+
+def wall(timestamp):
+    rng = np.random.default_rng(1)
+    color = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)
+    return Frame(timestamp, np.full((60, 80), 1.0, np.float32), color)
+
+
+def made_up_atlas(submaps):
+    """An atlas with one frame a second at x = the time, all kept, in the submaps given."""
+    keyframes = Keyframes(RelocalizationConfig(), TINY)
+    atlas = Atlas(lambda: TsdfVolume(TINY), keyframes, History(TINY, gap=1))
+    everything = np.ones((60, 80), dtype=bool)
+    for second, submap in enumerate(submaps):
+        if submap not in atlas.volumes:
+            atlas.start_submap()
+        T = shifted(0.01 * second)
+        atlas.volume.integrate(wall(second), T)
+        atlas.history.add(wall(second), everything, T, submap)
+        atlas.add_pose(second, T)
+        keyframes.keyframes.append(
+            Keyframe(second, T.copy(), PlacedFeatures(np.empty((0, 128)), np.empty((0, 3))), submap)
+        )
+    return atlas
+
+
+def test_everything_moves_along_with_a_correction():
+    atlas = made_up_atlas([0, 0, 0])
+    atlas.poses.insert(2, replace(atlas.poses[1], timestamp=1.5))  # a frame between two kept ones
+    volume, volume_before = atlas.make_volume(), atlas.volume
+    atlas.history.reintegrate(volume)
+    Ts_new = np.stack([shifted(0.0), shifted(0.01, 0.02), shifted(0.02, 0.04)])
+    motion = atlas.correct([0, 1, 2], Ts_new, volume)
+    np.testing.assert_allclose(motion, shifted(0.0, 0.04), atol=1e-12)
+    assert [round(pose.T_world_camera[1, 3], 6) for pose in atlas.poses] == [0, 0.02, 0.03, 0.04]
+    assert [round(known.T_world_camera[1, 3], 6) for known in atlas.keyframes.keyframes] == [0, 0.02, 0.04]
+    np.testing.assert_allclose(atlas.history.Ts_world_camera, Ts_new)
+    assert atlas.volume is volume_before  # views of the map stay connected
+    assert atlas.volume.born == volume.born
+
+
+def test_join_brings_one_map_into_the_other():
+    atlas = made_up_atlas([0, 0, 0, 1, 1])
+    assert atlas.by_size() == [0, 1]
+    assert len(atlas.trajectory(1)) == 2
+    blocks = atlas.volumes[0].num_blocks
+    atlas.join(1, 0, shifted(0.0, 0.5))
+    assert list(atlas.volumes) == [0]
+    assert atlas.current == 0
+    assert atlas.volume.num_blocks > blocks
+    trajectory = atlas.trajectory(0)
+    np.testing.assert_allclose(trajectory.Ts_world_camera[:, 1, 3], [0, 0, 0, 0.5, 0.5])
+    np.testing.assert_allclose(trajectory.Ts_world_camera[:, 0, 3], 0.01 * np.arange(5))
+    assert {known.submap for known in atlas.keyframes.keyframes} == set(atlas.history.submaps) == {0}
+
+
+def turned(yaw, fps=15.0):
+    """The room from one place, turned about the vertical by these angles (degrees), one per frame."""
+    base = dudmap.synthetic.sequence(
+        movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=fps, noise="realsense"
+    )
+    Ts = base.ground_truth.Ts_world_camera.copy()
+    up = base.scene.home[:3, 1]
+    for T, angle in zip(Ts, np.radians(yaw), strict=True):
+        T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), angle * up]))[:3, :3] @ T[:3, :3]
+    return SyntheticSequence(base.scene, [], Trajectory(base.timestamps, Ts), SMALL, noise="realsense", seed=1, fps=fps)
+
+
+def there_and_back(sequence, results):
+    """Errors (m, deg) of the last pose against the first: what a loop must close."""
+    Ts = sequence.ground_truth.Ts_world_camera
+    true = se3.inverse(Ts[0]) @ Ts[-1]
+    gap = se3.inverse(true) @ results.Ts_world_camera[-1]
+    return np.linalg.norm(gap[:3, 3]), np.degrees(se3.rotation_angle(gap))
+
+
+@pytest.fixture(scope="module")
+def round_trip():
+    """Once round and on, seen through a lens whose focal length is believed 1.5 % too long: the angles drift."""
+    sequence = turned(np.concatenate([np.linspace(0, 360, 170), np.linspace(361.5, 385, 16), np.full(34, 385.0)]))
+    camera = replace(SMALL, fx=SMALL.fx * 1.015, fy=SMALL.fy * 1.015)
+    return sequence, camera, [sequence[i] for i in range(len(sequence))]
+
+
+@pytest.mark.slow
+def test_a_loop_takes_the_drift_out(round_trip):
+    sequence, camera, frames = round_trip
+    gaps, maps = {}, {}
+    Ts = sequence.ground_truth.Ts_world_camera
+    for enabled in (True, False):
+        slam = Slam(camera, Config().override([f"loops.enabled={str(enabled).lower()}"]))
+        results = [slam.process(frame) for frame in frames]
+        assert all(result.state == "tracked" for result in results)
+        assert sum(result.corrected for result in results) == slam.loops.closed == int(enabled)
+        gaps[enabled] = there_and_back(sequence, slam.trajectory)
+        mesh = moved(slam.volume.extract_mesh(), Ts[0])
+        maps[enabled] = compare_surfaces(mesh, sequence.surface(), samples=30_000)
+        print(f"loops {enabled}: end off by {gaps[enabled][0]:.3f} m, {gaps[enabled][1]:.2f} deg; map off by "
+              f"{maps[enabled].accuracy.mean:.3f} m, ghosts {maps[enabled].ghost_share:.1%}")  # fmt: skip
+        np.testing.assert_allclose(results[-1].T_world_camera, slam.trajectory.Ts_world_camera[-1])
+    assert gaps[False][1] > 3
+    assert gaps[True][1] < 0.3 * gaps[False][1]
+    assert gaps[True][0] < 0.5 * gaps[False][0]
+    assert maps[True].accuracy.mean < 0.8 * maps[False].accuracy.mean
+    assert maps[True].ghost_share < 0.5 * maps[False].ghost_share
+
+
+def test_maps_are_joined_when_a_place_is_recognised():
+    """Carried elsewhere with closed eyes, a second map for a while, then a look back at the first place."""
+    yaw = np.concatenate([np.zeros(12), np.full(28, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 60)), np.zeros(20)])
+    sequence = turned(yaw)
+    slam = Slam(SMALL)
+    results = [slam.process(sequence[i]) for i in range(len(sequence))]
+    submaps = [result.submap for result in results if result.state == "tracked"]
+    assert submaps[0] == submaps[-1] == 0
+    assert 1 in submaps
+    assert sum(result.corrected for result in results) >= 1
+    assert list(slam.atlas.volumes) == [0]
+    lost = sum(result.state == "lost" for result in results)
+    assert 12 <= lost <= 18  # about the second that is waited for
+    trajectory = slam.trajectory
+    assert len(trajectory) == len(sequence) - lost
+    Ts = sequence.ground_truth.Ts_world_camera
+    of_time = {round(t, 3): T for t, T in zip(sequence.timestamps, Ts, strict=True)}
+    gaps = [
+        np.linalg.norm((se3.inverse(Ts[0]) @ of_time[round(t, 3)])[:3, 3] - T[:3, 3])
+        for t, T in zip(trajectory.timestamps, trajectory.Ts_world_camera, strict=True)
+    ]
+    assert max(gaps) < 0.05
+    assert gaps[-1] < 0.02
+
+
+def test_a_map_that_is_never_joined_is_written_beside_the_main_one(tmp_path):
+    sequence = turned(np.concatenate([np.zeros(30), np.full(24, 150.0)]))
+    report = run(sequence, Config(), tmp_path, progress=False)
+    assert report.metrics["maps"] == 2
+    assert report.metrics["lost"] >= 12
+    assert len(report.trajectory) == 30
+    second = Trajectory.load(tmp_path / "trajectory-2.txt")
+    assert len(second) == report.metrics["tracked"] - 30
+    np.testing.assert_allclose(second.Ts_world_camera[0], np.eye(4), atol=1e-9)
+    assert (tmp_path / "mesh-2.ply").stat().st_size > 1000
+    run(sequence, Config(), tmp_path, progress=False, max_frames=5)
+    assert not (tmp_path / "trajectory-2.txt").exists()
+    assert not (tmp_path / "mesh-2.ply").exists()
+
+
+def test_without_a_loop_nothing_changes():
+    sequence = turned(np.linspace(0, 40, 40))
+    on, off = Slam(SMALL), Slam(SMALL, Config().override(["loops.enabled=false", "submaps.enabled=false"]))
+    for i in range(len(sequence)):
+        a, b = on.process(sequence[i]), off.process(sequence[i])
+        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
+        assert not a.corrected
+    assert off.atlas.history is None
+    assert len(on.atlas.history) > 3
+    np.testing.assert_array_equal(on.volume.active_slots, off.volume.active_slots)
