@@ -152,8 +152,8 @@ def test_lines_of_the_file(tmp_path):
     for stamp, found in [(1.5, movers), (1.6, ())]:
         record.add(
             SimpleNamespace(
-                timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False, movers=found,
-                dynamic_share=0.1, timings={}, labels=None,
+                timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
+                movers=found, dynamic_share=0.1, timings={}, labels=None,
             ), 1.0, 1.0, None,
         )  # fmt: skip
     record.save_movers(tmp_path / "movers.jsonl")

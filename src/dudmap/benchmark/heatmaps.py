@@ -28,7 +28,7 @@ class Quantity(NamedTuple):
 QUANTITIES = (
     Quantity("ate_rmse_m", "ATE RMSE, cm", 100, 0.2, 50, True, True, "{:.2g}"),
     Quantity("mask_iou_mean", "mask IoU", 1, 0, 1, False, False, "{:.2f}"),
-    Quantity("ghost_area_m2", "ghost area, m²", 1, 0.1, 10, True, True, "{:.2g}"),
+    Quantity("ghost_area_m2", "ghost area, m²", 1, 0.5, 20, True, True, "{:.2g}"),
     Quantity("lost_share", "share of frames lost, %", 100, 0, 100, False, True, "{:.0f}"),
 )
 NOT_KNOWN = "#d0d0d0"

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from dudmap.benchmark.entries import Entry
 from dudmap.benchmark.score import SAMPLES, score_mesh, score_trajectory
+from dudmap.benchmark.systems import PASSES
 from dudmap.config import Config
 from dudmap.errors import DatasetError, DudmapError
 
@@ -47,7 +48,10 @@ def measure(job: Job) -> Row:
         DudmapError: The recording cannot be used, or nothing could be tracked.
     """
     sequence = job.entry.open()
-    row = measure_sequence(sequence, job.config, job.entry.surfaces(sequence), job.out, job.entry.max_frames)
+    row = measure_sequence(
+        sequence, job.config, job.entry.surfaces(sequence), job.out, job.entry.max_frames,
+        passes=PASSES.get(job.system, 1),
+    )  # fmt: skip
     return {"sequence": job.entry.name, "system": job.system} | row
 
 
@@ -58,6 +62,7 @@ def measure_sequence(
     out: Path | None = None,
     max_frames: int | None = None,
     samples: int = SAMPLES,
+    passes: int = 1,
 ) -> Row:
     """Figures of one run: those of its metrics.json, and how trajectory and mesh compare with the truth.
 
@@ -68,6 +73,7 @@ def measure_sequence(
         out: Folder that keeps the run; None keeps nothing.
         max_frames: Use only the first frames.
         samples: Points drawn on each surface.
+        passes: See ``dudmap.run.run``.
 
     Raises:
         DudmapError: The recording cannot be used, or nothing could be tracked.
@@ -81,7 +87,7 @@ def measure_sequence(
         folder = out or Path(temporary)
         report = run(
             sequence, config, folder,
-            max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None,
+            max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None, passes=passes,
         )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)

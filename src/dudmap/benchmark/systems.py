@@ -7,6 +7,7 @@ from dudmap.errors import ConfigError
 
 SYSTEMS: dict[str, tuple[str, ...]] = {
     "dudmap": (),
+    "two-passes": (),
     "thesis": ("preset=thesis",),
     "threshold": (
         "dynamics.method=threshold",
@@ -16,9 +17,12 @@ SYSTEMS: dict[str, tuple[str, ...]] = {
     "none": ("dynamics.method=none",),
     "em": ("dynamics.free_space=false", "dynamics.regions=false", "dynamics.start_seconds=0"),
 }
-"""What each differs in from the default configuration: the default itself, the thesis' values, the threshold-and-flood
-rule of the thesis' ancestor with its threshold of 7 cm and the band of 10 cm that this needs, no dynamic handling at
-all, and EM on the residuals alone."""
+"""What each differs in from the default configuration: the default itself, the default over the recording twice, the
+thesis' values, the threshold-and-flood rule of the thesis' ancestor with its threshold of 7 cm and the band of 10 cm
+that this needs, no dynamic handling at all, and EM on the residuals alone."""
+
+PASSES = {"two-passes": 2}
+"""Systems that go over a recording more than once."""
 
 
 def system(name: str) -> tuple[str, Config]:
