@@ -163,14 +163,14 @@ def turned_away(sequence, start, stop, yaw):
 
 
 def errors(slam, sequence, count):
-    """Per frame: (result, translation error in metres or None)."""
+    """Per frame: (result, translation error in metres, None where lost or in a map of its own)."""
     first = se3.inverse(sequence.ground_truth.Ts_world_camera[0])
     out = []
     for i in range(count):
         result = slam.process(sequence[i])
         true = first @ sequence.ground_truth.Ts_world_camera[i]
         T = result.T_world_camera
-        out.append((result, None if T is None else np.linalg.norm(T[:3, 3] - true[:3, 3])))
+        out.append((result, None if T is None or result.submap else np.linalg.norm(T[:3, 3] - true[:3, 3])))
     return out
 
 

@@ -62,12 +62,14 @@ class Search:
     Attributes:
         view: The frame.
         submap: That it was tracked in.
+        returned: Whether the camera should be where it has not been for a while.
         places: What it is found to show.
         due: Number of the frame at which that is decided on.
     """
 
     view: View
     submap: int
+    returned: bool
     places: "Future[list[Place]]"
     due: int
 
@@ -125,19 +127,19 @@ class LoopCloser:
         among = [keyframe for keyframe in keyframes if self._candidate(keyframe, now)]
         wanted = new_keyframe or returned or self._pending or len(self.atlas.volumes) > 1
         if among and wanted and self._count >= self._next_attempt:
-            self._look(view, among)
+            self._look(view, among, returned)
         if not returned:  # what has come back stays unseen until it is decided
             _see(near, now)
         return None
 
-    def _look(self, view: View, among: list[Keyframe]) -> None:
+    def _look(self, view: View, among: list[Keyframe], returned: bool) -> None:
         """Compare a frame with these keyframes, in a thread of its own."""
         if self._searcher is None:
             self._searcher = ThreadPoolExecutor(1, thread_name_prefix="dudmap-loops")
             weakref.finalize(self, self._searcher.shutdown, wait=False)
         features = self.atlas.keyframes.features(view.observation, view.static_mask)
         places = self._searcher.submit(self.atlas.keyframes.match, features, among)
-        self._search = Search(view, self.atlas.current, places, self._count + EVERY)
+        self._search = Search(view, self.atlas.current, returned, places, self._count + EVERY)
         self._next_attempt = self._count + self.config.loops.gap
 
     def _old(self, keyframe: Keyframe, now: float) -> bool:
@@ -152,6 +154,7 @@ class LoopCloser:
         """Correction by the places that a frame was found to show, None if none was made."""
         view, T = search.view, search.view.tracked.T_world_camera
         pending, self._pending = self._pending, None
+        in_vain = search.returned
         for place in search.places.result()[:2]:
             submap = place.keyframe.submap
             same = submap == self.atlas.current
@@ -161,9 +164,8 @@ class LoopCloser:
             if same and not self._believable(place, T):
                 continue
             T_found = self._registered(place, view, health)
-            if T_found is None:  # in vain, and dear: the next time later
-                self._failures += 1
-                self._next_attempt = self._count + self._failures * self.config.loops.gap
+            if T_found is None:
+                in_vain = True
                 continue
             self._failures = 0
             if same and agree(T_found, T, self.config.loops.min_distance, self.config.loops.min_angle_deg):
@@ -174,10 +176,14 @@ class LoopCloser:
                 self._next_attempt = self._count
                 return None
             return self._correct(place, view, T_found) if same else self._join(submap, correction)
+        if in_vain:  # and dear: the next time later
+            self._failures = min(self._failures + 1, 4)
+            self._next_attempt = self._count + self._failures * self.config.loops.gap
         return None
 
     def _confirm(self, place: Place, view: View) -> None:
         """Remember that there was no drift between a place and now: later corrections leave that part alone."""
+        self._failures = 0
         T = view.tracked.T_world_camera
         self._edges += self._edge(place, view, T)
         _see(self.atlas.keyframes.near(T, self.atlas.current, *NEAR), view.observation.timestamp)
