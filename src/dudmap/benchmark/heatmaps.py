@@ -66,7 +66,7 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
             axis.set_facecolor(NOT_KNOWN)
             axis.imshow(_colors(shown, quantity), origin="lower", aspect="auto")
             for (r, c), value in np.ndenumerate(shown):
-                text = "–" if np.isnan(value) else quantity.form.format(value)
+                text = "–" if np.isnan(value) else ("{:.0f}" if value >= 10 else quantity.form).format(value)
                 text += "*" if quantity.key == "ate_rmse_m" and lost[r, c] > 0 else ""
                 axis.text(c, r, text, ha="center", va="center", fontsize=7)
                 if copes[r, c] == 1:
