@@ -117,11 +117,10 @@ class History:
         self._file.seek(start)
         depth, color, mask = (self._file.read(size) for size in sizes)
         shape = self.camera.shape
-        frame = Frame(
-            self.timestamps[number],
-            _unpacked_depth(depth, shape),
-            cv2.cvtColor(cv2.imdecode(np.frombuffer(color, np.uint8), cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB),
-        )
+        bgr = cv2.imdecode(np.frombuffer(color, np.uint8), cv2.IMREAD_COLOR)
+        assert bgr is not None  # it was encoded here
+        rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        frame = Frame(self.timestamps[number], _unpacked_depth(depth, shape), rgb)
         bits = np.frombuffer(zlib.decompress(mask), np.uint8)
         static = np.unpackbits(bits, count=shape[0] * shape[1]).reshape(shape).astype(bool)
         return StoredFrame(frame, static, self.Ts_world_camera[number], self.counts[number])

@@ -240,7 +240,7 @@ def _spread(level: Level, points: NDArray[np.float64], moves: NDArray[np.bool_])
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
     low = np.zeros(coarse.shape, dtype=np.uint8)
     low[rows, columns] = votes > 0
-    labeling.upsample(0, out.shape[0], low, coarse, level.depth, stride, out)
+    labeling.upsample(0, level.depth.shape[0], low, coarse, level.depth, stride, out)
     return (out > 0) & (level.depth > 0)
 
 
