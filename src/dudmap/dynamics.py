@@ -105,7 +105,6 @@ class DynamicDetector:
         volume: TsdfVolume,
         level: Level,
         T_world_camera: NDArray[np.float64],
-        timestamp: float = 0.0,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> Labels:
         """Labels of a frame that has been registered to ``volume`` at a pose.
@@ -114,15 +113,16 @@ class DynamicDetector:
             volume: The map.
             level: The image.
             T_world_camera: (4, 4).
-            timestamp: Seconds.
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume)
-        tolerance = np.asarray(3 * self._sigma(level.depth, volume) + np.float32(0.02) * level.depth, np.float32)
+        tolerance = np.asarray(3 * sigma + np.float32(0.02) * level.depth, np.float32)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
-        histogram, edges = np.histogram(np.minimum(counted, LARGEST - 1e-3), bins=BINS, range=(0, LARGEST))
+        edges = np.linspace(0, LARGEST, BINS + 1)
+        cells = np.minimum(counted, np.float32(LARGEST - 1e-3)) * np.float32(BINS / LARGEST)
+        histogram = np.bincount(cells.astype(np.int64), minlength=BINS)
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(volume, level, sample)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
@@ -143,7 +143,7 @@ class DynamicDetector:
         if self.config.regions:
             seeds = _solid(dynamic) | (dynamic & (sample.place == FREE))
             dynamic = self._regions(seeds, evidence, level, tolerance)
-            dynamic, surface = self._whole(dynamic, seeds, sample, sigma, tolerance, level, T_world_camera, timestamp, exposure)
+            dynamic, surface = self._whole(dynamic, seeds, sample, sigma, tolerance, level, T_world_camera, exposure)
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         return Labels(probability, dynamic, mixture, histogram, sample, surface)
@@ -176,7 +176,6 @@ class DynamicDetector:
         tolerance: NDArray[np.float32],
         level: Level,
         T_world_camera: NDArray[np.float64],
-        timestamp: float,
         exposure: tuple[float, float],
     ) -> tuple[NDArray[np.bool_], surfaces.Pieces]:
         """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
@@ -187,11 +186,12 @@ class DynamicDetector:
         begun = (surface.share(seeds) >= 0.1)[surface.labels]
         dynamic = dynamic & ((sample.place != NOTHING) | moved | begun)
         gain, offset = exposure
-        difference = sample.difference + (np.float32(1 - gain) * level.intensity - np.float32(offset))
+        exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
+        difference = np.asarray(sample.difference + exposed, np.float32)
         noise = np.maximum(np.float32(self.config.noise_threshold / 3), sigma)
         verdict = surfaces.judge(surface, sample.place == SURFACE, dynamic, sample.distance, noise, difference)
         moving = dynamic | surfaces.moves_as_a_whole(verdict, surface.share(moved))[surface.labels]
-        return moving & ~self.memory.standing(timestamp, level, T_world_camera, surface, noise, moving), surface
+        return moving & ~self.memory.standing(level, T_world_camera, surface, noise, moving), surface
 
     def _threshold_and_flood(self, volume: TsdfVolume, level: Level, sample: MapSample) -> NDArray[np.bool_]:
         """The simple rule: far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019)."""

@@ -110,9 +110,8 @@ class Slam:
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.volume.is_empty:
             return self._as_recorded(self._start(frame, observation, known, clock))
-        tracked, labels = self._register(
-            frame.timestamp, levels, self.motion.predict(frame.timestamp), known, clock
-        )
+        self.detector.memory.begin(frame.timestamp)
+        tracked, labels = self._register(levels, self.motion.predict(frame.timestamp), known, clock)
         reason = (
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
@@ -136,7 +135,7 @@ class Slam:
         self._moved = None if labels is None else labels.dynamic
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
-            self.detector.memory.remember(frame.timestamp, level, tracked.T_world_camera, labels.dynamic, labels.surface)
+            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
         self._poses.append((frame.timestamp, tracked.T_world_camera))
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
@@ -173,12 +172,7 @@ class Slam:
         )  # fmt: skip
 
     def _register(
-        self,
-        timestamp: float,
-        levels: dict[int, Level],
-        T_init: NDArray[np.float64],
-        known: NDArray[np.bool_] | None,
-        clock: "Clock",
+        self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> tuple[TrackingResult, Labels | None]:
         """Register without labels, find what moves, register again without that (thesis algorithm 4).
 
@@ -191,12 +185,12 @@ class Slam:
                 tracked = self.tracker.align(self.volume, tracked_levels, T_init, unmasked)
             if self.config.dynamics.method == "none":
                 return tracked, None
-            return tracked, self._detect(timestamp, levels, tracked, known, clock)
+            return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
             weights = self._expected(tracked_levels, unmasked)
             tracked = self.tracker.align(self.volume, tracked_levels[:split], T_init, weights)
-        labels = self._detect(timestamp, levels, tracked, known, clock)
+        labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             again = tracked_levels[split - 1 :]
             tracked = self.tracker.align(
@@ -256,7 +250,7 @@ class Slam:
         with clock("recognise"):
             candidates = self.keyframes.find(observation, None if known is None else ~known)
         for T_world_camera in candidates:
-            tracked, labels = self._register(observation.timestamp, levels, T_world_camera, known, clock)
+            tracked, labels = self._register(levels, T_world_camera, known, clock)
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
                 tracked.converged
@@ -284,13 +278,11 @@ class Slam:
         return [levels[self._level(width)] for width in self.config.tracker.widths]
 
     def _detect(
-        self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, known: NDArray[np.bool_] | None, clock: "Clock"
+        self, levels: dict[int, Level], tracked: TrackingResult, known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            labels = self.detector.detect(
-                self.volume, level, tracked.T_world_camera, timestamp, tracked.exposure
-            )
+            labels = self.detector.detect(self.volume, level, tracked.T_world_camera, tracked.exposure)
             if known is None:
                 return labels
             masked = _reduced(known, level)

@@ -18,13 +18,13 @@ HOLLOW = 0.2
 SMALLEST = 60
 """Pieces of fewer pixels are not judged as a whole."""
 LARGEST = 0.15
-"""Pieces that are more than this share of the image hold a part of the room: they move only if nearly all of them does."""
-SHIFT = 2.5
+"""Pieces of more than this share of the image hold a part of the room: they move only if nearly all of them does."""
+SHIFT = 2.8
 """Mean distance to the map, in standard deviations of a reading, of a piece that surely moved."""
-MISMATCH = 0.42
+MISMATCH = 0.48
 """Mean difference of intensity over mean gradient of intensity of a piece that surely moved: pixels of motion."""
 ORDINARY_SHIFT, ORDINARY_MISMATCH = 0.4, 0.17
-"""What three of four pieces of a frame stay below without cause for doubt; where it has more, so must one that moved."""
+"""What three of four pieces of a good frame stay below; where they have more, so must one that moved."""
 FLOOR = 0.03
 """Gradients smaller than this tell nothing, intensity per pixel."""
 MEMORIES = 4
@@ -147,7 +147,9 @@ def judge(
     import cv2
 
     ones = used.astype(np.float32)
-    mean = cv2.blur(np.where(used, difference, np.float32(0)), (3, 3)) / np.maximum(cv2.blur(ones, (3, 3)), 1e-3)
+    mean = cv2.blur(np.where(used, difference, np.float32(0)), (3, 3)) / np.maximum(
+        cv2.blur(ones, (3, 3)), np.float32(1e-3)
+    )
     out = np.empty((surface.count + 1, 8))
     segmentation.sums(
         surface.labels, used, moving, distance, sigma, np.asarray(mean, np.float32), surface.gradient, out
@@ -163,9 +165,9 @@ def judge(
 def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which pieces (count + 1,) move, all of each.
 
-    A piece moves if nearly all of its pixels do by themselves; if half do, and the rest has no texture to show that it
-    stands, or a part does, and the rest shows that it does not stand; if the rest does not fit, by its distances and intensities together and by more than is common in
-    this frame; or if most of it moved in the last frame and it nearly does not fit.
+    A piece moves if nearly all of its pixels do by themselves. A piece that is not too large also moves if what remains
+    of it fits badly, by its distances and intensities together and by more than is common in this frame; less will do
+    where a part moves by itself, and still less where most of it moved in the last frame.
 
     Args:
         verdict: Evidence of each piece.
@@ -177,10 +179,11 @@ def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np
     mismatch = MISMATCH * max(1.0, _usual(verdict.mismatch[resting]) / ORDINARY_MISMATCH)
     score = np.zeros(len(verdict.size))
     score[counted] = ((np.maximum(verdict.shift, 0) / shift) ** 2 + (verdict.mismatch / mismatch) ** 2)[counted]
-    doubt = (verdict.shift / (0.32 * shift)) ** 2 + (verdict.mismatch / (0.65 * mismatch)) ** 2
+    doubt = (verdict.shift / (0.35 * shift)) ** 2 + (verdict.mismatch / (0.7 * mismatch)) ** 2
     telling = (verdict.texture > FLOOR) & (verdict.rest >= 0.5 * SMALLEST)
     whole = (score >= 1) | ((moved >= 0.5) & (score >= 0.6))
-    whole |= np.where(telling, (verdict.moving >= 0.15) & (doubt >= 1), verdict.moving >= 0.5)
+    whole |= np.where(telling, (verdict.moving >= 0.2) & (doubt >= 1), verdict.moving >= 0.6)
+    whole |= (moved >= 0.7) & (verdict.moving >= 0.2) & (doubt >= 0.4)
     whole &= verdict.size <= LARGEST * verdict.size[1:].sum()
     whole |= verdict.moving >= 0.8
     whole &= verdict.size >= SMALLEST
@@ -202,25 +205,29 @@ class StandStill:
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
+        self._now = 0.0
         self._last: _Memory | None = None
         self._memories: deque[_Memory] = deque()
 
+    def begin(self, timestamp: float) -> None:
+        """A new frame, of this time in seconds, is going to be labelled."""
+        self._now = timestamp
+
     def remember(
         self,
-        timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
         moving: NDArray[np.bool_],
         surface: Pieces | None,
     ) -> None:
-        """Keep a tracked frame, its labels (h, w) bool and its pieces."""
+        """Keep the frame, which was tracked, its labels (h, w) bool and its pieces."""
         marks = moving.astype(np.uint8)
         if surface is not None:
             marks[((surface.share(moving) >= 0.2) & (np.arange(surface.count + 1) > 0))[surface.labels]] |= BODY
-        self._last = _Memory(timestamp, level, T_world_camera, marks)
-        if not self._memories or timestamp - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
+        self._last = _Memory(self._now, level, T_world_camera, marks)
+        if not self._memories or self._now - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
             self._memories.append(self._last)
-        while len(self._memories) > 1 and timestamp - self._memories[1].timestamp >= self.config.settle_time:
+        while len(self._memories) > 1 and self._now - self._memories[1].timestamp >= self.config.settle_time:
             self._memories.popleft()
 
     def forget(self) -> None:
@@ -238,7 +245,6 @@ class StandStill:
 
     def standing(
         self,
-        timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
         surface: Pieces,
@@ -247,7 +253,7 @@ class StandStill:
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) of those called ``moving`` whose piece has been where it is for ``settle_time``."""
         nothing = np.zeros_like(moving)
-        if not self._memories or timestamp - self._memories[0].timestamp < self.config.settle_time or not moving.any():
+        if not self._memories or self._now - self._memories[0].timestamp < self.config.settle_time or not moving.any():
             return nothing
         count = surface.count
         both = Pieces(surface.labels + np.where(moving, np.int32(count), np.int32(0)), 2 * count, surface.gradient)

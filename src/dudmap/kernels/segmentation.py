@@ -74,7 +74,7 @@ def hollows(depth, intrinsics, tolerance, reach, sine, normals, edge):
 
 @kernel
 def _step(depth, intrinsics, normals, v, u, vn, un):
-    """Height of a step between two pixels, metres: how far each lies off the plane of the other, the smaller of both."""
+    """Height of a step between two pixels, metres: how far each lies off the other's plane, the smaller of both."""
     z, zn = depth[v, u], depth[vn, un]
     ex = ((np.float32(un) - intrinsics[2]) * zn - (np.float32(u) - intrinsics[2]) * z) / intrinsics[0]
     ey = ((np.float32(vn) - intrinsics[3]) * zn - (np.float32(v) - intrinsics[3]) * z) / intrinsics[1]
