@@ -165,9 +165,9 @@ def judge(
 def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which pieces (count + 1,) move, all of each.
 
-    A piece moves if nearly all of its pixels do by themselves. A piece that is not too large also moves if what remains
-    of it fits badly, by its distances and intensities together and by more than is common in this frame; less will do
-    where a part moves by itself, and still less where most of it moved in the last frame.
+    A piece moves if nearly all of its pixels do by themselves. A piece that is not too large also moves if a part of it
+    does and the rest fits badly, by its distances and intensities together and by more than is common in this frame;
+    the larger the part, the less will do, and still less where most of it moved in the last frame.
 
     Args:
         verdict: Evidence of each piece.
@@ -181,7 +181,7 @@ def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np
     score[counted] = ((np.maximum(verdict.shift, 0) / shift) ** 2 + (verdict.mismatch / mismatch) ** 2)[counted]
     doubt = (verdict.shift / (0.35 * shift)) ** 2 + (verdict.mismatch / (0.7 * mismatch)) ** 2
     telling = (verdict.texture > FLOOR) & (verdict.rest >= 0.5 * SMALLEST)
-    whole = (score >= 1) | ((moved >= 0.5) & (score >= 0.6))
+    whole = (score >= 1) & (verdict.moving >= 0.1)
     whole |= np.where(telling, (verdict.moving >= 0.2) & (doubt >= 1), verdict.moving >= 0.6)
     whole |= (moved >= 0.7) & (verdict.moving >= 0.2) & (doubt >= 0.4)
     whole &= verdict.size <= LARGEST * verdict.size[1:].sum()
