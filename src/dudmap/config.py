@@ -170,6 +170,10 @@ class DynamicsConfig(Part):
     """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
     """The same in standard deviations of the reading; the larger of both counts."""
+    pieces: bool = True
+    """Decide for whole pieces of surface, and remember what moved until it has settled (with regions only)."""
+    settle_time: float = Field(default=1.5, gt=0, le=60)
+    """What moved and has stood still for this long is no longer called moving, and becomes map, seconds."""
     max_share: float = Field(default=0.9, gt=0, le=1)
     """A frame of whose readings more than this share seems to move is not believed, but reported as lost."""
     start_seconds: float = Field(default=1.0, ge=0)

@@ -5,15 +5,18 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap import surfaces
 from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.kernels import labeling
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.tracker import Level
-from dudmap.volume import FREE, SURFACE, MapSample, TsdfVolume
+from dudmap.volume import FREE, NOTHING, SURFACE, MapSample, TsdfVolume
 
 BINS = 128
 LARGEST = 16.0
 """Normalised residuals are counted in BINS bins from 0 to LARGEST standard deviations."""
+REACH = 0.1
+"""Farthest that a point may be from its reading in the last frame to be what that was, metres."""
 
 
 @dataclass(frozen=True)
@@ -78,6 +81,7 @@ class Labels:
         mixture: The fitted densities, None for methods that fit none.
         histogram: (BINS,) normalised residuals.
         sample: What the map says at the points.
+        surface: Pieces of surface, None where they are not asked.
     """
 
     static_probability: NDArray[np.float32]
@@ -85,6 +89,7 @@ class Labels:
     mixture: Mixture | None
     histogram: NDArray[np.int64]
     sample: MapSample
+    surface: surfaces.Pieces | None = None
 
 
 class DynamicDetector:
@@ -93,15 +98,31 @@ class DynamicDetector:
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config
         self.sensor = sensor
+        self.memory = surfaces.StandStill(config)
 
-    def detect(self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> Labels:
-        """Labels of a frame that has been registered to ``volume`` at a pose."""
+    def detect(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float] = (1.0, 0.0),
+    ) -> Labels:
+        """Labels of a frame that has been registered to ``volume`` at a pose.
+
+        Args:
+            volume: The map.
+            level: The image.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset that make the image's intensities those of the map.
+        """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume)
-        tolerance = np.asarray(3 * self._sigma(level.depth, volume) + np.float32(0.02) * level.depth, np.float32)
+        tolerance = np.asarray(3 * sigma + np.float32(0.02) * level.depth, np.float32)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
-        histogram, edges = np.histogram(np.minimum(counted, LARGEST - 1e-3), bins=BINS, range=(0, LARGEST))
+        edges = np.linspace(0, LARGEST, BINS + 1)
+        cells = np.minimum(counted, np.float32(LARGEST - 1e-3)) * np.float32(BINS / LARGEST)
+        histogram = np.bincount(cells.astype(np.int64), minlength=BINS)
         noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(volume, level, sample, noise)
@@ -118,11 +139,17 @@ class DynamicDetector:
             evidence[sample.place == FREE] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
+        surface = None
         if self.config.regions:
-            dynamic = self._regions(_solid(dynamic) | (dynamic & (sample.place == FREE)), evidence, level, tolerance)
+            seeds = _solid(dynamic) | (dynamic & (sample.place == FREE))
+            dynamic = self._regions(seeds, evidence, level, tolerance)
+            if self.config.pieces:
+                dynamic, surface = self._whole(
+                    dynamic, seeds, sample, sigma, tolerance, level, T_world_camera, exposure
+                )
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
-        return Labels(probability, dynamic, mixture, histogram, sample)
+        return Labels(probability, dynamic, mixture, histogram, sample, surface)
 
     def _sigma(self, depth: NDArray[np.float32], volume: TsdfVolume) -> NDArray[np.float32]:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
@@ -142,6 +169,32 @@ class DynamicDetector:
         some = (areas >= smallest) & ~whole
         whole[0] = some[0] = False
         return whole[labels] | (some[labels] & seeds)
+
+    def _whole(
+        self,
+        dynamic: NDArray[np.bool_],
+        seeds: NDArray[np.bool_],
+        sample: MapSample,
+        sigma: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float],
+    ) -> tuple[NDArray[np.bool_], surfaces.Pieces]:
+        """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
+        marks = self.memory.marks(level, T_world_camera, REACH)
+        moved = (marks & surfaces.MOVED) > 0
+        surface = surfaces.split(surfaces.pieces(level, tolerance), (marks & surfaces.BODY) > 0)
+        # what the map does not know begins to move with the piece it belongs to, not with what is beside it
+        begun = (surface.share(seeds) >= 0.1)[surface.labels]
+        dynamic = dynamic & ((sample.place != NOTHING) | moved | begun)
+        gain, offset = exposure
+        exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
+        difference = np.asarray(sample.difference + exposed, np.float32)
+        noise = np.maximum(np.float32(self.config.noise_threshold / 3), sigma)
+        verdict = surfaces.judge(surface, sample.place == SURFACE, dynamic, sample.distance, noise, difference)
+        moving = dynamic | surfaces.moves_as_a_whole(verdict, surface.share(moved))[surface.labels]
+        return moving & ~self.memory.standing(level, T_world_camera, surface, noise, moving), surface
 
     def _threshold_and_flood(
         self, volume: TsdfVolume, level: Level, sample: MapSample, noise: NDArray[np.float32]

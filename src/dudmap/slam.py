@@ -147,6 +147,7 @@ class Slam:
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.reference.is_empty:
             return self._as_recorded(self._start(observation, levels, known, clock))
+        self.detector.memory.begin(frame.timestamp)
         T_init, known = self._expect(observation, levels, known, clock)
         tracked, labels = self._register(levels, T_init, known, clock)
         reason = (
@@ -172,6 +173,9 @@ class Slam:
         self._moved = None if labels is None else labels.dynamic
         self._compare_with_next(frame.timestamp, levels)
         self.atlas.add_pose(frame.timestamp, tracked.T_world_camera)
+        if labels is not None:
+            level = levels[self._level(self.config.dynamics.width)]
+            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
         result = self._result(
@@ -344,6 +348,7 @@ class Slam:
     def _lose(self, timestamp: float) -> None:
         self.motion.lost()
         self.health.lost()
+        self.detector.memory.forget()
         self._moved = None
         self._lost_since = timestamp if self._lost_since is None else self._lost_since
 
@@ -413,7 +418,7 @@ class Slam:
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            labels = self.detector.detect(self.reference, level, tracked.T_world_camera)
+            labels = self.detector.detect(self.reference, level, tracked.T_world_camera, tracked.exposure)
             if known is None:
                 return labels
             masked = _reduced(known, level)

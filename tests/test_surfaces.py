@@ -1,0 +1,140 @@
+"""Pieces of surface: how images are cut, what stands still, and whole slow, starting and stopping things."""
+
+import numpy as np
+import pytest
+
+from dudmap import surfaces, synthetic
+from dudmap.camera import Camera
+from dudmap.config import DynamicsConfig
+from dudmap.slam import Slam
+from dudmap.tracker import Level
+
+CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
+SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+RAYS = CAMERA.backproject(np.ones(CAMERA.shape, np.float32))
+TOLERANCE = np.full(CAMERA.shape, 0.08, np.float32)
+
+
+def plane(normal, point):
+    """Depth (h, w) of a plane."""
+    normal = np.asarray(normal, float)
+    return ((normal @ point) / (RAYS @ normal)).astype(np.float32)
+
+
+def level(depth, intensity=None):
+    grey = np.full(CAMERA.shape, 0.5, np.float32) if intensity is None else intensity.astype(np.float32)
+    return Level(CAMERA, depth.astype(np.float32), grey)
+
+
+def large(surface):
+    return [n for n in range(1, surface.count + 1) if np.count_nonzero(surface.labels == n) > 200]
+
+
+def test_a_hollow_cuts_and_a_ridge_does_not():
+    left, right = plane([-1, 0, 1], [0, 0, 2]), plane([1, 0, 1], [0, 0, 2])
+    assert len(large(surfaces.pieces(level(np.maximum(left, right)), TOLERANCE))) == 1  # the ridge faces the camera
+    hollow = surfaces.pieces(level(np.minimum(left, right)), TOLERANCE)
+    # every reading belongs to a piece, and the seam lies in the hollow
+    assert len(large(hollow)) == 2
+    assert (hollow.labels > 0).mean() > 0.99
+    assert np.all(hollow.labels[:, :70] == hollow.labels[60, 20])
+    assert np.all(hollow.labels[:, 90:] == hollow.labels[60, 140])
+
+
+def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
+    """Two boards 5 cm apart are two pieces, although a slanted floor has larger steps between its pixels."""
+    depth = np.full(CAMERA.shape, 2.0)
+    depth[:, 80:] = 2.05
+    boards = surfaces.pieces(level(depth), TOLERANCE).labels
+    assert np.all(boards[:, :75] == boards[60, 20])
+    assert np.all(boards[:, 85:] == boards[60, 140])
+    assert boards[60, 20] != boards[60, 140]
+    floor = plane([0, 1, 0.1], [0, 0.6, 0])
+    floor[(floor <= 0) | (floor > 4)] = 0
+    assert np.abs(np.diff(floor[70:], axis=0)).max() > 0.05
+    assert len(large(surfaces.pieces(level(floor), TOLERANCE))) == 1
+
+
+def test_pieces_that_met_are_split_by_what_they_were():
+    whole = surfaces.pieces(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
+    body = np.zeros(CAMERA.shape, bool)
+    assert surfaces.split(whole, body) is whole
+    body[:, :60] = True
+    two = surfaces.split(whole, body)
+    assert two.count == whole.count + 1
+    assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
+    body[:, 6:60] = False  # a strip that came into view
+    assert surfaces.split(whole, body) is whole
+
+
+def scene(x):
+    """A textured board at (x, 0, 2) before a textured wall at 3 m, and its pixels."""
+    v, u = np.indices(CAMERA.shape)
+    X, Y = (u - CAMERA.cx) / CAMERA.fx * 2 - x, (v - CAMERA.cy) / CAMERA.fy * 2
+    board = (np.abs(X) < 0.4) & (np.abs(Y) < 0.4)
+    own = 0.5 + 0.2 * np.sin(30 * X) * np.cos(30 * Y)
+    wall = 0.5 + 0.2 * np.sin(u / 5.0) * np.cos(v / 5.0)
+    return level(np.where(board, 2.0, 3.0), np.where(board, own, wall)), board
+
+
+@pytest.mark.parametrize(("speed", "stands"), [(0.0, True), (0.05, False)])
+def test_what_stood_still_for_the_settle_time_stands(speed, stands):
+    memory = surfaces.StandStill(DynamicsConfig(settle_time=1.0))
+    sigma = np.full(CAMERA.shape, 0.01, np.float32)
+    for i in range(35):
+        image, board = scene(speed * i / 30)
+        surface = surfaces.pieces(image, TOLERANCE)
+        memory.begin(i / 30)
+        still = memory.standing(image, np.eye(4), surface, sigma, board)
+        assert not still[~board].any()
+        if i < 30:
+            assert not still.any()
+        memory.remember(image, np.eye(4), board, surface)
+        marks = memory.marks(image, np.eye(4), 0.1)
+        inner = board.copy()
+        inner[1:, 1:] &= board[:-1, :-1]
+        assert (marks[inner] == surfaces.MOVED | surfaces.BODY).mean() > 0.9
+    assert (still[board].mean() > 0.9) == stands
+    memory.forget()
+    assert not memory.standing(image, np.eye(4), surface, sigma, board).any()
+
+
+def overlaps(sequence, frames):
+    """Overlap of found and true mask, and share of the image that is called moving without cause, by frame."""
+    slam, score, wrong = Slam(sequence.camera), [], []
+    for i in range(frames):
+        found, truth = slam.process(sequence[i]).dynamic_mask, sequence.mask(i)
+        score.append((found & truth).sum() / max((found | truth).sum(), 1) if truth.mean() > 0.01 else np.nan)
+        wrong.append((found & ~truth).mean())
+    return np.array(score), np.array(wrong)
+
+
+@pytest.mark.slow
+def test_a_slow_creeper_is_labelled_whole():
+    sequence = synthetic.sequence("yard", movers=("creeper",), frames=80, seed=2, noise="realsense", camera=SMALL)
+    score, _ = overlaps(sequence, 80)
+    seen = np.flatnonzero(~np.isnan(score))[0]
+    assert np.nanmean(score[seen + 30 :]) >= 0.7
+
+
+@pytest.mark.slow
+def test_a_mapped_thing_that_starts_is_labelled_whole():
+    sequence = synthetic.sequence("room", situation="starts", frames=90, camera=SMALL)
+    score, wrong = overlaps(sequence, 75)
+    begun = np.flatnonzero(~np.isnan(score))[0]
+    assert np.mean(score[begun + 18 :]) >= 0.7  # the first frames of a smooth start are slower than 5 cm/s
+    assert np.mean(wrong) < 0.005
+
+
+@pytest.mark.slow
+def test_a_thing_that_stops_becomes_map_after_the_settle_time():
+    sequence = synthetic.sequence("room", situation="stops", frames=160, camera=SMALL)
+    slam, rest, released = Slam(sequence.camera), None, None
+    for i in range(160):
+        found, truth = slam.process(sequence[i]).dynamic_mask, sequence.mask(i)
+        if truth.mean() > 0.01:
+            rest = i
+        if rest is not None and i > rest + 5 and released is None and found.mean() < 0.005:
+            released = i
+    assert released is not None
+    assert 0.8 < (released - rest) / 30 < slam.config.dynamics.settle_time + 0.7
