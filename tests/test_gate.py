@@ -29,7 +29,7 @@ def test_accuracy_is_no_worse_than_recorded(name):
 
 
 def test_a_spoiled_tracker_does_not_pass():
-    spoiled = Config().override(["tracker.iterations=[1,0,0]"])
+    spoiled = Config().override(["tracker.iterations=[1,0,0]", "dynamics.start_seconds=0"])
     rows = gate.measure_gate([ENTRIES["desk-fast-camera"]], spoiled)
     caught = {figure for _, figure in failures(rows)}
     assert caught & {"lost", "ate_rmse_m"}, rows  # it drifts, or notices that it does
