@@ -167,15 +167,7 @@ class Slam:
             return self._as_recorded(
                 self._result(observation, clock, levels, labels, known, tracked, reason, fused=False)
             )
-        self.motion.update(frame.timestamp, tracked.T_world_camera)
-        self.health.tracked(tracked)
-        self._lost_since = None
-        self._moved = None if labels is None else labels.dynamic
-        self._compare_with_next(frame.timestamp, levels)
-        self.atlas.add_pose(frame.timestamp, tracked.T_world_camera)
-        if labels is not None:
-            level = levels[self._level(self.config.dynamics.width)]
-            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
+        self._keep(observation.timestamp, levels, tracked, labels)
         with clock("similarity"):
             redundant = self._redundant(observation, tracked.T_world_camera)
         result = self._result(
@@ -186,6 +178,18 @@ class Slam:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
         return self._as_recorded(self._close_loop(observation, levels, result, clock))
+
+    def _keep(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> None:
+        """Take over a frame whose pose is believed: what the next one is predicted and judged from."""
+        self.motion.update(timestamp, tracked.T_world_camera)
+        self.health.tracked(tracked)
+        self._lost_since = None
+        self._moved = None if labels is None else labels.dynamic
+        self._compare_with_next(timestamp, levels)
+        self.atlas.add_pose(timestamp, tracked.T_world_camera)
+        if labels is not None:
+            level = levels[self._level(self.config.dynamics.width)]
+            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
 
     def _as_recorded(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
