@@ -1,0 +1,24 @@
+"""Telling the processor what will be loaded soon."""
+
+from llvmlite import ir
+from numba.core import types
+from numba.extending import intrinsic
+
+
+@intrinsic
+def prefetch(typing_context, array, index):
+    """Begin to bring element ``index`` of a flat array into the cache; only a hint, which changes no result."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        byte_pointer = ir.IntType(8).as_pointer()
+        number = ir.IntType(32)
+        hint = builder.module.declare_intrinsic(
+            "llvm.prefetch", [byte_pointer], ir.FunctionType(ir.VoidType(), [byte_pointer, number, number, number])
+        )
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), byte_pointer)
+        read, all_caches, data_cache = number(0), number(3), number(1)
+        builder.call(hint, [pointer, read, all_caches, data_cache])
+        return context.get_dummy_value()
+
+    return types.void(array, index), generate
