@@ -263,6 +263,10 @@ class MoversConfig(Part):
     """A body that comes back into view within this time keeps its number, seconds."""
     velocity_window: float = Field(default=0.2, gt=0)
     """The velocity is the mean over this time, seconds."""
+    meshes: bool = False
+    """Also fuse each rigid body into a mesh of its own and follow its pose (movers/<id>.ply and .txt of a run)."""
+    mesh_voxel_size: float = Field(default=0.005, ge=0.004, le=0.1)
+    """Edge of a voxel of these meshes, metres."""
 
 
 class Config(Part):

@@ -190,6 +190,18 @@ def _halved(
     return small
 
 
+def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
+    import cv2
+
+    gain, offset = exposure
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+
+
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
     """Map pairs of cv2.remap from the undistorted image into the distorted one: to the nearest pixel, between pixels.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap import se3
 from dudmap.atlas import Atlas
+from dudmap.bodies import Body, RigidFusion
 from dudmap.camera import Camera
 from dudmap.config import Config
 from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
@@ -21,7 +22,7 @@ from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
 from dudmap.parallax import Parallax
-from dudmap.preprocess import Observation, Preprocessor, pyramid
+from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
 from dudmap.tracker import Level, Tracker, TrackingResult
@@ -102,6 +103,7 @@ class Slam:
             self._seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = MoverTracker(self.config.movers)
+        self.fusion = RigidFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
         self.parallax = Parallax(self.config.dynamics.start_seconds)
         self._first: tuple[Observation, NDArray[np.bool_]] | None = None  # until a second frame shows what moves in it
         self._lost_since: float | None = None
@@ -128,6 +130,13 @@ class Slam:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and map of each submap, that with the most frames first; each has a world of its own."""
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def bodies(self) -> list[Body]:
+        """The moving bodies so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
+        if self.fusion is None:
+            return []
+        return self.fusion.bodies({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
     def process(self, frame: Frame, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
@@ -501,6 +510,9 @@ class Slam:
             with clock("movers"):
                 level = levels[self._level(self.config.dynamics.width)]
                 movers = tuple(self.movers.update(observation.timestamp, labels.dynamic, level, tracked.T_world_camera))
+            if self.fusion is not None:
+                with clock("bodies"):
+                    self.fusion.update(observation, movers, level, tracked.T_world_camera, tracked.exposure)
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
@@ -520,18 +532,6 @@ def _share(mask: NDArray[np.bool_], observation: Observation) -> float:
     """Share of the readings that lie in a mask."""
     readings = observation.depth > 0
     return float(np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1))
-
-
-def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
-    import cv2
-
-    gain, offset = exposure
-    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
-
-
-def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
-    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
 
 
 class Clock:

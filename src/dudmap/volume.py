@@ -376,7 +376,7 @@ class TsdfVolume:
         self, depth: NDArray[np.float32], color: NDArray[np.uint8], weights: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
         """Readings (H * W + 1, 2) and colours (H * W + 1,) as the fusion takes them; the last pixel has no reading."""
-        if self._packed is None:
+        if self._packed is None or len(self._packed[1]) != depth.size + 1:
             self._packed = np.zeros((depth.size + 1, 2), dtype=np.float32), np.zeros(depth.size + 1, dtype=np.int32)
         readings, colors = self._packed
         rgb = np.ascontiguousarray(color)
