@@ -43,14 +43,19 @@ SEEN_THROUGH = 0.08
 """Largest share of a rigid body's surface that a frame sees through: edges of the mask, errors of the pose."""
 OFF = 0.25
 """Largest share of a rigid body's readings that contradict its map."""
-YOUNG = 5
-"""Frames that a map must hold before a frame that does not fit speaks against it; until then it is begun anew."""
+YOUNG = 10
+"""Frames that a map must hold before a frame that does not fit speaks against it; until then it is begun anew, also
+where much more of the body comes into view: what is built on a narrow strip is crooked."""
+GROWN = 1.5
+"""Visible surface, as a multiple of that at the beginning, that is much more."""
 MOST_STARTS = 20
 """Times that a map is begun."""
 FAILED = 0.3
 """Largest share of frames that do not fit a rigid body."""
 FARTHEST_STILL = 0.05
 """What has not moved farther than this is no moving body, metres."""
+COLOR = 0.3
+"""Share of the usual weight that intensities have: light falls differently on a body that turns."""
 POINTS = 2000
 """Surface points that are looked at again."""
 
@@ -111,6 +116,12 @@ class _View:
     def mask(self) -> NDArray[np.bool_]:
         return self.weights[-1] > 0
 
+    @property
+    def area(self) -> float:
+        """Visible surface across the line of sight, square metres."""
+        level = self.levels[-1]
+        return float(np.sum(np.square(level.depth[self.mask]))) / (level.camera.fx * level.camera.fy)
+
 
 @dataclass(eq=False)
 class _Track:
@@ -118,6 +129,7 @@ class _Track:
 
     id: int
     volume: BodyVolume
+    area: float
     T_world_body: NDArray[np.float64]
     T_first: NDArray[np.float64]
     first_seen: float
@@ -142,7 +154,8 @@ class RigidFusion:
         self.config = config
         steps = config.tracker.model_copy(
             update={
-                "iterations": (8, 8, 6), "damping": 1e-3, "exposure": False, "min_inliers": 0.1, "min_condition": 1e-6
+                "iterations": (8, 8, 6), "damping": 1e-3, "exposure": False, "min_inliers": 0.1, "min_condition": 1e-6,
+                "color_weight": COLOR * config.tracker.color_weight,
             }
         )
         self.tracker = Tracker(steps, config.sensor)
@@ -194,7 +207,8 @@ class RigidFusion:
                 self._start(mover, view, now, T_world_camera)
                 continue
             self._follow(track, mover, view, observation, T_world_camera)
-            if track.misfits and len(track.Ts_camera_body) < YOUNG and track.starts < MOST_STARTS:
+            young = len(track.Ts_camera_body) < YOUNG and track.starts < MOST_STARTS
+            if young and (track.misfits or view.area > GROWN * track.area):
                 self._start(mover, view, now, T_world_camera, track.starts)
             elif _why(track, final=False):
                 self._finish(mover.id)
@@ -212,7 +226,7 @@ class RigidFusion:
         T = np.eye(4)
         T[:3, 3] = mover.centroid
         volume = BodyVolume(view.levels[-1].camera, self._volume, self.config.sensor, self.config.preprocess.depth_max)
-        track = _Track(mover.id, volume, T, T.copy(), now, now, starts=starts + 1)
+        track = _Track(mover.id, volume, view.area, T, T.copy(), now, now, starts=starts + 1)
         track.motion[:3] = mover.velocity
         self._tracks[mover.id] = track
         self._fuse(track, view, se3.inverse(T) @ T_world_camera, now)
