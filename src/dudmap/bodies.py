@@ -31,7 +31,7 @@ EXTENT = 1.0
 """The window of a body's map is that of a camera with readings up to this, metres: a cube of about 2.5 m."""
 FEWEST_PIXELS = 60
 """Pixels at the labels' resolution that a body is looked at from."""
-MOST_PIXELS = 20000
+MOST_PIXELS = 12000
 """Pixels of a body that are registered and fused; a larger image of it is halved."""
 LEAST = 128
 """Smallest width and height of the part of an image that is looked at, pixels."""
@@ -137,10 +137,10 @@ class _Track:
     motion: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))  # m/s and rad/s, world axes
     Ts_camera_body: dict[float, NDArray[np.float64]] = field(default_factory=dict)
     points: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
-    misfits: list[tuple[str, float]] = field(default_factory=list)
-    judged: list[tuple[float, float]] = field(default_factory=list)  # seen through, off, per frame
+    misfits: list[str] = field(default_factory=list)  # what each frame that did not fit was refused for
+    judged: list[tuple[float, float]] = field(default_factory=list)  # shares seen through and off, per frame
     farthest: float = 0.0
-    starts: int = 1
+    begun: tuple[str, ...] = ()  # why the map was begun anew, each time
 
 
 class RigidFusion:
@@ -154,7 +154,11 @@ class RigidFusion:
         self.config = config
         steps = config.tracker.model_copy(
             update={
-                "iterations": (8, 8, 6), "damping": 1e-3, "exposure": False, "min_inliers": 0.1, "min_condition": 1e-6,
+                "iterations": (6, 5, 3),
+                "damping": 1e-3,
+                "exposure": False,
+                "min_inliers": 0.1,
+                "min_condition": 1e-6,
                 "color_weight": COLOR * config.tracker.color_weight,
             }
         )
@@ -207,9 +211,11 @@ class RigidFusion:
                 self._start(mover, view, now, T_world_camera)
                 continue
             self._follow(track, mover, view, observation, T_world_camera)
-            young = len(track.Ts_camera_body) < YOUNG and track.starts < MOST_STARTS
-            if young and (track.misfits or view.area > GROWN * track.area):
-                self._start(mover, view, now, T_world_camera, track.starts)
+            misfit = track.misfits[0] if track.misfits else ""
+            young = len(track.Ts_camera_body) < YOUNG and len(track.begun) < MOST_STARTS
+            if young and (misfit or view.area > GROWN * track.area):
+                reason = misfit or "more of it came into view"
+                self._start(mover, view, now, T_world_camera, (*track.begun, reason))
             elif _why(track, final=False):
                 self._finish(mover.id)
 
@@ -221,12 +227,12 @@ class RigidFusion:
         self._finished.append((body, Ts if body.rigid else {}))
 
     def _start(
-        self, mover: Mover, view: _View, now: float, T_world_camera: NDArray[np.float64], starts: int = 0
+        self, mover: Mover, view: _View, now: float, T_world_camera: NDArray[np.float64], begun: tuple[str, ...] = ()
     ) -> None:
         T = np.eye(4)
         T[:3, 3] = mover.centroid
         volume = BodyVolume(view.levels[-1].camera, self._volume, self.config.sensor, self.config.preprocess.depth_max)
-        track = _Track(mover.id, volume, view.area, T, T.copy(), now, now, starts=starts + 1)
+        track = _Track(mover.id, volume, view.area, T, T.copy(), now, now, begun=begun)
         track.motion[:3] = mover.velocity
         self._tracks[mover.id] = track
         self._fuse(track, view, se3.inverse(T) @ T_world_camera, now)
@@ -241,14 +247,14 @@ class RigidFusion:
     ) -> None:
         """Register a frame to the body's map; fuse it if it fits."""
         now, duration = observation.timestamp, observation.timestamp - track.last_seen
-        guesses = [_predicted(track.T_world_body, motion, duration) for motion in (
-            track.motion, np.concatenate([mover.velocity, np.zeros(3)]), np.concatenate([track.motion[:3], np.zeros(3)]),
-        )]  # fmt: skip
+        turning, still = track.motion, np.zeros(3)
+        motions = turning, np.concatenate([mover.velocity, still]), np.concatenate([turning[:3], still])
+        guesses = [_predicted(track.T_world_body, motion, duration) for motion in motions]
         result = self._registered(track.volume, view, [se3.inverse(T) @ T_world_camera for T in guesses])
         T_body_camera = result.T_world_camera
         track.last_seen = now
         if not result.converged:
-            track.misfits.append((result.reason, now))
+            track.misfits.append(result.reason)
             track.motion = np.concatenate([mover.velocity, np.zeros(3)])
             track.T_world_body = guesses[1]
             track.judged.append((np.nan, np.nan))
@@ -262,7 +268,7 @@ class RigidFusion:
         track.T_world_body = T
         if through > SEEN_THROUGH or off > OFF:
             share, what = (through, "is seen through") if through > SEEN_THROUGH else (off, "does not fit")
-            track.misfits.append((f"{share:.0%} of its surface {what}", now))
+            track.misfits.append(f"{share:.0%} of its surface {what}")
         if through <= 2 * SEEN_THROUGH and off <= OFF:
             self._fuse(track, view, T_body_camera, now)
 
@@ -298,7 +304,9 @@ class RigidFusion:
         track.points = np.concatenate([kept, points])
         corners = track.points[:: max(1, len(track.points) // 50)].astype(np.float64)
         change = track.T_world_body[:3] - track.T_first[:3]
-        track.farthest = max(track.farthest, float(np.median(np.linalg.norm(corners @ change[:, :3].T + change[:, 3], axis=1))))
+        track.farthest = max(
+            track.farthest, float(np.median(np.linalg.norm(corners @ change[:, :3].T + change[:, 3], axis=1)))
+        )
 
     def _seen_through(self, track: _Track, observation: Observation, T_body_camera: NDArray[np.float64]) -> float:
         """Share of the body's known surface, as far as it is not hidden, that the image sees through."""
@@ -346,20 +354,20 @@ def _why(track: _Track, *, final: bool = True) -> str:
     """Why a body is not rigid or not known to be; empty if it is, or before the end if nothing speaks against it."""
     judged, bad = len(track.judged), len(track.misfits)
     if judged >= FEWEST_FRAMES and bad > FAILED * judged:
-        return f"not rigid: {bad} of {judged} frames do not fit, the last: {track.misfits[-1][0]}"
+        return f"not rigid: {bad} of {judged} frames do not fit, the last: {track.misfits[-1]}"
     if not final:
         return ""
     time = track.last_seen - track.first_seen
     if len(track.Ts_camera_body) < FEWEST_FRAMES or time < SHORTEST:
+        if len(track.begun) >= FEWEST_FRAMES // 2:
+            return f"not rigid: {len(track.begun)} beginnings did not fit what followed, the last: {track.begun[-1]}"
         return f"seen too short: {len(track.Ts_camera_body)} frames in {time:.1f} s"
     if track.farthest < FARTHEST_STILL:
         return f"moved by {100 * track.farthest:.1f} cm only"
     return ""
 
 
-def _predicted(
-    T_world_body: NDArray[np.float64], motion: NDArray[np.float64], duration: float
-) -> NDArray[np.float64]:
+def _predicted(T_world_body: NDArray[np.float64], motion: NDArray[np.float64], duration: float) -> NDArray[np.float64]:
     """Pose after some seconds of a motion (6,): velocity of the origin and turning rate, world axes."""
     T = T_world_body.copy()
     T[:3, 3] += motion[:3] * duration
@@ -373,10 +381,11 @@ def _view(observation: Observation, mover: Mover, level: Level, exposure: tuple[
 
     if np.count_nonzero(mover.mask) < FEWEST_PIXELS:
         return None
-    height, width = observation.camera.shape
-    stride = width // mover.mask.shape[1]
+    stride = observation.camera.width // mover.mask.shape[1]
     rows, columns = np.flatnonzero(mover.mask.any(axis=1)), np.flatnonzero(mover.mask.any(axis=0))
-    low = tuple(_around(part, LEAST // stride, size) for part, size in zip((rows, columns), mover.mask.shape, strict=True))
+    low = tuple(
+        _around(part, LEAST // stride, size) for part, size in zip((rows, columns), mover.mask.shape, strict=True)
+    )
     crop = tuple(slice(part.start * stride, part.stop * stride) for part in low)
     mask = full_size(mover.mask[low], level.depth[low], np.ascontiguousarray(observation.depth[crop])).astype(np.uint8)
     mask = cv2.erode(mask, np.ones((5, 5), np.uint8))

@@ -100,6 +100,9 @@ def summary(metrics: dict[str, Any]) -> Table:
     table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))
     table.add_row("map", _text(metrics["map_bytes"], "{:.1f} MB", 1e-6))
     table.add_row("mesh", f"{metrics['mesh_triangles']} triangles")
+    if "bodies" in metrics:
+        rigid = sum(body["rigid"] for body in metrics["bodies"])
+        table.add_row("meshes of movers", f"{rigid} of {len(metrics['bodies'])} movers are rigid")
     if "ate_rmse_m" in metrics:
         table.add_row("ATE RMSE", _text(metrics["ate_rmse_m"], "{:.2f} cm", 100))
         table.add_row("RPE RMSE, translation", _text(metrics["rpe_trans_rmse_m_per_s"], "{:.2f} cm/s", 100))

@@ -22,6 +22,7 @@ from dudmap.progress import RunProgress
 from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
+    from dudmap.bodies import Body
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
     from dudmap.slam import FrameResult, Slam
@@ -107,7 +108,8 @@ def run(
     metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it),
     movers.jsonl (one JSON object per frame with moving bodies: timestamp and, of each body, id, centroid, box,
     velocity, speed and pixels; metres, m/s, world frame), the true trajectory as groundtruth.txt where it is known
-    and, if asked for, masks/<timestamp>.png (255 = dynamic). Where the camera was lost and what it showed then was
+    and, if asked for, masks/<timestamp>.png (255 = dynamic) and movers/<id>.ply and .txt, mesh and poses of every rigid
+    moving body (``movers.meshes``). Where the camera was lost and what it showed then was
     never joined with the rest, the largest map is written, and the others as trajectory-2.txt and mesh-2.ply and so on,
     each in a world of its own. Results of an earlier run in the same folder are removed first. If anything stops the
     run, what was computed so far is written all the same.
@@ -336,7 +338,8 @@ def _prepare(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
-        for part in (*out.glob("trajectory-[0-9]*.txt"), *out.glob("mesh-[0-9]*.ply")):
+        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt"
+        for part in (path for pattern in parts for path in out.glob(pattern)):
             part.unlink()
         if save_masks:
             (out / "masks").mkdir(exist_ok=True)
@@ -397,6 +400,8 @@ def _write(
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
+    if config.movers.meshes:
+        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.bodies)))
     problems = []
     try:
         for step in steps:
@@ -409,3 +414,17 @@ def _write(
     if problems:
         raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
     return RunReport(out, metrics, trajectory)
+
+
+def _save_bodies(folder: Path, bodies: "list[Body]") -> list[dict[str, Any]]:
+    """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
+    out = []
+    for body in bodies:
+        row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
+        if body.mesh is not None and body.trajectory is not None:
+            folder.mkdir(exist_ok=True)
+            body.mesh.save(folder / f"{body.id}.ply")
+            body.trajectory.save(folder / f"{body.id}.txt")
+            row["mesh_triangles"] = len(body.mesh.faces)
+        out.append(row)
+    return out

@@ -53,7 +53,8 @@ def run(
 ) -> None:
     """Turn a recording into a trajectory and a clean mesh.
 
-    Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder.
+    Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
+    --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid thing that moved.
     """
     from dudmap.run import run as run_sequence
     from dudmap.sequences import open_sequence

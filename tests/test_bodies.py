@@ -1,0 +1,167 @@
+"""Rigid fusion: shape and trajectory of moving bodies against the synthetic truth; what is not rigid is refused."""
+
+import json
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+import dudmap.synthetic
+from dudmap import se3
+from dudmap.bodies import Body, BodyVolume, RigidFusion
+from dudmap.camera import Camera
+from dudmap.config import Config, SensorConfig, VolumeConfig
+from dudmap.mesh import Mesh
+from dudmap.movers import Mover
+from dudmap.preprocess import Preprocessor, pyramid
+from dudmap.run import run
+from dudmap.slam import Slam
+from dudmap.tracker import Level
+from dudmap.trajectory import Trajectory
+
+SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+ON = Config().override(["movers.meshes=true"])
+
+
+def fused(sequence, frames):
+    """All bodies of some frames, with the true poses and the true masks of the movers, by the movers' numbers."""
+    fusion, preprocess, last = RigidFusion(ON), Preprocessor(sequence.camera), {}
+    poses = {}
+    for i in frames:
+        observation = preprocess(sequence[i])
+        T = sequence.ground_truth.Ts_world_camera[i]
+        poses[observation.timestamp] = T
+        depth, intensity = pyramid(observation, 1)
+        level = Level(sequence.camera.scaled(1), depth, intensity)
+        numbers = sequence.mover_numbers(i)[1::2, 1::2]
+        movers = []
+        for number in np.unique(numbers[(numbers > 0) & (depth > 0)]):
+            mask = (numbers == number) & (depth > 0)
+            points = level.camera.backproject(depth)[mask] @ T[:3, :3].T + T[:3, 3]
+            centroid = points.mean(axis=0)
+            velocity = (centroid - last.get(number, centroid)) * 30
+            last[number] = centroid
+            box = np.stack([points.min(axis=0), points.max(axis=0)])
+            movers.append(Mover(int(number), mask, points, centroid, box, velocity, 1.0))
+        fusion.update(observation, movers, level, T, (1.0, 0.0))
+    return {body.id: body for body in fusion.bodies(poses)}
+
+
+def errors(body, mover, T_world):
+    """Distances (n,) of the mesh to the true surface after one alignment, and errors (m,) of the positions, metres.
+
+    ``T_world`` maps the trajectory's world to that of the truth.
+    """
+    estimates = T_world @ body.trajectory.Ts_world_camera
+    truths = np.array([mover.reference(t) for t in body.trajectory.timestamps])
+    X = se3.inverse(estimates[len(truths) // 2]) @ truths[len(truths) // 2]  # true body to ours
+    points = body.mesh.vertices.astype(np.float64)
+
+    def distances(x, points):
+        T = se3.inverse(X @ se3.exp(x))
+        there = points @ T[:3, :3].T + T[:3, 3]
+        return np.min([primitive.distance(there) for primitive in mover.primitives], axis=0)
+
+    fit = least_squares(distances, np.zeros(6), args=(points[:: len(points) // 1000],), loss="soft_l1", f_scale=0.005)
+    offset = np.median(
+        [(se3.inverse(e) @ t)[:3, 3] for e, t in zip(estimates, truths, strict=True)], axis=0
+    )  # of the two origins, in our body frame
+    places = estimates[:, :3, :3] @ offset + estimates[:, :3, 3]
+    return np.abs(distances(fit.x, points)), np.linalg.norm(places - truths[:, :3, 3], axis=1)
+
+
+def test_the_window_stays_with_the_body_and_is_small():
+    volume = BodyVolume(SMALL, VolumeConfig(voxel_size=0.005), SensorConfig(), 6.0)
+    T = np.eye(4)
+    T[:3, 3] = 0, 0, -3
+    volume.look_at(T)
+    half = volume.window[1] * volume.block_size / 2
+    origin = volume.lattice(np.eye(4))[:, 3] * volume.voxel_size
+    np.testing.assert_allclose(origin, half, atol=2 * volume.block_size)
+    assert (half > 1.0).all()
+    assert volume.window[0].nbytes < 4e6
+    assert volume.depth_max == 6.0
+    assert not volume.config.carving
+
+
+def test_a_cart_is_rigid_and_gets_its_shape():
+    sequence = dudmap.synthetic.sequence(
+        "box", ["creeper"], frames=30, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
+    )
+    (body,) = fused(sequence, range(4, 30)).values()
+    assert body.rigid, body.why
+    assert body.trajectory is not None
+    assert len(body.trajectory) == body.frames >= 20
+    shape, path = errors(body, sequence._movers[0], np.eye(4))
+    assert np.median(shape) < 0.003
+    assert np.percentile(shape, 90) < 0.01
+    assert np.sqrt(np.mean(path**2)) < 0.01
+    # the origin is the middle of the mesh
+    np.testing.assert_allclose(body.mesh.vertices.min(axis=0), -body.mesh.vertices.max(axis=0), atol=1e-5)
+
+
+def test_a_walking_person_is_refused_and_it_is_said_why():
+    sequence = dudmap.synthetic.sequence(
+        "box", ["person"], frames=36, speed=0.8, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
+    )
+    (body,) = fused(sequence, range(36)).values()
+    assert not body.rigid
+    assert body.mesh is None
+    assert body.trajectory is None
+    assert body.why.startswith("not rigid")
+
+
+def test_what_rests_is_no_moving_body():
+    sequence = dudmap.synthetic.sequence(
+        "box", ["stopping_cart"], frames=90, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
+    )
+    (body,) = fused(sequence, range(70, 90)).values()
+    assert not body.rigid
+    assert body.why.startswith("moved by 0.")
+
+
+def test_a_few_frames_prove_nothing():
+    sequence = dudmap.synthetic.sequence(
+        "box", ["creeper"], frames=8, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
+    )
+    (body,) = fused(sequence, range(4, 8)).values()
+    assert not body.rigid
+    assert body.why.startswith("seen too short: 4 frames")
+
+
+def test_off_by_default_and_without_influence():
+    sequence = dudmap.synthetic.sequence("box", ["person"], frames=12, start_dynamic=True, camera=SMALL)
+    off, on = Slam(sequence.camera), Slam(sequence.camera, ON)
+    for i in range(12):
+        a, b = off.process(sequence[i]), on.process(sequence[i])
+        np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
+        np.testing.assert_array_equal(a.dynamic_mask, b.dynamic_mask)
+        assert "bodies" not in a.timings
+    assert off.fusion is None
+    assert off.bodies == []
+    assert len(on.bodies) > 0
+    assert off.volume.num_blocks == on.volume.num_blocks
+
+
+@pytest.mark.slow
+def test_run_writes_meshes_of_rigid_movers(tmp_path):
+    """The whole system on a moving camera: a ball rolls, a cart creeps, each in its own recording."""
+    for name, rms, seed in (("creeper", 0.01, 0), ("ball", 0.04, 0)):
+        sequence = dudmap.synthetic.sequence("room", [name], frames=100, seed=seed)
+        out = tmp_path / name
+        (out / "movers").mkdir(parents=True)
+        (out / "movers" / "77.ply").write_text("of an earlier run")
+        report = run(sequence, ON, out, progress=False, save_map=False)
+        bodies = json.loads((out / "metrics.json").read_text())["bodies"]
+        assert bodies == report.metrics["bodies"]
+        rigid = [body for body in bodies if body["rigid"]]
+        assert len(rigid) == 1
+        assert all(body["why_not"] for body in bodies if not body["rigid"])
+        number = rigid[0]["id"]
+        assert sorted(path.name for path in (out / "movers").iterdir()) == [f"{number}.ply", f"{number}.txt"]
+        mesh, path = Mesh.load(out / "movers" / f"{number}.ply"), Trajectory.load(out / "movers" / f"{number}.txt")
+        body = Body(number, True, "", rigid[0]["frames"], mesh, path)
+        shape, way = errors(body, sequence._movers[0], sequence.ground_truth.Ts_world_camera[0])
+        assert np.median(shape) < 0.004
+        assert np.percentile(shape, 90) < 0.02
+        assert np.sqrt(np.mean(way**2)) < rms
