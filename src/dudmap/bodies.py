@@ -31,7 +31,7 @@ EXTENT = 1.0
 """The window of a body's map is that of a camera with readings up to this, metres: a cube of about 2.5 m."""
 FEWEST_PIXELS = 60
 """Pixels at the labels' resolution that a body is looked at from."""
-MOST_PIXELS = 12000
+MOST_PIXELS = 16000
 """Pixels of a body that are registered and fused; a larger image of it is halved."""
 LEAST = 128
 """Smallest width and height of the part of an image that is looked at, pixels."""
@@ -52,10 +52,12 @@ MOST_STARTS = 20
 """Times that a map is begun."""
 FAILED = 0.3
 """Largest share of frames that do not fit a rigid body."""
-FARTHEST_STILL = 0.05
+FARTHEST_STILL = 0.03
 """What has not moved farther than this is no moving body, metres."""
 COLOR = 0.3
 """Share of the usual weight that intensities have: light falls differently on a body that turns."""
+FLECK = 0.05
+"""Pieces of a mesh that have a smaller share of the largest piece's vertices than this are left out."""
 POINTS = 2000
 """Surface points that are looked at again."""
 
@@ -140,6 +142,7 @@ class _Track:
     misfits: list[str] = field(default_factory=list)  # what each frame that did not fit was refused for
     judged: list[tuple[float, float]] = field(default_factory=list)  # shares seen through and off, per frame
     farthest: float = 0.0
+    recent: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)  # time and T_world_body
     begun: tuple[str, ...] = ()  # why the map was begun anew, each time
 
 
@@ -154,7 +157,7 @@ class RigidFusion:
         self.config = config
         steps = config.tracker.model_copy(
             update={
-                "iterations": (6, 5, 3),
+                "iterations": (8, 8, 6),
                 "damping": 1e-3,
                 "exposure": False,
                 "min_inliers": 0.1,
@@ -186,7 +189,7 @@ class RigidFusion:
         level: Level,
         T_world_camera: NDArray[np.float64],
         exposure: tuple[float, float],
-    ) -> None:
+    ) -> list[Mover]:
         """Register and fuse the bodies of a tracked frame.
 
         Args:
@@ -195,6 +198,10 @@ class RigidFusion:
             level: The image that their masks belong to.
             T_world_camera: (4, 4).
             exposure: Gain and offset of the frame.
+
+        Returns:
+            The movers, those that are followed with the velocity of their middle: the surface of a rolling ball, of
+            which only the upper half is in view, is faster than the ball.
         """
         now = observation.timestamp
         for id, track in list(self._tracks.items()):
@@ -218,6 +225,18 @@ class RigidFusion:
                 self._start(mover, view, now, T_world_camera, (*track.begun, reason))
             elif _why(track, final=False):
                 self._finish(mover.id)
+        return [self._with_velocity(mover, now) for mover in movers]
+
+    def _with_velocity(self, mover: Mover, now: float) -> Mover:
+        """A mover with the slope of a line through the places of its body's middle in the last while."""
+        track = self._tracks.get(mover.id)
+        if track is None or len(track.Ts_camera_body) < YOUNG or track.last_seen != now or len(track.recent) < 3:
+            return mover
+        points = np.append((track.points.min(axis=0) + track.points.max(axis=0)) / 2, 1.0)
+        places = np.array([T[:3] @ points for _, T in track.recent])
+        times = np.array([time for time, _ in track.recent])
+        times = times - times.mean()
+        return replace(mover, velocity=times @ places / np.sum(times**2))
 
     def _finish(self, id: int) -> None:
         body, Ts = _finished(self._tracks.pop(id))
@@ -266,6 +285,7 @@ class RigidFusion:
         move = T @ se3.inverse(track.T_world_body)
         track.motion = np.concatenate([T[:3, 3] - track.T_world_body[:3, 3], se3.log_rotation(move[:3, :3])]) / duration
         track.T_world_body = T
+        track.recent = [old for old in track.recent if now - old[0] < self.config.movers.velocity_window] + [(now, T)]
         if through > SEEN_THROUGH or off > OFF:
             share, what = (through, "is seen through") if through > SEEN_THROUGH else (off, "does not fit")
             track.misfits.append(f"{share:.0%} of its surface {what}")
@@ -342,12 +362,28 @@ def _finished(track: _Track) -> tuple[Body, dict[float, NDArray[np.float64]]]:
     why, frames = _why(track), len(track.Ts_camera_body)
     if why:
         return Body(track.id, False, why, frames), {}
-    mesh = track.volume.extract_mesh()
+    mesh = _without_flecks(track.volume.extract_mesh())
     middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
     T = np.eye(4)
     T[:3, 3] = middle
     mesh = replace(mesh, vertices=mesh.vertices - middle)
     return Body(track.id, True, "", frames, mesh), {t: pose @ T for t, pose in track.Ts_camera_body.items()}
+
+
+def _without_flecks(mesh: Mesh) -> Mesh:
+    """The mesh without pieces that hang apart and are much smaller than the largest: readings beside the body."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = mesh.faces.T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    size = len(mesh.vertices)
+    _, piece = connected_components(coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(size, size)), False)
+    counts = np.bincount(piece)
+    kept = (counts >= FLECK * counts.max())[piece]
+    number = np.cumsum(kept) - 1
+    faces = number[mesh.faces[kept[a]]].astype(np.int32)
+    return Mesh(mesh.vertices[kept], faces, mesh.colors[kept], mesh.normals[kept])
 
 
 def _why(track: _Track, *, final: bool = True) -> str:

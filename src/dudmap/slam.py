@@ -512,7 +512,8 @@ class Slam:
                 movers = tuple(self.movers.update(observation.timestamp, labels.dynamic, level, tracked.T_world_camera))
             if self.fusion is not None:
                 with clock("bodies"):
-                    self.fusion.update(observation, movers, level, tracked.T_world_camera, tracked.exposure)
+                    pose, exposure = tracked.T_world_camera, tracked.exposure
+                    movers = tuple(self.fusion.update(observation, movers, level, pose, exposure))
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
