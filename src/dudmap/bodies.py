@@ -158,7 +158,7 @@ class RigidFusion:
         steps = config.tracker.model_copy(
             update={
                 "iterations": (8, 8, 6),
-                "damping": 1e-3,
+                "damping": 1e-4,
                 "exposure": False,
                 "min_inliers": 0.1,
                 "min_condition": 1e-6,
