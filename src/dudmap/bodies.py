@@ -56,6 +56,8 @@ FARTHEST_STILL = 0.03
 """What has not moved farther than this is no moving body, metres."""
 COLOR = 0.3
 """Share of the usual weight that intensities have: light falls differently on a body that turns."""
+RIM = 0.05
+"""Width of the border of a body's image that is left out, as a share of its size: readings at grazing angles."""
 FLECK = 0.05
 """Pieces of a mesh that have a smaller share of the largest piece's vertices than this are left out."""
 POINTS = 2000
@@ -143,7 +145,7 @@ class _Track:
     judged: list[tuple[float, float]] = field(default_factory=list)  # shares seen through and off, per frame
     farthest: float = 0.0
     recent: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)  # time and T_world_body
-    begun: tuple[str, ...] = ()  # why the map was begun anew, each time
+    begun: tuple[str, ...] = ()  # misfit that the map was begun anew for, each time; empty: more came into view
 
 
 class RigidFusion:
@@ -221,8 +223,7 @@ class RigidFusion:
             misfit = track.misfits[0] if track.misfits else ""
             young = len(track.Ts_camera_body) < YOUNG and len(track.begun) < MOST_STARTS
             if young and (misfit or view.area > GROWN * track.area):
-                reason = misfit or "more of it came into view"
-                self._start(mover, view, now, T_world_camera, (*track.begun, reason))
+                self._start(mover, view, now, T_world_camera, (*track.begun, misfit))
             elif _why(track, final=False):
                 self._finish(mover.id)
         return [self._with_velocity(mover, now) for mover in movers]
@@ -395,8 +396,9 @@ def _why(track: _Track, *, final: bool = True) -> str:
         return ""
     time = track.last_seen - track.first_seen
     if len(track.Ts_camera_body) < FEWEST_FRAMES or time < SHORTEST:
-        if len(track.begun) >= FEWEST_FRAMES // 2:
-            return f"not rigid: {len(track.begun)} beginnings did not fit what followed, the last: {track.begun[-1]}"
+        misfits = [reason for reason in track.begun if reason]
+        if len(misfits) >= FEWEST_FRAMES // 2:
+            return f"not rigid: {len(misfits)} beginnings did not fit what followed, the last: {misfits[-1]}"
         return f"seen too short: {len(track.Ts_camera_body)} frames in {time:.1f} s"
     if track.farthest < FARTHEST_STILL:
         return f"moved by {100 * track.farthest:.1f} cm only"
@@ -424,7 +426,8 @@ def _view(observation: Observation, mover: Mover, level: Level, exposure: tuple[
     )
     crop = tuple(slice(part.start * stride, part.stop * stride) for part in low)
     mask = full_size(mover.mask[low], level.depth[low], np.ascontiguousarray(observation.depth[crop])).astype(np.uint8)
-    mask = cv2.erode(mask, np.ones((5, 5), np.uint8))
+    margin = max(2, round(RIM * float(np.sqrt(np.count_nonzero(mask)))))
+    mask = cv2.erode(mask, np.ones((2 * margin + 1, 2 * margin + 1), np.uint8))
     pixels = int(np.count_nonzero(mask))
     finest = 0
     while pixels >> (2 * finest) > MOST_PIXELS:
