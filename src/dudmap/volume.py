@@ -267,11 +267,13 @@ class TsdfVolume:
     def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
         """Give voxels to the blocks that the truncation band of this depth image touches."""
         T = self.lattice(T_world_camera) / np.float32(BLOCK)
-        ranges = bands(depth.shape[0] // 2, 30)
+        farthest = max(float(depth.max()), 0.05)
+        stride = int(np.clip(0.5 * self.block_size * self.camera.fx / farthest, 1, 8))  # half a block apart, or less
+        ranges = bands(-(-depth.shape[0] // stride), 15)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
-                2 * start, 2 * stop, 2, depth, self._intrinsics(), T, self._shape,
+                stride * start, min(stride * stop, depth.shape[0]), stride, depth, self._intrinsics(), T, self._shape,
                 self._window, self._frame_number, self._stamps, self.noise_band(), out,
             ),
             ranges, found,

@@ -178,27 +178,29 @@ def observation_weights(row_start, row_stop, depth, intrinsics, sigma_base, sigm
         out: (H, W) uint8 out, at least 1 where there is a reading.
     """
     h, w = depth.shape
+    zero, half, one, slanted = np.float32(0), np.float32(0.5), np.float32(1), np.float32(0.3)
+    fx, fy, cx, by_fx = intrinsics[0], intrinsics[1], intrinsics[2], np.float32(1) / intrinsics[0]
     err_one = sigma_base + sigma_scale
     for v in range(row_start, row_stop):
-        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
-        up, down = max(v - 1, 0), min(v + 1, h - 1)
-        for u in range(w):
-            z = depth[v, u]
-            out[v, u] = 0
-            if z <= 0:
-                continue
-            left, right = max(u - 1, 0), min(u + 1, w - 1)
-            zl, zr, zu, zd = depth[v, left], depth[v, right], depth[up, u], depth[down, u]
-            cosine = np.float32(0.3)  # at a depth edge the angle is not known: taken as slanted
-            edge = np.float32(0.03) * z
-            if min(min(zl, zr), min(zu, zd)) > 0 and abs(zl - zr) < edge and abs(zu - zd) < edge:
-                x = (np.float32(u) - intrinsics[2]) / intrinsics[0]
-                # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..))
-                gu = intrinsics[0] * (zr - zl) / np.float32(max(right - left, 1))
-                gv = intrinsics[1] * (zd - zu) / np.float32(max(down - up, 1))
-                nz = -(z + x * gu + y * gv)
-                normal = np.sqrt(gu * gu + gv * gv + nz * nz)
-                ray = np.sqrt(x * x + y * y + np.float32(1))
-                cosine = abs(x * gu + y * gv + nz) / (normal * ray)
+        y = (np.float32(v) - intrinsics[3]) / fy
+        above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
+        by_rows = fy / np.float32(max(min(v + 1, h - 1) - max(v - 1, 0), 1))
+        row = out[v]
+        for u in range(1, w - 1):
+            k = np.uintp(u)
+            left, right = middle[np.uintp(u - 1)], middle[np.uintp(u + 1)]
+            z, up, down = middle[k], above[k], below[k]
+            x = (np.float32(u) - cx) * by_fx
+            # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and
+            # its product with the ray (x, y, 1) is -z
+            gu, gv = half * fx * (right - left), by_rows * (down - up)
+            nz = z + x * gu + y * gv
+            cosine = z / np.sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
+            step = max(abs(left - right), abs(up - down))
+            smooth = (min(min(left, right), min(up, down)) > zero) & (step < np.float32(0.03) * z)
+            cosine = cosine if smooth else slanted  # at a depth edge the angle is not known: taken as slanted
             weight = best * cosine * err_one / (sigma_base + sigma_scale * z * z)
-            out[v, u] = np.uint8(min(max(weight + np.float32(0.5), np.float32(1)), np.float32(16)))
+            weight = min(max(weight + half, one), np.float32(16)) if z > zero else zero
+            row[k] = np.int32(weight)
+        row[0] = 1 if middle[0] > zero else 0
+        row[w - 1] = 1 if middle[w - 1] > zero else 0
