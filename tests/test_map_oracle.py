@@ -39,6 +39,16 @@ def voxels_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
     return points, (words >> 16) * volume.sdf_unit, (words >> 8) & 255, rgb
 
 
+def intensity(volume: TsdfVolume) -> np.ndarray:
+    """Intensities (n,) 0..255 of all voxels."""
+    return volume._geometry[volume.active_slots].reshape(-1) & 255
+
+
+def allowed(volume: TsdfVolume) -> float:
+    """Rounding of a distance, metres: two steps of the stored one, half a step of the reading's 65534 in its range."""
+    return 2 * volume.sdf_unit + volume.depth_max / 65534 / 2 + 1e-6
+
+
 def test_integrate_equals_the_running_average_of_the_thesis():
     volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
     frames, Ts = [wall(1.5, seed) for seed in range(3)], poses(3)
@@ -52,9 +62,11 @@ def test_integrate_equals_the_running_average_of_the_thesis():
     same_pixel = weights == 3  # float32 and float64 may round a projection to neighbouring pixels
     assert same_pixel.mean() > 0.98
     error = np.abs(distance[chosen] - expected)[same_pixel]
-    assert np.mean(error < 2 * volume.sdf_unit + 1e-6) > 0.98
+    assert np.mean(error < allowed(volume)) > 0.98
+    near = same_pixel & (np.abs(expected) < 1.5 * volume.voxel_size)
+    assert np.mean(np.abs(color[chosen] - colors)[near].max(axis=1) < 1.0) > 0.97
     band = same_pixel & (np.abs(expected) < 0.9 * volume.truncation)
-    assert np.mean(np.abs(color[chosen] - colors)[band].max(axis=1) < 1.0) > 0.97
+    assert np.mean(np.abs(intensity(volume)[chosen] - colors @ [0.299, 0.587, 0.114])[band] < 1.5) > 0.97
 
 
 def test_integrate_with_angle_weights_and_a_band_that_grows_with_the_noise():
@@ -76,10 +88,10 @@ def test_integrate_with_angle_weights_and_a_band_that_grows_with_the_noise():
     )
     same_pixel = weights == weight[chosen]
     assert same_pixel.mean() > 0.98
-    assert np.mean(np.abs(distance[chosen] - expected)[same_pixel] < 2 * volume.sdf_unit + 1e-6) > 0.98
+    assert np.mean(np.abs(distance[chosen] - expected)[same_pixel] < allowed(volume)) > 0.98
     assert np.nanmax(expected) > 1.1 * volume.truncation
-    band = same_pixel & (np.abs(expected) < 0.9 * volume.truncation)
-    assert np.mean(np.abs(color[chosen] - colors)[band].max(axis=1) < 1.0) > 0.97
+    near = same_pixel & (np.abs(expected) < 0.35 * sigma(0.8))
+    assert np.mean(np.abs(color[chosen] - colors)[near].max(axis=1) < 1.0) > 0.97
 
 
 @pytest.mark.parametrize("tilt_deg", [0, 30, 60])

@@ -97,8 +97,7 @@ class BodyVolume(TsdfVolume):
     """
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
-        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, EXTENT)
-        self.depth_max = depth_max
+        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, EXTENT)
         self._around = np.eye(4)
         self._around[2, 3] = -self._reach
 

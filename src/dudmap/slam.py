@@ -27,7 +27,10 @@ from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
 from dudmap.tracker import Level, Tracker, TrackingResult
 from dudmap.trajectory import Trajectory
-from dudmap.volume import TsdfVolume
+from dudmap.volume import SURFACE, TsdfVolume
+
+AS_EXPECTED = 0.02
+"""Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -285,13 +288,15 @@ class Slam:
             tracked = self.tracker.align(self.reference, tracked_levels[:split], T_init, weights)
         labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
-            again = tracked_levels[split - 1 :]
+            enough = split < len(tracked_levels) and tracked.settled and self._as_expected(labels)
+            first = split if enough else split - 1
+            again = tracked_levels[first:]
             tracked = self.tracker.align(
                 self.reference,
                 again,
                 tracked.T_world_camera,
                 self._weights(labels, again),
-                first_level=split - 1,
+                first_level=first,
                 exposure=tracked.exposure,
             )
         return tracked, labels
@@ -304,6 +309,13 @@ class Slam:
             return unmasked
         weights = [np.float32(1) - np.float32(0.9) * _reduced(self._moved, level) for level in levels]
         return weights if unmasked is None else [a * b for a, b in zip(weights, unmasked, strict=True)]
+
+    def _as_expected(self, labels: Labels) -> bool:
+        """Whether so little of what lies on the map moves other than in the last frame that no coarser level need be
+        registered again."""
+        changed = labels.dynamic if self._moved is None else labels.dynamic != self._moved
+        counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
+        return np.count_nonzero(changed & counted) <= AS_EXPECTED * np.count_nonzero(counted)
 
     def _undecided(self, levels: dict[int, Level], labels: Labels | None) -> str:
         """Sentence if so much seems to move that the static world cannot be told, else empty."""

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.config import DynamicsConfig
 from dudmap.kernels import segmentation
+from dudmap.kernels.threads import bands, run_bands
 from dudmap.tracker import Level
 
 REACH = 3
@@ -278,9 +279,12 @@ def _against(
     shape = level.depth.shape
     out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
     T = (se3.inverse(memory.T_world_camera) @ T_world_camera)[:3].astype(np.float32)
-    segmentation.against(
-        level.depth, level.intensity, _intrinsics(level), T, memory.level.depth, memory.level.intensity, memory.marks,
-        *out,
+    run_bands(
+        lambda start, stop: segmentation.against(
+            start, stop, level.depth, level.intensity, _intrinsics(level), T, memory.level.depth,
+            memory.level.intensity, memory.marks, *out,
+        ),
+        bands(shape[0], 30),
     )  # fmt: skip
     return out
 

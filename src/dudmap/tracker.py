@@ -1,6 +1,6 @@
 """Camera pose from the signed distances and intensities of the map (thesis section 4.4, algorithm 2)."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,6 +64,7 @@ class TrackingResult:
         condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
         iterations: Linearisations over all levels.
         color_residual: Median absolute intensity difference (0..1) to the map at the static readings.
+        settled: Whether the last level ended with a step too small to matter, not for want of iterations.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -75,6 +76,7 @@ class TrackingResult:
     condition: float
     iterations: int
     color_residual: float = 0.0
+    settled: bool = True
 
 
 class Tracker:
@@ -104,7 +106,7 @@ class Tracker:
             exposure: First guess of the gain and offset.
         """
         volume.look_at(T_init)
-        T, iterations, system = T_init, 0, None
+        T, iterations, system, settled = T_init, 0, None, True
         weights = np.ones_like(levels[-1].depth)
         for index, level in enumerate(levels):
             limit = self.config.iterations[first_level + index]
@@ -121,13 +123,13 @@ class Tracker:
                     lit = exposed(level, exposure)
                     system = self.linearize(volume, lit, T, weights)
                     iterations += 1
-            T, system, used = self._optimize(volume, lit, T, weights, system, limit)
+            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit)
             iterations += used
         if system is None:  # every level is left out: judge the first guess
             system = self.linearize(volume, levels[-1], T, weights)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return self._judge(T, exposure, system, weights, iterations)
+        return replace(self._judge(T, exposure, system, weights, iterations), settled=settled)
 
     def _optimize(
         self,
@@ -137,7 +139,7 @@ class Tracker:
         weights: NDArray[np.float32],
         system: LinearSystem,
         limit: int,
-    ) -> tuple[NDArray[np.float64], LinearSystem, int]:
+    ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
         damping, used = self.config.damping, 0
         for _ in range(limit):
@@ -150,15 +152,14 @@ class Tracker:
             if (
                 np.linalg.norm(step) < self.config.stop
             ):  # the step is known to be small before it is tried: take it and be done
-                T = T_trial
-                break
+                return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
                 damping *= 5
-        return T, system, used
+        return T, system, used, False
 
     def linearize(
         self, volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64], weights: NDArray[np.float32]

@@ -72,6 +72,7 @@ class TsdfVolume:
         config: Voxel size, truncation, weights.
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
+        extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
         born: Number of this map among all of the program; another one after the map was made anew.
@@ -86,6 +87,7 @@ class TsdfVolume:
         config: VolumeConfig | None = None,
         sensor: SensorConfig | None = None,
         depth_max: float = 6.0,
+        extent: float | None = None,
     ) -> None:
         self.camera = camera
         self.config = config or VolumeConfig()
@@ -97,14 +99,16 @@ class TsdfVolume:
         self.truncation_behind = self.config.truncation_behind_voxels * self.voxel_size
         self._limit = max(0.3, self.truncation, self.truncation_behind)
         self.sdf_unit = self._limit / 32767
+        self._depth_unit = depth_max / 65534  # of readings on their way into the voxels
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
                          max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
-        self._reach = depth_max * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
+        extent = depth_max if extent is None else extent
+        self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
         cells = int(np.ceil(2 * (self._reach + self._limit) / self.block_size)) + 8
         if cells > 288:
-            longest = depth_max * 280 / cells
+            longest = extent * 280 / cells
             raise MapError(
-                f"voxels of {self.voxel_size} m with readings up to {depth_max} m need too large a window; "
+                f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
         size = 16 * int(np.ceil(cells / 16))
@@ -127,7 +131,7 @@ class TsdfVolume:
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
         self.born = next(_BIRTHS)
-        self._packed: tuple[NDArray[np.float32], NDArray[np.int32]] | None = None
+        self._packed: NDArray[np.int32] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -266,11 +270,13 @@ class TsdfVolume:
     def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
         """Give voxels to the blocks that the truncation band of this depth image touches."""
         T = self.lattice(T_world_camera) / np.float32(BLOCK)
-        ranges = bands(depth.shape[0] // 2, 30)
+        farthest = max(float(depth.max()), 0.05)
+        stride = int(np.clip(0.5 * self.block_size * self.camera.fx / farthest, 1, 8))  # half a block apart, or less
+        ranges = bands(-(-depth.shape[0] // stride), 15)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
-                2 * start, 2 * stop, 2, depth, self._intrinsics(), T, self._shape,
+                stride * start, min(stride * stop, depth.shape[0]), stride, depth, self._intrinsics(), T, self._shape,
                 self._window, self._frame_number, self._stamps, self.noise_band(), out,
             ),
             ranges, found,
@@ -356,35 +362,41 @@ class TsdfVolume:
             [
                 self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
                 self.sensor.sigma_base, self.sensor.sigma_scale, self.config.max_weight,
-                self.config.carve_rate if self.config.carving else 1, self._limit,
+                self.config.carve_rate if self.config.carving else 1, self._limit, self._depth_unit,
             ],
             dtype=np.float32,
         )  # fmt: skip
-        readings, colors = self._pixels(depth, color, self._weights(depth) if weights is None else weights)
-        state = np.empty((count, 2), dtype=np.int32)
+        pixels = self._pixels(depth, color, self._weights(depth) if weights is None else weights)
+        occupied = np.empty(count, dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate(
-                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, readings, colors,
-                self._geometry.reshape(-1), self._colors.reshape(-1), voxel, state,
+                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, pixels,
+                self._geometry.reshape(-1), self._colors.reshape(-1), voxel, occupied,
             ),
             bands(count, 256),
         )  # fmt: skip
         if self.config.carving:
-            self._release(visible[(state[:, 0] == 0) & (state[:, 1] == BLOCK**3)])
+            self._release(visible[occupied == 0])
 
     def _pixels(
         self, depth: NDArray[np.float32], color: NDArray[np.uint8], weights: NDArray[np.uint8]
-    ) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Readings (H * W + 1, 2) and colours (H * W + 1,) as the fusion takes them; the last pixel has no reading."""
-        if self._packed is None or len(self._packed[1]) != depth.size + 1:
-            self._packed = np.zeros((depth.size + 1, 2), dtype=np.float32), np.zeros(depth.size + 1, dtype=np.int32)
-        readings, colors = self._packed
-        rgb = np.ascontiguousarray(color)
+    ) -> NDArray[np.int64]:
+        """Readings and colours (H * W + 1,) as the fusion takes them; the last pixel has no reading."""
+        if self._packed is None or len(self._packed) != depth.size + 1:
+            self._packed = np.zeros((depth.size + 1, 2), dtype=np.int32)
+        pixels, rgb = self._packed, np.ascontiguousarray(color)
+        limits = np.array(
+            [
+                self.truncation, self.config.truncation_noise, self.sensor.sigma_base, self.sensor.sigma_scale,
+                self._limit, self._depth_unit,
+            ],
+            dtype=np.float32,
+        )  # fmt: skip
         run_bands(
-            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, readings, colors),
+            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, limits, pixels),
             bands(depth.shape[0], 60),
         )
-        return readings, colors
+        return pixels.view(np.int64).reshape(-1)
 
     def _weights(self, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
         """Weights (H, W) of the readings: all alike, or by the angle of sight and the sensor's noise (eq. 4.20)."""

@@ -3,23 +3,29 @@
 import numpy as np
 
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.words import bits, upper_half
 
 
 @kernel
-def pack_pixels(row_start, row_stop, depth, rgb, weights, readings, colors):
-    """What the fusion loads of each pixel, in two words side by side and one more, so that it loads little.
+def pack_pixels(row_start, row_stop, depth, rgb, weights, bands, pixels):
+    """What the fusion loads of each pixel, in two words, so that it loads little.
 
     Args:
         row_start, row_stop: Rows of the band.
         depth: (H, W) float32, metres, 0 = none.
         rgb: (H, W, 3) uint8.
         weights: (H, W) uint8, weight of each reading.
-        readings: (H * W + 1, 2) float32 out: the reading, and the nearest of the readings in its 3x3 neighbourhood,
-            which decides whether a voxel is surely seen empty; 0 = none. The last row stays as it is.
-        colors: (H * W + 1,) int32 out: r << 24 | g << 16 | b << 8 | weight. The last element stays as it is.
+        bands: (5,) float32: truncation, truncation_noise, sigma_base, sigma_scale, largest storable distance; the unit
+            of depth last.
+        pixels: (H * W + 1, 2) int32 out. First: reading << 16 | depth in front of which the pixel surely sees nothing,
+            both in units, 0 = none; the latter is the nearest reading of the 3x3 neighbourhood less its band. Second:
+            r << 24 | g << 16 | b << 8 | weight. The last row stays as it is.
     """
     h, w = depth.shape
     far = np.float32(1e9)
+    zero, half = np.float32(0), np.float32(0.5)
+    front, noise, base, scale, limit = bands[0], bands[1], bands[2], bands[3], bands[4]
+    by_unit = np.float32(1) / bands[5]
     column = np.full(w + 2, far, np.float32)
     for v in range(row_start, row_stop):
         above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
@@ -27,34 +33,21 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, readings, colors):
             a, b, c = above[u], middle[u], below[u]
             a, b, c = a if a > 0 else far, b if b > 0 else far, c if c > 0 else far
             column[np.uintp(u + 1)] = min(min(a, b), c)
-        row, shades = readings[v * w : v * w + w], colors[v * w : v * w + w]
+        row = pixels[v * w : v * w + w]
         source, gains = rgb[v].reshape(-1), weights[v]
         for u in range(w):
             k = np.uintp(u)
             near = min(min(column[k], column[np.uintp(u + 1)]), column[np.uintp(u + 2)])
-            row[k, 0] = middle[k]
-            row[k, 1] = near if middle[k] > 0 else np.float32(0)
+            empty = near - min(max(front, noise * (base + scale * near * near)), limit)
+            empty = max(empty, zero) if middle[k] > zero else zero
+            row[k, 0] = (np.int32(middle[k] * by_unit + half) << np.int32(16)) | np.int32(empty * by_unit)
         for u in range(w):
             r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
-            shades[u] = (np.int32(r) << 24) | (np.int32(g) << 16) | (np.int32(b) << 8) | np.int32(gains[u])
+            row[u, 1] = (np.int32(r) << 24) | (np.int32(g) << 16) | (np.int32(b) << 8) | np.int32(gains[u])
 
 
 @kernel
-def integrate(
-    start,
-    stop,
-    slots,
-    coords,
-    T,
-    intrinsics,
-    size,
-    readings,
-    colors,
-    map_geometry,
-    map_colors,
-    voxel,
-    state,
-):
+def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geometry, map_colors, voxel, occupied):
     """Fuse one frame into blocks ``slots[start:stop]`` (eq. 4.18-4.23).
 
     Args:
@@ -64,19 +57,19 @@ def integrate(
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
-        readings, colors: See ``pack_pixels``.
+        pixels: (H * W + 1,) int64, the two words of ``pack_pixels`` as one.
         map_geometry, map_colors: (num_slots * 512,) int32.
-        voxel: (10,) float32: voxel_size, sdf_unit, truncation, truncation_behind, truncation_noise, sigma_base,
-            sigma_scale, max_weight, carve_rate, largest storable distance.
-        state: (n, 2) int32 out: voxels that hold a surface, voxels seen.
+        voxel: (11,) float32: voxel_size, sdf_unit, truncation, truncation_behind, truncation_noise, sigma_base,
+            sigma_scale, max_weight, carve_rate, largest storable distance, unit of depth.
+        occupied: (n,) int32 out: voxels that hold a surface or were never seen.
     """
     voxel_size, unit, front, behind = voxel[0], voxel[1], voxel[2], voxel[3]
     noise, base, scale = voxel[4], voxel[5], voxel[6]
-    max_weight, carve_rate, limit = voxel[7], voxel[8], voxel[9]
+    max_weight, carve_rate, limit, depth_unit = voxel[7], voxel[8], voxel[9], voxel[10]
     by_unit = np.float32(1) / unit
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
     height, width = size[0], size[1]
-    blank = np.int32(height * width)
+    blank = np.float32(height * width)
     fx, fy = intrinsics[0], intrinsics[1]
     cx, cy = intrinsics[2] + half, intrinsics[3] + half
     local_x = np.empty(512, np.float32)
@@ -90,11 +83,11 @@ def integrate(
                 local_x[n] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
                 local_y[n] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
                 local_z[n] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+    # few arrays, since the compiler vectorises no loop that needs many checks whether two of them overlap
     pixel = np.empty(512, np.int32)
-    voxel_z = np.empty(512, np.float32)
-    seen = np.empty(512, np.float32)
-    seen_near = np.empty(512, np.float32)
-    seen_color = np.empty(512, np.int32)
+    seen = np.empty(512, np.int64)
+    words = seen.view(np.int32)  # reading and colour of the voxel's pixel, side by side
+    known = np.empty((2, 512), np.float32)  # depth of the voxel; the share in which it takes on the pixel's colour
     max_u, max_v = np.float32(width), np.float32(height)
 
     for block in range(start, stop):
@@ -111,68 +104,65 @@ def integrate(
             u = np.floor((bx + local_x[n]) * by_z * fx + cx)
             v = np.floor((by + local_y[n]) * by_z * fy + cy)
             ok = (z > np.float32(0.05)) & (u >= zero) & (v >= zero) & (u < max_u) & (v < max_v)
-            pixel[n] = np.int32(v) * np.int32(width) + np.int32(u) if ok else blank
-            voxel_z[n] = z
+            pixel[n] = np.int32(v * max_u + u if ok else blank)
+            known[0, n] = z
         for n in range(512):
-            p = np.uintp(pixel[n])
-            seen[n] = readings[p, 0]
-            seen_near[n] = readings[p, 1]
-            seen_color[n] = colors[p]
+            seen[n] = pixels[np.uintp(pixel[n])]
         first = np.int64(slot) * 512
-        surface = np.int32(0)
-        known = np.int32(0)
+        geometry = map_geometry[first : first + 512]
+        held = painted = zero  # counted in float32: an integer sum has 64 bits, half as many in a register
         for n in range(512):
-            word = map_geometry[np.uintp(first + n)]
-            old_color = map_colors[np.uintp(first + n)]
-            d, dn = seen[n], seen_near[n]
-            s = d - voxel_z[n]
+            word, reading, c = geometry[n], words[2 * n], words[2 * n + 1]
+            d = bits(reading, 16, 0xFFFF) * depth_unit
+            z = known[0, n]
+            s = d - z
             sigma = noise * (base + scale * d * d)
             tau = min(max(front, sigma), limit)
-            tau_behind = min(max(behind, sigma), limit)
-            observed = (d > zero) & (s > -tau_behind)
+            observed = (d > zero) & (s > -min(max(behind, sigma), limit))
             banded = observed & (s < tau)
-            old_sdf = np.float32(word >> 16) * unit
-            old_weight = np.float32((word >> 8) & 0xFF)
-            dn_sigma = noise * (base + scale * dn * dn)
-            empty = observed & (dn > zero) & (dn - voxel_z[n] > min(max(front, dn_sigma), limit))
+            empty = observed & (bits(reading, 0, 0xFFFF) * depth_unit > z)
+            old_sdf = upper_half(word) * unit
+            old_weight = bits(word, 8, 0xFF)
             holds = (old_weight > zero) & (old_sdf < tau * np.float32(0.9))
-            c = seen_color[n]
-            gain = np.float32(c & 0xFF)
+            gain = bits(c, 0, 0xFF)
             gain = gain * carve_rate if empty & holds else gain
             gain = gain if banded | empty else zero
-            value = min(s, tau)
             total = old_weight + gain
             share = gain / max(total, one)
-            new_sdf = old_sdf + (value - old_sdf) * share
-            new_weight = min(total, max_weight)
-            q = np.floor(new_sdf * by_unit + half)
-            # colour belongs to the surface: emptiness does not repaint it
-            paint = gain / max(total, one) if banded else zero
-            r0, g0, b0 = (
-                np.float32((old_color >> 20) & 0x3FF),
-                np.float32((old_color >> 10) & 0x3FF),
-                np.float32(old_color & 0x3FF),
+            new_sdf = old_sdf + (min(s, tau) - old_sdf) * share
+            # intensity and colour belong to the surface: emptiness does not repaint it
+            share = share if banded else zero
+            shade = np.float32(0.299) * bits(c, 24, 0xFF) + np.float32(0.587) * bits(c, 16, 0xFF)
+            shade += np.float32(0.114) * bits(c, 8, 0xFF)
+            old_shade = bits(word, 0, 0xFF)
+            new_shade = old_shade + (shade - old_shade) * share
+            new_word = (
+                (np.int32(np.floor(new_sdf * by_unit + half)) << np.int32(16))
+                | (np.int32(min(total, max_weight)) << np.int32(8))
+                | np.int32(new_shade + half)
             )
-            r1, g1, b1 = np.float32((c >> 22) & 0x3FC), np.float32((c >> 14) & 0x3FC), np.float32((c >> 6) & 0x3FC)
-            r1, g1, b1 = r0 + (r1 - r0) * paint, g0 + (g1 - g0) * paint, b0 + (b1 - b0) * paint
-            new_color = (
+            new_word = np.int32(new_word) if gain > zero else word
+            geometry[n] = new_word
+            near = abs(s) < max(np.float32(2.5) * voxel_size, np.float32(0.4) * tau)
+            share = share if near else zero
+            known[1, n] = share
+            painted += one if share > zero else zero
+            surface = (bits(new_word, 8, 0xFF) == zero) | (upper_half(new_word) * unit < front * np.float32(0.9))
+            held += one if surface else zero
+        occupied[block] = np.int32(held)
+        if painted == zero:
+            continue
+        shades = map_colors[first : first + 512]
+        for n in range(512):
+            old, c = shades[n], words[2 * n + 1]
+            share = known[1, n]
+            share = one if (old == 0) & (share > zero) else share
+            r0, g0, b0 = bits(old, 20, 0x3FF), bits(old, 10, 0x3FF), bits(old, 0, 0x3FF)
+            r1, g1, b1 = bits(c, 22, 0x3FC), bits(c, 14, 0x3FC), bits(c, 6, 0x3FC)
+            r1, g1, b1 = r0 + (r1 - r0) * share, g0 + (g1 - g0) * share, b0 + (b1 - b0) * share
+            shades[n] = (
                 (np.int32(r1 + half) << np.int32(20)) | (np.int32(g1 + half) << np.int32(10)) | np.int32(b1 + half)
             )
-            shade = np.int32(
-                (np.float32(0.299) * r1 + np.float32(0.587) * g1 + np.float32(0.114) * b1) * np.float32(0.25) + half
-            )
-            shade = min(shade, np.int32(255))
-            changed = gain > zero
-            new_word = (np.int32(q) << np.int32(16)) | (np.int32(new_weight) << np.int32(8)) | shade
-            new_word = new_word if changed else word
-            map_geometry[np.uintp(first + n)] = new_word
-            map_colors[np.uintp(first + n)] = new_color if changed else old_color
-            final_weight = (new_word >> 8) & 0xFF
-            final_sdf = np.float32(new_word >> 16) * unit
-            known += np.int32(1) if final_weight > 0 else np.int32(0)
-            surface += np.int32(1) if (final_weight > 0) & (final_sdf < front * np.float32(0.9)) else np.int32(0)
-        state[block, 0] = surface
-        state[block, 1] = known
 
 
 @kernel
@@ -188,27 +178,29 @@ def observation_weights(row_start, row_stop, depth, intrinsics, sigma_base, sigm
         out: (H, W) uint8 out, at least 1 where there is a reading.
     """
     h, w = depth.shape
+    zero, half, one, slanted = np.float32(0), np.float32(0.5), np.float32(1), np.float32(0.3)
+    fx, fy, cx, by_fx = intrinsics[0], intrinsics[1], intrinsics[2], np.float32(1) / intrinsics[0]
     err_one = sigma_base + sigma_scale
     for v in range(row_start, row_stop):
-        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
-        up, down = max(v - 1, 0), min(v + 1, h - 1)
-        for u in range(w):
-            z = depth[v, u]
-            out[v, u] = 0
-            if z <= 0:
-                continue
-            left, right = max(u - 1, 0), min(u + 1, w - 1)
-            zl, zr, zu, zd = depth[v, left], depth[v, right], depth[up, u], depth[down, u]
-            cosine = np.float32(0.3)  # at a depth edge the angle is not known: taken as slanted
-            edge = np.float32(0.03) * z
-            if min(min(zl, zr), min(zu, zd)) > 0 and abs(zl - zr) < edge and abs(zu - zd) < edge:
-                x = (np.float32(u) - intrinsics[2]) / intrinsics[0]
-                # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..))
-                gu = intrinsics[0] * (zr - zl) / np.float32(max(right - left, 1))
-                gv = intrinsics[1] * (zd - zu) / np.float32(max(down - up, 1))
-                nz = -(z + x * gu + y * gv)
-                normal = np.sqrt(gu * gu + gv * gv + nz * nz)
-                ray = np.sqrt(x * x + y * y + np.float32(1))
-                cosine = abs(x * gu + y * gv + nz) / (normal * ray)
+        y = (np.float32(v) - intrinsics[3]) / fy
+        above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
+        by_rows = fy / np.float32(max(min(v + 1, h - 1) - max(v - 1, 0), 1))
+        row = out[v]
+        for u in range(1, w - 1):
+            k = np.uintp(u)
+            left, right = middle[np.uintp(u - 1)], middle[np.uintp(u + 1)]
+            z, up, down = middle[k], above[k], below[k]
+            x = (np.float32(u) - cx) * by_fx
+            # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and
+            # its product with the ray (x, y, 1) is -z
+            gu, gv = half * fx * (right - left), by_rows * (down - up)
+            nz = z + x * gu + y * gv
+            cosine = z / np.sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
+            step = max(abs(left - right), abs(up - down))
+            smooth = (min(min(left, right), min(up, down)) > zero) & (step < np.float32(0.03) * z)
+            cosine = cosine if smooth else slanted  # at a depth edge the angle is not known: taken as slanted
             weight = best * cosine * err_one / (sigma_base + sigma_scale * z * z)
-            out[v, u] = np.uint8(min(max(weight + np.float32(0.5), np.float32(1)), np.float32(16)))
+            weight = min(max(weight + half, one), np.float32(16)) if z > zero else zero
+            row[k] = np.int32(weight)
+        row[0] = 1 if middle[0] > zero else 0
+        row[w - 1] = 1 if middle[w - 1] > zero else 0

@@ -201,10 +201,13 @@ def sums(labels, used, moving, distance, sigma, difference, gradient, out):
 
 
 @kernel
-def against(depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks):
+def against(
+    row_start, row_stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
+):
     """A depth image against an older one of the same camera, seen from where the older one was.
 
     Args:
+        row_start, row_stop: Rows of the band.
         depth, intensity: (h, w) float32.
         intrinsics: (4,) float32.
         T: (3, 4) float32, this camera to the older one.
@@ -217,7 +220,7 @@ def against(depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks
     """
     h, w = depth.shape
     nan = np.float32(np.nan)
-    for v in range(h):
+    for v in range(row_start, row_stop):
         for u in range(w):
             z = depth[v, u]
             gap[v, u], difference[v, u], marks[v, u] = nan, nan, 0
