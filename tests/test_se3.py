@@ -75,3 +75,9 @@ def test_nearest_rotation_is_orthonormal():
     assert np.allclose(mended.T @ mended, np.eye(3), atol=1e-12)
     assert np.isclose(np.linalg.det(mended), 1.0)
     assert np.allclose(se3.nearest_rotation(R), R)
+
+
+@given(twists)
+def test_exp_rotation_is_the_rotation_of_exp(xi):
+    turn = np.concatenate([np.zeros(3), xi[3:]])
+    assert np.allclose(se3.exp_rotation(xi[3:]), se3.exp(turn)[:3, :3], atol=1e-12)

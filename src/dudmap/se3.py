@@ -4,6 +4,8 @@
 first, in metres and radians; updates are applied on the left, ``exp(xi) @ T``.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -37,6 +39,24 @@ def exp(xi: Matrix) -> Matrix:
     T[:3, :3] += a * W + b * WW
     T[:3, 3] = v + b * (W @ v) + c * (WW @ v)
     return T
+
+
+def exp_rotation(omega: Matrix) -> Matrix:
+    """Rotation matrix (3, 3) of a rotation vector (3,), radians (Rodrigues)."""
+    x, y, z = (float(value) for value in omega)
+    theta_squared = x * x + y * y + z * z
+    if theta_squared < 1e-8:
+        a, b = 1 - theta_squared / 6, 0.5 - theta_squared / 24
+    else:
+        theta = math.sqrt(theta_squared)
+        a, b = math.sin(theta) / theta, (1 - math.cos(theta)) / theta_squared
+    return np.array(
+        [
+            [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+            [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+            [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+        ]
+    )
 
 
 def log(T: Matrix) -> Matrix:

@@ -12,6 +12,8 @@ from dudmap.kernels import registration
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.volume import TsdfVolume
 
+PIXELS_PER_BAND = 4800
+"""What a thread is woken for; the coarsest level is one band."""
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 
@@ -177,8 +179,8 @@ class Tracker:
             dtype=np.float32,
         )  # fmt: skip
         window, shape, geometry = volume.window
-        height = level.depth.shape[0]
-        ranges = bands(height, 30)
+        height, width = level.depth.shape
+        ranges = bands(height, -(-PIXELS_PER_BAND // width))
         sums = np.zeros((len(ranges), registration.NUM_SUMS))
         residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
         T = volume.lattice(T_world_camera)
@@ -223,7 +225,7 @@ class Tracker:
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
-        difference = system.residuals[1, ::2, ::2][weights[::2, ::2] > 0.5]
+        difference = system.residuals[1, ::4, ::4][weights[::4, ::4] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(np.median(difference)) if len(difference) else 0.0
         return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
@@ -232,7 +234,7 @@ class Tracker:
 def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
     """Pose after a twist (v, omega) about the camera's centre, world axes."""
     out = T_world_camera.copy()
-    out[:3, :3] = se3.exp(np.concatenate([np.zeros(3), step[3:]]))[:3, :3] @ T_world_camera[:3, :3]
+    out[:3, :3] = se3.exp_rotation(step[3:]) @ T_world_camera[:3, :3]
     out[:3, 3] += step[:3]
     return out
 

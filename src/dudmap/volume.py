@@ -338,7 +338,7 @@ class TsdfVolume:
     def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
         shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
         tiles = tuple(np.empty(shape, dtype=np.float32) for _ in range(3))
-        visibility.tile_ranges(depth, *tiles)
+        run_bands(lambda start, stop: visibility.tile_ranges(start, stop, depth, *tiles), bands(shape[0], 15))
         return tiles
 
     def _fuse(
@@ -351,12 +351,18 @@ class TsdfVolume:
     ) -> None:
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
-        visible = np.empty(len(self._near), dtype=np.int32)
-        count = visibility.visible_slots(
-            self._near, self._slot_coords, T_camera_world, self._intrinsics(), size, np.float32(self.block_size),
-            nearest, farthest, self.noise_band(), np.float32(0.05), np.float32(self.depth_max), visible,
+        slots = np.empty(len(self._near), dtype=np.int32)
+        ranges = bands(len(slots), 2048)
+        counts = run_bands(
+            lambda start, stop: visibility.visible_slots(
+                start, stop, self._near, self._slot_coords, T_camera_world, self._intrinsics(), size,
+                np.float32(self.block_size), nearest, farthest, self.noise_band(), np.float32(0.05),
+                np.float32(self.depth_max), slots,
+            ),
+            ranges,
         )  # fmt: skip
-        visible = visible[:count]
+        visible = np.concatenate([slots[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)])
+        count = len(visible)
         self._written[visible] = self._frame_number
         voxel = np.array(
             [
@@ -444,7 +450,7 @@ class TsdfVolume:
             lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
                 self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
-                np.float32(self.depth_max), self._free_count, count, out,
+                np.float32(self.depth_max), self._free_count, count, self.config.free_after, out,
             ),
             ranges, found,
         )  # fmt: skip

@@ -57,14 +57,15 @@ def mark_blocks(row_start, row_stop, stride, depth, intrinsics, T, shape, window
 
 
 @kernel
-def tile_ranges(depth, nearest, farthest, valid):
+def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
     """Nearest and farthest reading and share of pixels with one, per tile of the finest level.
 
     Args:
+        row_start, row_stop: Rows of tiles.
         depth: (H, W) float32.
         nearest, farthest, valid: (ceil(H / TILE), ceil(W / TILE)) float32 out; no reading gives inf, 0, 0.
     """
-    for ty in range(nearest.shape[0]):
+    for ty in range(row_start, row_stop):
         for tx in range(nearest.shape[1]):
             near, far, count, total = np.float32(np.inf), np.float32(0), 0, 0
             for v in range(ty * TILE, min(ty * TILE + TILE, depth.shape[0])):
@@ -80,10 +81,13 @@ def tile_ranges(depth, nearest, farthest, valid):
 
 
 @kernel
-def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, bands, depth_min, depth_max, out):
+def visible_slots(
+    start, stop, slots, coords, T, intrinsics, size, edge, nearest, farthest, bands, depth_min, depth_max, out
+):
     """Slots of the blocks that a depth image can change.
 
     Args:
+        start, stop: Range of candidates.
         slots: (n,) int32 candidates.
         coords: (num_slots, 3) int16 block coordinates by slot.
         T: (3, 4) float32, world to camera.
@@ -93,15 +97,15 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
         nearest, farthest: Depth tiles, see ``tile_ranges``.
         bands: See ``mark_blocks``.
         depth_min, depth_max: Range of the readings, metres.
-        out: (n,) int32 out.
+        out: (n,) int32 out, written from ``start`` on.
 
     Returns:
         How many slots were written.
     """
-    count = 0
+    count = start
     radius = np.float32(0.8661) * edge
     behind, noise, base, scale = bands[1], bands[2], bands[3], bands[4]
-    for n in range(len(slots)):
+    for n in range(start, stop):
         slot = slots[n]
         x = (np.float32(coords[slot, 0]) + np.float32(0.5)) * edge
         y = (np.float32(coords[slot, 1]) + np.float32(0.5)) * edge
@@ -129,7 +133,7 @@ def visible_slots(slots, coords, T, intrinsics, size, edge, nearest, farthest, b
                 continue
         out[count] = slot
         count += 1
-    return count
+    return count - start
 
 
 @kernel
@@ -150,6 +154,7 @@ def observe_free(
     depth_max,
     counts,
     more,
+    enough,
     found,
 ):
     """Count more observations of emptiness for window cells without voxels that lie wholly in front of everything
@@ -170,6 +175,7 @@ def observe_free(
         depth_max: Farthest reading, metres.
         counts: (entries,) uint8, observations of emptiness by entry; changed here.
         more: Observations that are counted.
+        enough: Observations after which a cell is not looked at again.
         found: (n,) int32 out, cells without an entry.
 
     Returns:
@@ -217,12 +223,18 @@ def observe_free(
                 continue
             for k in range(np.int64(np.ceil(low)), np.int64(np.floor(high)) + 1):
                 cell = (bx * shape[1] + by) * shape[2] + k
-                if window[cell] >= 0:
+                known = window[cell]
+                if known >= 0:
+                    continue
+                if known <= -2 and counts[np.uintp(-2 - known)] >= enough:
                     continue
                 kf = np.float32(k)
                 z = cz + kf * dz
                 px, py = cx + kf * dx, cy + kf * dy
                 u, v = px / z * intrinsics[0] + intrinsics[2], py / z * intrinsics[1] + intrinsics[3]
+                tx0, ty0 = np.int64(u) // TILE, np.int64(v) // TILE
+                if 0 <= tx0 < nearest.shape[1] and 0 <= ty0 < nearest.shape[0] and z + radius >= nearest[ty0, tx0]:
+                    continue  # most of space is behind something: its middle tells
                 reach = radius / (z - radius)
                 ru, rv = reach * intrinsics[0], reach * intrinsics[1]
                 tx0, tx1 = np.int64(np.floor(u - ru)) // TILE, np.int64(np.floor(u + ru)) // TILE
@@ -238,7 +250,6 @@ def observe_free(
                 if share < np.float32(0.6) * np.float32(tiles):
                     continue
                 if z + radius < near - max(front, noise * (base + scale * near * near)):
-                    known = window[cell]
                     if known <= -2:
                         entry = np.uintp(-2 - known)
                         counts[entry] = min(np.int64(counts[entry]) + more, 255)
