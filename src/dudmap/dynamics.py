@@ -99,6 +99,13 @@ class DynamicDetector:
         self.config = config
         self.sensor = sensor
         self.memory = surfaces.StandStill(config)
+        self._cut: tuple[Level, surfaces.Pieces] | None = None
+
+    def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
+        """Pieces of surface of an image; cut only once for the image that was asked for last."""
+        if self._cut is None or self._cut[0] is not level:
+            self._cut = level, surfaces.pieces(level, self._tolerance(self._sigma(level.depth, volume), level.depth))
+        return self._cut[1]
 
     def detect(
         self,
@@ -117,7 +124,7 @@ class DynamicDetector:
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume)
-        tolerance = np.asarray(3 * sigma + np.float32(0.02) * level.depth, np.float32)
+        tolerance = self._tolerance(sigma, level.depth)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
         edges = np.linspace(0, LARGEST, BINS + 1)
@@ -145,7 +152,7 @@ class DynamicDetector:
             dynamic = self._regions(seeds, evidence, level, tolerance)
             if self.config.pieces:
                 dynamic, surface = self._whole(
-                    dynamic, seeds, sample, sigma, tolerance, level, T_world_camera, exposure
+                    dynamic, seeds, sample, sigma, self.pieces(level, volume), level, T_world_camera, exposure
                 )
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
@@ -155,6 +162,11 @@ class DynamicDetector:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
         sensor = self.sensor.sigma_base + self.sensor.sigma_scale * depth**2
         return np.hypot(sensor, 0.4 * volume.voxel_size).astype(np.float32)
+
+    @staticmethod
+    def _tolerance(sigma: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Largest depth step (h, w) to a neighbour of the same surface, metres."""
+        return np.asarray(3 * sigma + np.float32(0.02) * depth, np.float32)
 
     def _regions(
         self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
@@ -176,7 +188,7 @@ class DynamicDetector:
         seeds: NDArray[np.bool_],
         sample: MapSample,
         sigma: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
+        surface: surfaces.Pieces,
         level: Level,
         T_world_camera: NDArray[np.float64],
         exposure: tuple[float, float],
@@ -184,7 +196,7 @@ class DynamicDetector:
         """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
         marks = self.memory.marks(level, T_world_camera, REACH)
         moved = (marks & surfaces.MOVED) > 0
-        surface = surfaces.split(surfaces.pieces(level, tolerance), (marks & surfaces.BODY) > 0)
+        surface = surfaces.split(surface, (marks & surfaces.BODY) > 0)
         # what the map does not know begins to move with the piece it belongs to, not with what is beside it
         begun = (surface.share(seeds) >= 0.1)[surface.labels]
         dynamic = dynamic & ((sample.place != NOTHING) | moved | begun)

@@ -228,7 +228,9 @@ class Slam:
             return T_init, known
         with clock("parallax"):
             level, small = self._compared(levels)
-            motion = self.parallax.compare(observation.timestamp, level, small)
+            motion = self.parallax.compare(
+                observation.timestamp, level, small, self.detector.pieces(small, self.volume)
+            )
             if motion is None:
                 return T_init, known
             if self._first is not None:
@@ -253,7 +255,9 @@ class Slam:
         return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
 
     def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
-        self.parallax.remember(timestamp, *self._compared(levels))
+        if self.parallax.wanted(timestamp):
+            level, small = self._compared(levels)
+            self.parallax.remember(level, small, self.detector.pieces(small, self.volume))
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
