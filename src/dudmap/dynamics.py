@@ -143,7 +143,8 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            evidence[sample.place == FREE] = -6
+            free = (sample.place == FREE) | self.memory.seen_free(level, T_world_camera, 1.5 * noise)
+            evidence[free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None

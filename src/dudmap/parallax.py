@@ -37,6 +37,8 @@ LEAST_SHARE = 0.3
 REACH = 0.1
 """A pixel is judged by the corners within this share of its depth, in space."""
 NEIGHBOURS = 5
+ALIKE, ALIKE_GREY = 1.5, 2.0
+"""A window that differs by less than this times another's difference, and this many of 255 grey values, is as good."""
 WINDOW = 11
 """Edge of the window a corner is recognised by, pixels."""
 GUESSES = 150
@@ -118,7 +120,8 @@ def dominant_motion(
         small: Both at the resolution of the result.
         surfaces: Pieces of surface of both of these.
     """
-    pixels, targets = _followed(before, after)
+    images = [np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after)]
+    pixels, targets, unlike = _followed(before, *images)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
@@ -134,7 +137,13 @@ def dominant_motion(
         return None
     path = np.linalg.norm(targets - pixels, axis=1)
     sigma = np.median(error[error < FAR_PX]) / RAYLEIGH
-    moves = error > np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
+    allowed = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
+    moves = error > allowed
+    certain = ~moves
+    certain[moves] = ~_rests_as_well(
+        *images, pixels[moves], _projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
+    )
+    pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
     depth_after = after.depth[
         _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
     ]
@@ -151,11 +160,15 @@ def dominant_motion(
     )
 
 
-def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Corners (n, 2) int of the first image and their places (n, 2) in the second, found there and back."""
+def _followed(
+    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (n, 2) int of the first image, their places (n, 2) in the second, found there and back, and what differs.
+
+    The last is the mean difference (n,) of the grey values of their windows.
+    """
     import cv2
 
-    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
     strength = cv2.cornerMinEigenVal(first, 5)
     cell = max(6, first.shape[1] // CELLS)
     height, width = first.shape[0] // cell, first.shape[1] // cell
@@ -172,14 +185,47 @@ def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[n
     useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
     pixels = np.stack([columns, rows], axis=1)[useful]
     if len(pixels) == 0:
-        return pixels, np.empty((0, 2))
+        return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
     )
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
-    return pixels[good], there[good, 0].astype(np.float64)
+    return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
+
+
+def _rests_as_well(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    expected: NDArray[np.float64],
+    allowed: NDArray[np.float64],
+    unlike: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Corners (n,) that were found elsewhere, but could as well be where a static world would have put them.
+
+    The coarse levels of the search see more than the window and follow what is nearer, and textures repeat. So the
+    search is done once more, from the place of a static point on and at full size alone.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) int, corners in the first.
+        expected: (n, 2) where they were if the world stood still.
+        allowed: (n,) farthest from there that it still may, pixels.
+        unlike: (n,) mean difference of the grey values of their windows where they were found.
+    """
+    import cv2
+
+    if len(pixels) == 0:
+        return np.zeros(0, dtype=bool)
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    guess = expected.astype(np.float32).reshape(-1, 1, 2)
+    there, found, other = cv2.calcOpticalFlowPyrLK(
+        first, second, start, guess.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    near = np.linalg.norm((there - guess)[:, 0], axis=1) < allowed
+    return (found[:, 0] > 0) & near & (other[:, 0] < ALIKE * unlike + ALIKE_GREY)
 
 
 def _rigid_motion(
@@ -284,7 +330,7 @@ def _spread(
     distance, index = KDTree(corners).query(places, k=min(NEIGHBOURS, len(points)))
     near = distance < REACH * z[:, None]
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
-    out[rows, columns] = votes > 0
+    out[rows, columns] = votes >= 2
     return out
 
 

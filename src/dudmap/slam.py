@@ -212,6 +212,8 @@ class Slam:
             if self.config.dynamics.method == "em":
                 self.parallax.start(observation.timestamp)
                 self._first = observation, nothing
+                self.detector.memory.begin(observation.timestamp)
+                self.detector.memory.start(levels[self._level(self.config.dynamics.width)])
             self._compare_with_next(observation.timestamp, levels)
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,

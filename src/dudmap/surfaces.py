@@ -31,6 +31,12 @@ MEMORIES = 4
 """Frames that are kept of the time in which a thing must stand still."""
 
 
+YOUTH = 3.0
+"""Times `start_seconds` for which space that was seen free from single frames counts; later the map knows it."""
+VIEWS = 6
+"""Frames that are kept of `start_seconds` to know that."""
+
+
 MOVED, BODY = 1, 2
 """Bits of a pixel of the last frame: it was called moving; a part of its piece was."""
 
@@ -208,6 +214,14 @@ class StandStill:
         self._now = 0.0
         self._last: _Memory | None = None
         self._memories: deque[_Memory] = deque()
+        self._young_until = -np.inf
+        self._views: deque[_Memory] = deque()
+
+    def start(self, level: Level) -> None:
+        """The frame that has begun is the first of a map, and stands at its origin."""
+        self._young_until = self._now + YOUTH * self.config.start_seconds
+        self._views.clear()
+        self._views.append(_Memory(self._now, level, np.eye(4), np.zeros(level.depth.shape, np.uint8)))
 
     def begin(self, timestamp: float) -> None:
         """A new frame, of this time in seconds, is going to be labelled."""
@@ -227,6 +241,12 @@ class StandStill:
         self._last = _Memory(self._now, level, T_world_camera, marks)
         if not self._memories or self._now - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
             self._memories.append(self._last)
+        if self._now >= self._young_until:
+            self._views.clear()
+        elif not self._views or self._now - self._views[-1].timestamp >= self.config.start_seconds / VIEWS:
+            self._views.append(self._last)
+            while len(self._views) > VIEWS:
+                self._views.popleft()
         while len(self._memories) > 1 and self._now - self._memories[1].timestamp >= self.config.settle_time:
             self._memories.popleft()
 
@@ -234,6 +254,7 @@ class StandStill:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
         self._last = None
         self._memories.clear()
+        self._views.clear()
 
     def marks(self, level: Level, T_world_camera: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
         """What each pixel (h, w) was in the last frame, MOVED and BODY, if its point is nearer than ``reach`` (m)."""
@@ -242,6 +263,24 @@ class StandStill:
         gap, _, marks = _against(level, T_world_camera, self._last)
         marks[~(np.abs(gap) < reach)] = 0
         return marks
+
+    def seen_free(
+        self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) whose point lies in space through which frames of the last moments have seen farther.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            noise: (h, w) float32, largest gap between two readings of one point, metres.
+        """
+        free = np.zeros(level.depth.shape, dtype=np.int8)
+        there = np.zeros(level.depth.shape, dtype=np.int8)
+        for view in self._views:
+            gap, _, _ = _against(level, T_world_camera, view)
+            free += gap > noise
+            there += np.abs(gap) <= noise
+        return (free > 0) & (2 * free >= there)
 
     def standing(
         self,
