@@ -99,7 +99,13 @@ class DynamicDetector:
         self.config = config
         self.sensor = sensor
         self.memory = surfaces.StandStill(config)
+        self.moving: NDArray[np.bool_] | None = None
         self._cut: tuple[Level, surfaces.Pieces] | None = None
+
+    def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
+        """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
+        self.memory.begin(timestamp)
+        self.moving = moving
 
     def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
         """Pieces of surface of an image; cut only once for the image that was asked for last."""
@@ -135,6 +141,7 @@ class DynamicDetector:
             dynamic = self._threshold_and_flood(volume, level, sample, noise)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, edges)
+        rested = np.zeros(level.depth.shape, dtype=bool)
         evidence = np.zeros(level.depth.shape, dtype=np.float32)
         near = sample.place == SURFACE
         evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
@@ -143,8 +150,8 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            free = (sample.place == FREE) | self.memory.seen_free(level, T_world_camera, 1.5 * noise)
-            evidence[free] = -6
+            seen_free, rested = self.memory.views(level, T_world_camera, 1.5 * noise)
+            evidence[(sample.place == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None
@@ -155,6 +162,8 @@ class DynamicDetector:
                 dynamic, surface = self._whole(
                     dynamic, seeds, sample, sigma, self.pieces(level, volume), level, T_world_camera, exposure
                 )
+            if self.moving is not None:
+                dynamic = dynamic | (self.moving & ~rested)
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         return Labels(probability, dynamic, mixture, histogram, sample, surface)

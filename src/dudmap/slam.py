@@ -147,8 +147,8 @@ class Slam:
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.reference.is_empty:
             return self._as_recorded(self._start(observation, levels, known, clock))
-        self.detector.memory.begin(frame.timestamp)
-        T_init, known = self._expect(observation, levels, known, clock)
+        T_init, moving = self._expect(observation, levels, clock)
+        self.detector.begin(frame.timestamp, moving)
         tracked, labels = self._register(levels, T_init, known, clock)
         reason = (
             tracked.reason
@@ -222,24 +222,23 @@ class Slam:
         )  # fmt: skip
 
     def _expect(
-        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], clock: "Clock"
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
-        """First guess of the pose, and what is known to move: while the map is young, from the last image to this."""
+        """First guess of the pose; while the map is young, from the last image to this, with what moves (h, w)."""
         T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
         if not self.parallax.active(observation.timestamp):
-            return T_init, known
+            return T_init, None
         with clock("parallax"):
             level, small = self._compared(levels)
             motion = self.parallax.compare(
                 observation.timestamp, level, small, self.detector.pieces(small, self.volume)
             )
             if motion is None:
-                return T_init, known
+                return T_init, None
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
             T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
-            moving = full_size(motion.moving_after, small.depth, observation.depth)
-            return T_init, moving if known is None else known | moving
+            return T_init, motion.moving_after
 
     def _start_again(
         self, first: Observation, known: NDArray[np.bool_], moving: NDArray[np.bool_], level: Level
@@ -269,7 +268,7 @@ class Slam:
         The coarse levels bring the pose near enough to tell what moves, the fine ones make it exact.
         """
         tracked_levels = self._tracked(levels)
-        unmasked = None if known is None else [(~_reduced(known, level)).astype(np.float32) for level in tracked_levels]
+        unmasked = self._unmasked(tracked_levels, known)
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
                 tracked = self.tracker.align(self.reference, tracked_levels, T_init, unmasked)
@@ -292,6 +291,15 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _unmasked(self, levels: list[Level], known: NDArray[np.bool_] | None) -> list[NDArray[np.float32]] | None:
+        """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
+        masks = [mask for mask in (known, self.detector.moving) if mask is not None]
+        if not masks:
+            return None
+        return [
+            (~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels
+        ]
 
     def _expected(
         self, levels: list[Level], unmasked: list[NDArray[np.float32]] | None

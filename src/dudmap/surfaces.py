@@ -33,6 +33,10 @@ MEMORIES = 4
 
 YOUTH = 3.0
 """Times `start_seconds` for which space that was seen free from single frames counts; later the map knows it."""
+ALIKE = 0.08
+"""Intensities that differ by less are the same."""
+RESTED = 0.3
+"""Share of `start_seconds` in which a thing must have been seen at its place to have rested there."""
 VIEWS = 6
 """Frames that are kept of `start_seconds` to know that."""
 
@@ -264,23 +268,35 @@ class StandStill:
         marks[~(np.abs(gap) < reach)] = 0
         return marks
 
-    def seen_free(
+    def views(
         self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) whose point lies in space through which frames of the last moments have seen farther.
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """What single frames of the last moments say of each pixel, while the map is young.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest gap between two readings of one point, metres.
+
+        Returns:
+            (h, w) bool, pixels whose point lies in space through which those frames have seen farther,
+            (h, w) bool, pixels whose point was there in all of them, and looked the same.
         """
-        free = np.zeros(level.depth.shape, dtype=np.int8)
-        there = np.zeros(level.depth.shape, dtype=np.int8)
+        import cv2
+
+        shape = level.depth.shape
+        free, there, alike, known, age = (np.zeros(shape, dtype=np.float32) for _ in range(5))
         for view in self._views:
-            gap, _, _ = _against(level, T_world_camera, view)
+            gap, difference, _ = _against(level, T_world_camera, view)
+            close = np.abs(gap) <= noise
             free += gap > noise
-            there += np.abs(gap) <= noise
-        return (free > 0) & (2 * free >= there)
+            there += close
+            alike += close & (np.abs(difference) < ALIKE)
+            known += ~np.isnan(gap)
+            age[~np.isnan(gap) & (age == 0)] = self._now - view.timestamp
+        rested = (known >= 2) & (alike == known) & (age >= RESTED * self.config.start_seconds)
+        rested = cv2.medianBlur(rested.astype(np.uint8), 5) > 0
+        return (free > 0) & (2 * free >= there), rested
 
     def standing(
         self,
