@@ -1,5 +1,7 @@
 """Motion from image to image against the truth of synthetic worlds and against numerical derivatives."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -21,7 +23,12 @@ def crowd():
 
 def levels(sequence, index):
     slam = Slam(sequence.camera, Config())
-    return slam._compared(slam._levels(slam.preprocess(sequence[index])))
+    level, small = slam._compared(slam._levels(slam.preprocess(sequence[index])))
+    return level, small, slam.detector.pieces(small, slam.volume)
+
+
+def compare(before, after):
+    return dominant_motion(before[0], after[0], (before[1], after[1]), (before[2], after[2]))
 
 
 def test_the_flow_jacobian_is_the_derivative_of_the_projection():
@@ -36,8 +43,9 @@ def test_the_flow_jacobian_is_the_derivative_of_the_projection():
 
 @pytest.mark.parametrize("index", [0, 6, 20])
 def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
-    (before, small), (after, small_after) = levels(crowd, index), levels(crowd, index + 1)
-    motion = dominant_motion(before, after, (small, small_after))
+    before = levels(crowd, index)
+    small = before[1]
+    motion = compare(before, levels(crowd, index + 1))
     truth = crowd.ground_truth.Ts_world_camera
     off = motion.T_after_before @ se3.inverse(truth[index]) @ truth[index + 1]
     assert np.linalg.norm(off[:3, 3]) < 0.006
@@ -50,18 +58,15 @@ def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
 
 def test_nothing_moves_in_a_still_room():
     room = synthetic.sequence("room", movers=(), frames=8, camera=CAMERA, noise="kinect")
-    (before, small), (after, small_after) = levels(room, 4), levels(room, 5)
-    motion = dominant_motion(before, after, (small, small_after))
+    motion = compare(levels(room, 4), levels(room, 5))
     assert motion.share > 0.9
     assert motion.moving_after.mean() < 0.01
 
 
 def test_images_without_corners_tell_nothing(crowd):
-    before, small = levels(crowd, 0)
-    from dataclasses import replace
-
-    blank = replace(before, intensity=np.full_like(before.intensity, 0.5))
-    assert dominant_motion(blank, blank, (small, small)) is None
+    before, small, surface = levels(crowd, 0)
+    blank = replace(before, intensity=np.full_like(before.intensity, 0.5)), small, surface
+    assert compare(blank, blank) is None
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):

@@ -208,8 +208,10 @@ class DynamicDetector:
         moved = (marks & surfaces.MOVED) > 0
         surface = surfaces.split(surface, (marks & surfaces.BODY) > 0)
         # what the map does not know begins to move with the piece it belongs to, not with what is beside it
-        begun = (surface.share(seeds) >= 0.1)[surface.labels]
-        dynamic = dynamic & ((sample.place != NOTHING) | moved | begun)
+        known = sample.place != NOTHING
+        begun = surface.share(seeds) >= 0.1
+        at_rest = surface.share(known & ~dynamic) > np.maximum(0.5, 9 * surface.share(known & dynamic))
+        dynamic = dynamic & (known | begun[surface.labels] | (moved & ~at_rest[surface.labels]))
         gain, offset = exposure
         exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = np.asarray(sample.difference + exposed, np.float32)

@@ -99,9 +99,7 @@ class Parallax:
     def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it."""
         assert self._before is not None
-        motion = dominant_motion(
-            self._before[0], level, (self._before[1], small), (self._before[2], surface)
-        )
+        motion = dominant_motion(self._before[0], level, (self._before[1], small), (self._before[2], surface))
         if motion is not None and np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
             self._until = min(timestamp + self.seconds, self._longest)
         return motion
@@ -187,7 +185,9 @@ def _followed(
     if len(pixels) == 0:
         return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(
+        first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
+    )
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
     )

@@ -297,9 +297,7 @@ class Slam:
         masks = [mask for mask in (known, self.detector.moving) if mask is not None]
         if not masks:
             return None
-        return [
-            (~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels
-        ]
+        return [(~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
 
     def _expected(
         self, levels: list[Level], unmasked: list[NDArray[np.float32]] | None
