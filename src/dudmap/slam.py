@@ -100,6 +100,7 @@ class Slam:
             self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
             self._knowledge = first_pass.atlas.volumes[main]
             self._seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
+            self.detector.memory.know(first_pass.detector.memory, self._seen)
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = MoverTracker(self.config.movers)
         self.parallax = Parallax(self.config.dynamics.start_seconds)
@@ -212,8 +213,10 @@ class Slam:
             if self.config.dynamics.method == "em":
                 self.parallax.start(observation.timestamp)
                 self._first = observation, nothing
-                self.detector.memory.begin(observation.timestamp)
-                self.detector.memory.start(levels[self._level(self.config.dynamics.width)])
+                self.detector.begin(observation.timestamp)
+                self.detector.memory.start()
+                small = self._compared(levels)[1]
+                self.detector.memory.remember(small, T, np.zeros(small.depth.shape, dtype=bool), None)
             self._compare_with_next(observation.timestamp, levels)
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
