@@ -37,6 +37,8 @@ ALIKE = 0.08
 """Intensities that differ by less are the same."""
 RESTED = 0.3
 """Share of `start_seconds` in which a thing must have been seen at its place to have rested there."""
+SEAM = 3
+"""What is thinner, pixels, may come from a pose that is a little off along a depth edge."""
 VIEWS = 6
 """Frames that are kept of `start_seconds` to know that."""
 
@@ -311,7 +313,9 @@ class StandStill:
             age[seen] = np.maximum(age[seen], apart)
         rested = (known >= 2) & (alike == known) & (age >= RESTED * self.config.start_seconds)
         rested = cv2.medianBlur(rested.astype(np.uint8), 5) > 0
-        return (free > 0) & (2 * free >= there), rested
+        freed = ((free > 0) & (2 * free >= there)).astype(np.uint8)
+        freed = cv2.morphologyEx(freed, cv2.MORPH_OPEN, np.ones((SEAM, SEAM), np.uint8)) > 0
+        return freed, rested
 
     def standing(
         self,
