@@ -102,7 +102,7 @@ def upsample(row_start, row_stop, low, low_depth, depth, stride, out):
     """
     h, w = low.shape
     width = depth.shape[1]
-    zero, mismatch = np.float32(0), np.float32(1e3)
+    zero, mismatch = np.float32(0), np.float32(64)
     # a tenth of a millimetre for each low-size pixel of distance: among equals the nearest
     apart = np.empty((2, width), np.float32)
     for u in range(width):
