@@ -148,6 +148,8 @@ class Slam:
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.reference.is_empty:
             return self._as_recorded(self._start(observation, levels, known, clock))
+        if not self.atlas.poses and self.config.dynamics.method == "em":  # a second pass begins
+            self.parallax.start(frame.timestamp)
         T_init, moving = self._expect(observation, levels, clock)
         self.detector.begin(frame.timestamp, moving)
         tracked, labels = self._register(levels, T_init, known, clock)
@@ -240,7 +242,8 @@ class Slam:
                 return T_init, None
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
-            T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
+            if observation.timestamp not in self._seen:
+                T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
             return T_init, motion.moving_after
 
     def _start_again(
