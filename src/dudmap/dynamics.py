@@ -150,7 +150,7 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            seen_free, rested = self.memory.views(level, T_world_camera, 1.5 * noise)
+            seen_free, rested = self.memory.views(level, T_world_camera, np.float32(1.5) * noise.astype(np.float32))
             evidence[(sample.place == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)

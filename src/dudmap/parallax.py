@@ -118,8 +118,8 @@ def dominant_motion(
         small: Both at the resolution of the result.
         surfaces: Pieces of surface of both of these.
     """
-    images = [np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after)]
-    pixels, targets, unlike = _followed(before, *images)
+    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
+    pixels, targets, unlike = _followed(before, first, second)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
@@ -139,7 +139,7 @@ def dominant_motion(
     moves = error > allowed
     certain = ~moves
     certain[moves] = ~_rests_as_well(
-        *images, pixels[moves], _projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
+        first, second, pixels[moves], _projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
     )
     pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
     depth_after = after.depth[
@@ -191,7 +191,8 @@ def _followed(
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
     )
-    good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
+    good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
+    good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
     return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
 
 
@@ -224,8 +225,10 @@ def _rests_as_well(
     there, found, other = cv2.calcOpticalFlowPyrLK(
         first, second, start, guess.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
     )
-    near = np.linalg.norm((there - guess)[:, 0], axis=1) < allowed
-    return (found[:, 0] > 0) & near & (other[:, 0] < ALIKE * unlike + ALIKE_GREY)
+    rests = found[:, 0] > 0  # what was not found has arbitrary numbers
+    near = np.linalg.norm((there - guess)[rests, 0], axis=1) < allowed[rests]
+    rests[rests] = near & (other[rests, 0] < ALIKE * unlike[rests] + ALIKE_GREY)
+    return rests
 
 
 def _rigid_motion(
