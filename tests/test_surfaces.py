@@ -99,6 +99,49 @@ def test_what_stood_still_for_the_settle_time_stands(speed, stands):
     assert not memory.standing(image, np.eye(4), surface, sigma, board).any()
 
 
+def test_single_frames_tell_who_stands_where_they_saw_farther():
+    """A board that walks through a room, seen by a camera that walks too, against where both are."""
+    memory = surfaces.StandStill(DynamicsConfig())
+    noise = np.full(CAMERA.shape, 0.1, np.float32)
+    v, u = np.indices(CAMERA.shape)
+
+    def image(camera_x, board_x):
+        X = (u - CAMERA.cx) / CAMERA.fx * 2 + camera_x  # in the board's plane
+        board = (np.abs(X - board_x) < 0.2) & (np.abs(v - CAMERA.cy) < 40)
+        wall = 0.5 + 0.2 * np.sin(12 * ((u - CAMERA.cx) / CAMERA.fx * 3 + camera_x))
+        return level(np.where(board, 2.0, 3.0), np.where(board, 0.5, wall)), board, X
+
+    for i in range(16):
+        camera_x, board_x = 0.01 * i, -0.3 + 0.05 * i
+        seen, board, X = image(camera_x, board_x)
+        T = np.eye(4)
+        T[0, 3] = camera_x
+        memory.begin(i / 30)
+        if i == 0:
+            memory.start()
+        free, rested = memory.views(seen, T, noise)
+        assert not free[~board].any()
+        memory.remember(seen, T, np.zeros_like(board), None)
+    new = board & (X > -0.3 + 0.2 + 0.03)  # where it was not in the first frame
+    assert free[new].mean() > 0.9
+    assert rested[new].mean() < 0.05
+    wall = ~board & (u > 8) & (u < 150) & (X < -0.6)  # never hidden
+    assert rested[wall].mean() > 0.95
+    # another pass over the same frames knows also what comes later
+    again = surfaces.StandStill(DynamicsConfig())
+    again.know(
+        memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
+    )
+    again.begin(0.0)
+    seen, board, X = image(0.0, -0.3)
+    free, _ = again.views(seen, np.eye(4), noise)
+    assert free[board].mean() > 0.8
+    assert not free[~board].any()
+    # a grown map knows free space itself
+    again.begin(10.0)
+    assert not np.any(again.views(seen, np.eye(4), noise))
+
+
 def overlaps(sequence, frames):
     """Overlap of found and true mask, and share of the image that is called moving without cause, by frame."""
     slam, score, wrong = Slam(sequence.camera), [], []

@@ -99,6 +99,19 @@ class DynamicDetector:
         self.config = config
         self.sensor = sensor
         self.memory = surfaces.StandStill(config)
+        self.moving: NDArray[np.bool_] | None = None
+        self._cut: tuple[Level, surfaces.Pieces] | None = None
+
+    def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
+        """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
+        self.memory.begin(timestamp)
+        self.moving = moving
+
+    def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
+        """Pieces of surface of an image; cut only once for the image that was asked for last."""
+        if self._cut is None or self._cut[0] is not level:
+            self._cut = level, surfaces.pieces(level, self._tolerance(self._sigma(level.depth, volume), level.depth))
+        return self._cut[1]
 
     def detect(
         self,
@@ -117,7 +130,7 @@ class DynamicDetector:
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume)
-        tolerance = np.asarray(3 * sigma + np.float32(0.02) * level.depth, np.float32)
+        tolerance = self._tolerance(sigma, level.depth)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
         edges = np.linspace(0, LARGEST, BINS + 1)
@@ -128,6 +141,7 @@ class DynamicDetector:
             dynamic = self._threshold_and_flood(volume, level, sample, noise)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, edges)
+        rested = np.zeros(level.depth.shape, dtype=bool)
         evidence = np.zeros(level.depth.shape, dtype=np.float32)
         near = sample.place == SURFACE
         evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
@@ -136,7 +150,8 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            evidence[sample.place == FREE] = -6
+            seen_free, rested = self.memory.views(level, T_world_camera, np.float32(1.5) * noise.astype(np.float32))
+            evidence[(sample.place == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None
@@ -145,8 +160,10 @@ class DynamicDetector:
             dynamic = self._regions(seeds, evidence, level, tolerance)
             if self.config.pieces:
                 dynamic, surface = self._whole(
-                    dynamic, seeds, sample, sigma, tolerance, level, T_world_camera, exposure
+                    dynamic, seeds, sample, sigma, self.pieces(level, volume), level, T_world_camera, exposure
                 )
+            if self.moving is not None:
+                dynamic = dynamic | (self.moving & ~rested)
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         return Labels(probability, dynamic, mixture, histogram, sample, surface)
@@ -155,6 +172,11 @@ class DynamicDetector:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
         sensor = self.sensor.sigma_base + self.sensor.sigma_scale * depth**2
         return np.hypot(sensor, 0.4 * volume.voxel_size).astype(np.float32)
+
+    @staticmethod
+    def _tolerance(sigma: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+        """Largest depth step (h, w) to a neighbour of the same surface, metres."""
+        return np.asarray(3 * sigma + np.float32(0.02) * depth, np.float32)
 
     def _regions(
         self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
@@ -176,7 +198,7 @@ class DynamicDetector:
         seeds: NDArray[np.bool_],
         sample: MapSample,
         sigma: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
+        surface: surfaces.Pieces,
         level: Level,
         T_world_camera: NDArray[np.float64],
         exposure: tuple[float, float],
@@ -184,10 +206,12 @@ class DynamicDetector:
         """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
         marks = self.memory.marks(level, T_world_camera, REACH)
         moved = (marks & surfaces.MOVED) > 0
-        surface = surfaces.split(surfaces.pieces(level, tolerance), (marks & surfaces.BODY) > 0)
+        surface = surfaces.split(surface, (marks & surfaces.BODY) > 0)
         # what the map does not know begins to move with the piece it belongs to, not with what is beside it
-        begun = (surface.share(seeds) >= 0.1)[surface.labels]
-        dynamic = dynamic & ((sample.place != NOTHING) | moved | begun)
+        known = sample.place != NOTHING
+        begun = surface.share(seeds) >= 0.1
+        at_rest = surface.share(known & ~dynamic) > np.maximum(0.5, 9 * surface.share(known & dynamic))
+        dynamic = dynamic & (known | begun[surface.labels] | (moved & ~at_rest[surface.labels]))
         gain, offset = exposure
         exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = np.asarray(sample.difference + exposed, np.float32)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap import se3
 from dudmap.camera import Camera
-from dudmap.kernels import labeling
+from dudmap.surfaces import Pieces
 from dudmap.tracker import Level
 
 CELLS = 40
@@ -22,8 +22,14 @@ NOISE_PX = 0.7
 """A corner fits a motion if it lies within this of where the motion puts it, pixels."""
 MOVES_PX = 1.0
 """A corner farther off than this,"""
+MOVES_SIGMAS = 5.0
+"""and than this many standard deviations (per coordinate) of the corners that follow the motion,"""
 MOVES_SHARE = 0.08
-"""and than this share of its own path (motion blur, rolling shutter), moves."""
+"""and by this share of its own path besides (motion blur, rolling shutter), moves."""
+FAR_PX = 3.0
+"""Corners farther off than this say nothing of that deviation."""
+RAYLEIGH = 1.1774
+"""Median length of a vector of two normally distributed coordinates of deviation 1."""
 FEWEST = 30
 """With fewer corners no motion is believed."""
 LEAST_SHARE = 0.3
@@ -31,9 +37,15 @@ LEAST_SHARE = 0.3
 REACH = 0.1
 """A pixel is judged by the corners within this share of its depth, in space."""
 NEIGHBOURS = 5
+ALIKE, ALIKE_GREY = 1.5, 2.0
+"""A window that differs by less than this times another's difference, and this many of 255 grey values, is as good."""
 WINDOW = 11
 """Edge of the window a corner is recognised by, pixels."""
 GUESSES = 150
+FEWEST_MOVING = 3
+"""Corners of a piece that must move for any of it to."""
+AGREED = 0.7
+"""A piece moves as a whole if at least this share of its corners does."""
 SEVERAL = 0.02
 """Share of the readings that must move for it to be more than noise."""
 
@@ -64,7 +76,7 @@ class Parallax:
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
-        self._before: tuple[Level, Level] | None = None
+        self._before: tuple[Level, Level, Pieces] | None = None
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
@@ -72,22 +84,30 @@ class Parallax:
 
     def active(self, timestamp: float) -> bool:
         """Whether a frame is to be compared with the one before it."""
-        return self._before is not None and timestamp < self._until
+        return self._before is not None and self.wanted(timestamp)
 
-    def remember(self, timestamp: float, level: Level, small: Level) -> None:
+    def wanted(self, timestamp: float) -> bool:
+        """Whether the map is still too young at this time."""
+        if timestamp >= self._until:
+            self._before = None
+        return timestamp < self._until
+
+    def remember(self, level: Level, small: Level, surface: Pieces) -> None:
         """Take a tracked frame as the one to compare the next with."""
-        self._before = (level, small) if timestamp < self._until else None
+        self._before = level, small, surface
 
-    def compare(self, timestamp: float, level: Level, small: Level) -> DominantMotion | None:
+    def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it."""
         assert self._before is not None
-        motion = dominant_motion(self._before[0], level, (self._before[1], small))
+        motion = dominant_motion(self._before[0], level, (self._before[1], small), (self._before[2], surface))
         if motion is not None and np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
             self._until = min(timestamp + self.seconds, self._longest)
         return motion
 
 
-def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> DominantMotion | None:
+def dominant_motion(
+    before: Level, after: Level, small: tuple[Level, Level], surfaces: tuple[Pieces, Pieces]
+) -> DominantMotion | None:
     """Explain the corners' paths from one image to the next by one rigid motion; None where too few are left.
 
     The static world is what covers most *surface*, so that each corner counts by its depth squared: a crowd may fill
@@ -96,8 +116,10 @@ def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> 
     Args:
         before, after: Both images at the resolution in which corners are followed.
         small: Both at the resolution of the result.
+        surfaces: Pieces of surface of both of these.
     """
-    pixels, targets = _followed(before, after)
+    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
+    pixels, targets, unlike = _followed(before, first, second)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
@@ -112,25 +134,39 @@ def dominant_motion(before: Level, after: Level, small: tuple[Level, Level]) -> 
     if share < LEAST_SHARE:
         return None
     path = np.linalg.norm(targets - pixels, axis=1)
-    moves = error > MOVES_PX + MOVES_SHARE * path
+    sigma = np.median(error[error < FAR_PX]) / RAYLEIGH
+    allowed = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
+    moves = error > allowed
+    certain = ~moves
+    certain[moves] = ~_rests_as_well(
+        first, second, pixels[moves], _projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
+    )
+    pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
     depth_after = after.depth[
         _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
     ]
     seen = depth_after > 0
     points_after = _points(after.camera, targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
+    scale = small[0].camera.width / before.camera.width
+    limit = np.array(small[0].depth.shape[::-1]) - 1
+    places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
     return DominantMotion(
         T,
-        _spread(small[0], points, moves),
-        _spread(small[1], points_after[seen], moves[seen]),
+        _spread(small[0], surfaces[0], points, places[0], moves),
+        _spread(small[1], surfaces[1], points_after[seen], places[1], moves[seen]),
         share,
     )
 
 
-def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-    """Corners (n, 2) int of the first image and their places (n, 2) in the second, found there and back."""
+def _followed(
+    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8]
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (n, 2) int of the first image, their places (n, 2) in the second, found there and back, and what differs.
+
+    The last is the mean difference (n,) of the grey values of their windows.
+    """
     import cv2
 
-    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
     strength = cv2.cornerMinEigenVal(first, 5)
     cell = max(6, first.shape[1] // CELLS)
     height, width = first.shape[0] // cell, first.shape[1] // cell
@@ -147,14 +183,52 @@ def _followed(before: Level, after: Level) -> tuple[NDArray[np.int64], NDArray[n
     useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
     pixels = np.stack([columns, rows], axis=1)[useful]
     if len(pixels) == 0:
-        return pixels, np.empty((0, 2))
+        return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    there, found, _ = cv2.calcOpticalFlowPyrLK(first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3)
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(
+        first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
+    )
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
     )
-    good = (found[:, 0] > 0) & (found_back[:, 0] > 0) & (np.linalg.norm((back - start)[:, 0], axis=1) < 0.5)
-    return pixels[good], there[good, 0].astype(np.float64)
+    good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
+    good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
+    return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
+
+
+def _rests_as_well(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    expected: NDArray[np.float64],
+    allowed: NDArray[np.float64],
+    unlike: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Corners (n,) that were found elsewhere, but could as well be where a static world would have put them.
+
+    The coarse levels of the search see more than the window and follow what is nearer, and textures repeat. So the
+    search is done once more, from the place of a static point on and at full size alone.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) int, corners in the first.
+        expected: (n, 2) where they were if the world stood still.
+        allowed: (n,) farthest from there that it still may, pixels.
+        unlike: (n,) mean difference of the grey values of their windows where they were found.
+    """
+    import cv2
+
+    if len(pixels) == 0:
+        return np.zeros(0, dtype=bool)
+    start = pixels.astype(np.float32).reshape(-1, 1, 2)
+    guess = expected.astype(np.float32).reshape(-1, 1, 2)
+    there, found, other = cv2.calcOpticalFlowPyrLK(
+        first, second, start, guess.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
+    )
+    rests = found[:, 0] > 0  # what was not found has arbitrary numbers
+    near = np.linalg.norm((there - guess)[rests, 0], axis=1) < allowed[rests]
+    rests[rests] = near & (other[rests, 0] < ALIKE * unlike[rests] + ALIKE_GREY)
+    return rests
 
 
 def _rigid_motion(
@@ -223,25 +297,44 @@ def _reprojection_error(
     return np.linalg.norm(_projected(T, points, camera) - targets, axis=1)
 
 
-def _spread(level: Level, points: NDArray[np.float64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Moving pixels (h, w): those whose neighbours in space among the corners mostly move."""
+def _spread(
+    level: Level, surface: Pieces, points: NDArray[np.float64], pixels: NDArray[np.int64], moves: NDArray[np.bool_]
+) -> NDArray[np.bool_]:
+    """Moving pixels (h, w): those of pieces of surface whose corners move.
+
+    Where corners of one piece disagree, a pixel goes with most of its neighbours in space among the piece's corners.
+
+    Args:
+        level: The image.
+        surface: Its pieces.
+        points: (n, 3) the corners in space, metres.
+        pixels: (n, 2) int, their pixels u, v.
+        moves: (n,).
+    """
     from scipy.spatial import KDTree
 
-    out = np.zeros(level.depth.shape, dtype=np.uint8)
-    if np.count_nonzero(moves) < 4:
-        return out > 0
-    stride = 2
-    coarse = np.ascontiguousarray(level.depth[stride // 2 :: stride, stride // 2 :: stride])
-    rows, columns = np.nonzero(coarse > 0)
-    z = coarse[rows, columns].astype(np.float64)
-    places = _points(level.camera, columns * stride + stride // 2, rows * stride + stride // 2, z)
-    distance, index = KDTree(points).query(places, k=min(NEIGHBOURS, len(points)))
+    if np.count_nonzero(moves) < FEWEST_MOVING:
+        return np.zeros(level.depth.shape, dtype=bool)
+    piece = surface.labels[pixels[:, 1], pixels[:, 0]]
+    moving = np.bincount(piece[moves], minlength=surface.count + 1)
+    total = np.bincount(piece, minlength=surface.count + 1)
+    solid = moving >= FEWEST_MOVING
+    whole = solid & (moving >= AGREED * total)
+    mixed = solid & ~whole & (moving >= 0.1 * total)
+    whole[0] = mixed[0] = False
+    out = whole[surface.labels]
+    rows, columns = np.nonzero(mixed[surface.labels] & (level.depth > 0))
+    if len(rows) == 0:
+        return out
+    z = level.depth[rows, columns].astype(np.float64)
+    apart = 1e3 * piece  # corners of other pieces are far away
+    corners = np.column_stack([points, apart])
+    places = np.column_stack([_points(level.camera, columns, rows, z), 1e3 * surface.labels[rows, columns]])
+    distance, index = KDTree(corners).query(places, k=min(NEIGHBOURS, len(points)))
     near = distance < REACH * z[:, None]
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
-    low = np.zeros(coarse.shape, dtype=np.uint8)
-    low[rows, columns] = votes > 0
-    labeling.upsample(0, level.depth.shape[0], low, coarse, level.depth, stride, out)
-    return (out > 0) & (level.depth > 0)
+    out[rows, columns] = votes >= 2
+    return out
 
 
 def _points(camera: Camera, u: NDArray, v: NDArray, z: NDArray[np.float64]) -> NDArray[np.float64]:

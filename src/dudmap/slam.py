@@ -104,6 +104,7 @@ class Slam:
             self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
             self._knowledge = first_pass.atlas.volumes[main]
             self._seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
+            self.detector.memory.know(first_pass.detector.memory, self._seen)
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = MoverTracker(self.config.movers)
         self.fusion = RigidFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
@@ -159,8 +160,10 @@ class Slam:
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         if self.reference.is_empty:
             return self._as_recorded(self._start(observation, levels, known, clock))
-        self.detector.memory.begin(frame.timestamp)
-        T_init, known = self._expect(observation, levels, known, clock)
+        if not self.atlas.poses and self.config.dynamics.method == "em":  # a second pass begins
+            self.parallax.start(frame.timestamp)
+        T_init, moving = self._expect(observation, levels, clock)
+        self.detector.begin(frame.timestamp, moving)
         tracked, labels = self._register(levels, T_init, known, clock)
         reason = (
             tracked.reason
@@ -224,6 +227,10 @@ class Slam:
             if self.config.dynamics.method == "em":
                 self.parallax.start(observation.timestamp)
                 self._first = observation, nothing
+                self.detector.begin(observation.timestamp)
+                self.detector.memory.start()
+                small = self._compared(levels)[1]
+                self.detector.memory.remember(small, T, np.zeros(small.depth.shape, dtype=bool), None)
             self._compare_with_next(observation.timestamp, levels)
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else T, not reason, False,
@@ -232,22 +239,24 @@ class Slam:
         )  # fmt: skip
 
     def _expect(
-        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], clock: "Clock"
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
-        """First guess of the pose, and what is known to move: while the map is young, from the last image to this."""
+        """First guess of the pose; while the map is young, from the last image to this, with what moves (h, w)."""
         T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
         if not self.parallax.active(observation.timestamp):
-            return T_init, known
+            return T_init, None
         with clock("parallax"):
             level, small = self._compared(levels)
-            motion = self.parallax.compare(observation.timestamp, level, small)
+            motion = self.parallax.compare(
+                observation.timestamp, level, small, self.detector.pieces(small, self.volume)
+            )
             if motion is None:
-                return T_init, known
+                return T_init, None
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
-            T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
-            moving = full_size(motion.moving_after, small.depth, observation.depth)
-            return T_init, moving if known is None else known | moving
+            if observation.timestamp not in self._seen:
+                T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
+            return T_init, motion.moving_after
 
     def _start_again(
         self, first: Observation, known: NDArray[np.bool_], moving: NDArray[np.bool_], level: Level
@@ -265,7 +274,9 @@ class Slam:
         return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
 
     def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
-        self.parallax.remember(timestamp, *self._compared(levels))
+        if self.parallax.wanted(timestamp):
+            level, small = self._compared(levels)
+            self.parallax.remember(level, small, self.detector.pieces(small, self.volume))
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
@@ -275,7 +286,7 @@ class Slam:
         The coarse levels bring the pose near enough to tell what moves, the fine ones make it exact.
         """
         tracked_levels = self._tracked(levels)
-        unmasked = None if known is None else [(~_reduced(known, level)).astype(np.float32) for level in tracked_levels]
+        unmasked = self._unmasked(tracked_levels, known)
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
                 tracked = self.tracker.align(self.reference, tracked_levels, T_init, unmasked)
@@ -300,6 +311,13 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _unmasked(self, levels: list[Level], known: NDArray[np.bool_] | None) -> list[NDArray[np.float32]] | None:
+        """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
+        masks = [mask for mask in (known, self.detector.moving) if mask is not None]
+        if not masks:
+            return None
+        return [(~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
 
     def _expected(
         self, levels: list[Level], unmasked: list[NDArray[np.float32]] | None

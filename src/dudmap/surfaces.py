@@ -1,7 +1,7 @@
 """Whether a whole piece of surface moves: what its pixels say of it together, and how long it has stood still."""
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,18 @@ FLOOR = 0.03
 """Gradients smaller than this tell nothing, intensity per pixel."""
 MEMORIES = 4
 """Frames that are kept of the time in which a thing must stand still."""
+
+
+YOUTH = 3.0
+"""Times `start_seconds` for which space that was seen free from single frames counts; later the map knows it."""
+ALIKE = 0.08
+"""Intensities that differ by less are the same."""
+RESTED = 0.3
+"""Share of `start_seconds` in which a thing must have been seen at its place to have rested there."""
+SEAM = 3
+"""What is thinner, pixels, may come from a pose that is a little off along a depth edge."""
+VIEWS = 6
+"""Frames that are kept of `start_seconds` to know that."""
 
 
 MOVED, BODY = 1, 2
@@ -209,6 +221,28 @@ class StandStill:
         self._now = 0.0
         self._last: _Memory | None = None
         self._memories: deque[_Memory] = deque()
+        self._young_until = -np.inf
+        self._views: list[_Memory] = []
+        self._complete = False  # they are those of another pass
+
+    def start(self) -> None:
+        """The frame that has begun is the first of a map."""
+        self._young_until = self._now + YOUTH * self.config.start_seconds
+        self._views = []
+
+    def know(self, other: "StandStill", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
+        """Take over what another pass over the same frames has seen in the first seconds.
+
+        Args:
+            other: Its memory.
+            Ts_world_camera: (4, 4) by time, where it saw the frames; others are left out.
+        """
+        self._young_until, self._complete = other._young_until, True
+        self._views = [
+            replace(view, T_world_camera=Ts_world_camera[view.timestamp])
+            for view in other._views
+            if view.timestamp in Ts_world_camera
+        ]
 
     def begin(self, timestamp: float) -> None:
         """A new frame, of this time in seconds, is going to be labelled."""
@@ -228,6 +262,9 @@ class StandStill:
         self._last = _Memory(self._now, level, T_world_camera, marks)
         if not self._memories or self._now - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
             self._memories.append(self._last)
+        if self._now < self._young_until and not self._complete:
+            if not self._views or self._now - self._views[-1].timestamp >= self.config.start_seconds / VIEWS:
+                self._views.append(self._last)
         while len(self._memories) > 1 and self._now - self._memories[1].timestamp >= self.config.settle_time:
             self._memories.popleft()
 
@@ -235,6 +272,7 @@ class StandStill:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
         self._last = None
         self._memories.clear()
+        self._views = self._views if self._complete else []
 
     def marks(self, level: Level, T_world_camera: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
         """What each pixel (h, w) was in the last frame, MOVED and BODY, if its point is nearer than ``reach`` (m)."""
@@ -243,6 +281,42 @@ class StandStill:
         gap, _, marks = _against(level, T_world_camera, self._last)
         marks[~(np.abs(gap) < reach)] = 0
         return marks
+
+    def views(
+        self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32]
+    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """What single frames of the last moments say of each pixel, while the map is young; later nothing.
+
+        A second pass also asks the frames of the next moments.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            noise: (h, w) float32, largest gap between two readings of one point, metres.
+
+        Returns:
+            (h, w) bool, pixels whose point lies in space through which those frames have seen farther,
+            (h, w) bool, pixels whose point was there in all of them, and looked the same.
+        """
+        import cv2
+
+        free, there, alike, known, age = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(5))
+        for view in self._views if self._now < self._young_until else ():
+            apart = abs(self._now - view.timestamp)
+            if not 0 < apart <= self.config.start_seconds:
+                continue
+            gap, difference, _ = _against(level, T_world_camera, view)
+            seen, close = ~np.isnan(gap), np.abs(gap) <= noise
+            free += gap > noise
+            there += close
+            alike += close & (np.abs(difference) < ALIKE)
+            known += seen
+            age[seen] = np.maximum(age[seen], apart)
+        rested = (known >= 2) & (alike == known) & (age >= RESTED * self.config.start_seconds)
+        rested = cv2.medianBlur(rested.astype(np.uint8), 5) > 0
+        freed = ((free > 0) & (2 * free >= there)).astype(np.uint8)
+        freed = cv2.morphologyEx(freed, cv2.MORPH_OPEN, np.ones((SEAM, SEAM), np.uint8)) > 0
+        return freed, rested
 
     def standing(
         self,
