@@ -219,38 +219,48 @@ def against(
         marks: (h, w) uint8 out: that reading's mark.
     """
     h, w = depth.shape
-    nan = np.float32(np.nan)
+    zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
+    by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
+    place = np.empty(w, np.int32)
+    seen = np.empty((4, w), np.float32)  # between the older pixels (2), depth there, inside
+    readings, greys, old = np.empty((4, w), np.float32), np.empty((4, w), np.float32), np.empty((4, w), np.float32)
+    last_u, last_v = np.float32(w - 1), np.float32(h - 1)
+    flat_depth, flat_intensity, flat_marks = old_depth.reshape(-1), old_intensity.reshape(-1), old_marks.reshape(-1)
     for v in range(row_start, row_stop):
+        row_y = (np.float32(v) - intrinsics[3]) * by_fy
+        row = depth[v]
         for u in range(w):
-            z = depth[v, u]
-            gap[v, u], difference[v, u], marks[v, u] = nan, nan, 0
-            if z <= 0:
-                continue
-            x = (np.float32(u) - intrinsics[2]) / intrinsics[0] * z
-            y = (np.float32(v) - intrinsics[3]) / intrinsics[1] * z
+            z = row[u]
+            x, y = (np.float32(u) - intrinsics[2]) * by_fx * z, row_y * z
             qx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
             qy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
             qz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            if qz <= np.float32(0.05):
-                continue
-            pu = qx / qz * intrinsics[0] + intrinsics[2]
-            pv = qy / qz * intrinsics[1] + intrinsics[3]
-            iu, iv = np.int64(np.floor(pu)), np.int64(np.floor(pv))
-            if iu < 0 or iv < 0 or iu >= w - 1 or iv >= h - 1:
-                continue
-            au, av = pu - np.float32(iu), pv - np.float32(iv)
-            best, grey, total = np.float32(np.inf), np.float32(0), np.float32(0)
+            by_z = one / max(qz, np.float32(0.05))
+            pu = qx * by_z * intrinsics[0] + intrinsics[2]
+            pv = qy * by_z * intrinsics[1] + intrinsics[3]
+            fu, fv = np.floor(pu), np.floor(pv)
+            ok = (z > zero) & (qz > np.float32(0.05)) & (fu >= zero) & (fv >= zero) & (fu < last_u) & (fv < last_v)
+            place[u] = np.int32(fv * np.float32(w) + fu if ok else zero)
+            seen[0, u], seen[1, u], seen[2, u], seen[3, u] = pu - fu, pv - fv, qz, one if ok else zero
+        for u in range(w):
+            first = np.int64(place[u])
             for k in range(4):
-                ku, kv = k & 1, k >> 1
-                reading = old_depth[iv + kv, iu + ku]
-                if reading <= 0:
-                    continue
-                part = (au if ku else 1 - au) * (av if kv else 1 - av)
-                grey += part * old_intensity[iv + kv, iu + ku]
+                n = np.uintp(first + (k >> 1) * w + (k & 1))
+                readings[k, u], greys[k, u], old[k, u] = flat_depth[n], flat_intensity[n], np.float32(flat_marks[n])
+        for u in range(w):
+            au, av, qz, inside = seen[0, u], seen[1, u], seen[2, u], seen[3, u]
+            best, mark, grey, total = far, zero, zero, zero
+            for k in range(4):
+                reading = readings[k, u]
+                part = (au if k & 1 else one - au) * (av if k >> 1 else one - av)
+                part = part if reading > zero else zero
+                grey += part * greys[k, u]
                 total += part
-                if abs(reading - qz) < abs(best):
-                    best = reading - qz
-                    marks[v, u] = old_marks[iv + kv, iu + ku]
-            if total > np.float32(0.25):
-                gap[v, u] = best
-                difference[v, u] = grey / total - intensity[v, u]
+                step = reading - qz if reading > zero else far
+                nearer = abs(step) < abs(best)
+                best = step if nearer else best
+                mark = old[k, u] if nearer else mark
+            known = (inside > zero) & (total > np.float32(0.25))
+            gap[v, u] = best if known else nan
+            difference[v, u] = grey / max(total, np.float32(0.25)) - intensity[v, u] if known else nan
+            marks[v, u] = np.int32(mark if inside > zero else zero)
