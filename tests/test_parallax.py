@@ -28,8 +28,8 @@ def levels(sequence, index):
     return level, small, slam.detector.pieces(small, slam.volume)
 
 
-def compare(before, after):
-    return dominant_motion(before[0], after[0], (before[1], after[1]), (before[2], after[2]))
+def compare(before, after, moved=None):
+    return dominant_motion(before[0], after[0], (before[1], after[1]), (before[2], after[2]), moved)
 
 
 def test_the_flow_jacobian_is_the_derivative_of_the_projection():
@@ -93,6 +93,56 @@ def test_images_without_corners_tell_nothing(crowd):
     before, small, surface = levels(crowd, 0)
     blank = replace(before, intensity=np.full_like(before.intensity, 0.5)), small, surface
     assert compare(blank, blank) is None
+
+
+def test_where_everything_is_known_to_move_nothing_tells_the_world(crowd):
+    before, after = levels(crowd, 6), levels(crowd, 7)
+    assert compare(before, after, np.ones(before[1].depth.shape, bool)) is None
+
+
+def test_what_is_known_to_move_has_no_majority(crowd):
+    """Of a view that people fill but for its edges the rest still tells the camera's motion."""
+    before, small, surface = levels(crowd, 6)
+    moved = crowd.mask(6)[1::2, 1::2]
+    near = replace(before, depth=np.where(crowd.mask(6), before.depth * 4, before.depth))  # they outweigh the room
+    motion = compare((near, small, surface), levels(crowd, 7), moved)
+    truth = crowd.ground_truth.Ts_world_camera
+    off = motion.T_after_before @ se3.inverse(truth[6]) @ truth[7]
+    assert np.linalg.norm(off[:3, 3]) < 0.006
+
+
+def test_people_who_fill_the_view_do_not_take_a_camera_at_rest_along():
+    people = synthetic.sequence("room", coverage=0.7, camera_path="still", frames=90, camera=CAMERA, noise="kinect")
+    slam = Slam(people.camera)
+    results = [slam.process(people[index]) for index in range(56)]
+    assert np.mean([people.mask(index).mean() for index in range(40, 56)]) > 0.7
+    assert all(result.state == "tracked" for result in results)
+    assert max(np.linalg.norm(result.T_world_camera[:3, 3]) for result in results) < 0.025
+
+
+def test_the_pose_that_explains_the_image_is_kept():
+    room = synthetic.sequence("room", movers=(), frames=6, camera=CAMERA, noise="kinect")
+    slam = Slam(room.camera)
+    for index in range(5):
+        slam.process(room[index])
+    level = slam._tracked(slam._levels(slam.preprocess(room[5])))[0]
+    truth = room.ground_truth.Ts_world_camera
+    right = se3.inverse(truth[0]) @ truth[5]
+    wrong = right @ se3.exp(np.array([0.08, 0, 0, 0, 0, 0]))
+    assert slam._fits_better(right, wrong, level)
+    assert not slam._fits_better(wrong, right, level)
+    assert not slam._fits_better(right, right, level)
+
+
+def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
+    slam = Slam(crowd.camera)
+    results = [slam.process(crowd[index]) for index in range(3)]
+    labels, tracked = results[2].labels, results[2].tracking
+    levels_of = slam._levels(slam.preprocess(crowd[2]))
+    rows = np.arange(labels.dynamic.shape[0])[:, None] >= 0.2 * labels.dynamic.shape[0]
+    hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
+    assert slam._undecided(levels_of, hidden, replace(tracked, inlier_share=0.9)) == ""
+    assert "rest where the map" in slam._undecided(levels_of, hidden, replace(tracked, inlier_share=0.2))
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):

@@ -163,15 +163,17 @@ def test_chained_exposures_apply_one_after_the_other():
     assert np.allclose(exposed(level, chained((1.2, 0.1), (0.9, -0.05))).intensity, twice.intensity)
 
 
-def test_constant_velocity_goes_on_and_stops_after_a_loss():
+def test_constant_velocity_goes_on_and_stops_some_time_after_a_loss():
     model = MotionModel(TrackerConfig())
     motion = se3.exp(np.array([0.01, 0.0, 0.02, 0.0, 0.01, 0.0]))
     model.update(0.0, np.eye(4))
     model.update(0.1, motion)
     assert np.allclose(model.predict(0.2), motion @ motion, atol=1e-9)
     assert np.allclose(model.predict(0.3), motion @ motion @ motion, atol=1e-9)
-    model.lost()
-    assert np.allclose(model.predict(0.2), motion)
+    model.lost(0.2)
+    assert np.allclose(model.predict(0.2), motion @ motion, atol=1e-9)  # a single frame without a pose
+    model.lost(0.3)
+    assert np.allclose(model.predict(0.3), motion)
     assert "jumped" in model.implausible(0.2, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
 
 

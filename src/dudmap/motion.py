@@ -6,9 +6,12 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.config import TrackerConfig
 
+KEPT = 0.15
+"""Time after the last good pose in which the camera is taken to go on as it did, seconds."""
+
 
 class MotionModel:
-    """Predicts the next pose from the last two; after a loss it stays at the last good pose."""
+    """Predicts the next pose from the last two; some time after a loss it stays at the last good pose."""
 
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
@@ -30,9 +33,10 @@ class MotionModel:
             self._velocity = motion / max(self._elapsed(timestamp), 1e-6)
         self._timestamp, self._T_world_camera, self._known = timestamp, T_world_camera, True
 
-    def lost(self) -> None:
-        """Forget the velocity; the next frames are tried from the last good pose."""
-        self._velocity = np.zeros(6)
+    def lost(self, timestamp: float) -> None:
+        """Take note of a frame without a pose; after a few, the next are tried from the last good pose."""
+        if timestamp - self._timestamp > KEPT:
+            self._velocity = np.zeros(6)
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Take over the pose of a frame whose place was recognised; what lies before it says nothing of its motion."""

@@ -46,6 +46,11 @@ FEWEST_MOVING = 3
 """Corners of a piece that must move for any of it to."""
 AGREED = 0.7
 """A piece moves as a whole if at least this share of its corners does."""
+COVERED = 0.5
+"""Share of the readings that must move for frames to be compared however old the map is: behind a crowd it learns
+nothing of free space."""
+MOVED_SAY = 0.1
+"""What a corner on something known to move counts, against one that is not."""
 SEVERAL = 0.02
 """Share of the readings that must move for it to be more than noise."""
 
@@ -67,46 +72,62 @@ class DominantMotion:
 
 
 class Parallax:
-    """Finds movers from image to image as long as the map is too young to know them.
+    """Finds movers from image to image while the map is too young to know them, or most of the view is hidden.
 
     Args:
-        seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found.
+        seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found. 0 turns it
+            off, later too.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
-        self._before: tuple[Level, Level, Pieces] | None = None
+        self._before: tuple[Level, Level, Pieces, NDArray[np.bool_] | None] | None = None
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
 
-    def active(self, timestamp: float) -> bool:
-        """Whether a frame is to be compared with the one before it."""
-        return self._before is not None and self.wanted(timestamp)
+    @property
+    def active(self) -> bool:
+        """Whether the next frame is to be compared with the one before it."""
+        return self._before is not None
 
-    def wanted(self, timestamp: float) -> bool:
-        """Whether the map is still too young at this time."""
-        if timestamp >= self._until:
-            self._before = None
+    def young(self, timestamp: float) -> bool:
+        """Whether the map cannot know yet what moves."""
         return timestamp < self._until
 
-    def remember(self, level: Level, small: Level, surface: Pieces) -> None:
-        """Take a tracked frame as the one to compare the next with."""
-        self._before = level, small, surface
+    def wanted(self, timestamp: float, small: Level, moving: NDArray[np.bool_] | None) -> bool:
+        """Whether a tracked frame, in which this (h, w) moves, is to be compared with the next."""
+        covered = moving is not None and np.count_nonzero(moving) > COVERED * np.count_nonzero(small.depth)
+        return bool(self.young(timestamp) or (covered and self.seconds > 0 and np.isfinite(self._longest)))
+
+    def remember(self, level: Level, small: Level, surface: Pieces, moving: NDArray[np.bool_] | None = None) -> None:
+        """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
+        self._before = level, small, surface, moving
+
+    def forget(self) -> None:
+        """Compare no more, until a frame is remembered again."""
+        self._before = None
 
     def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it."""
         assert self._before is not None
-        motion = dominant_motion(self._before[0], level, (self._before[1], small), (self._before[2], surface))
-        if motion is not None and np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
+        before, small_before, surface_before, moved = self._before
+        motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
+        if motion is None or not self.young(timestamp):
+            return motion
+        if np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
             self._until = min(timestamp + self.seconds, self._longest)
         return motion
 
 
 def dominant_motion(
-    before: Level, after: Level, small: tuple[Level, Level], surfaces: tuple[Pieces, Pieces]
+    before: Level,
+    after: Level,
+    small: tuple[Level, Level],
+    surfaces: tuple[Pieces, Pieces],
+    moved: NDArray[np.bool_] | None = None,
 ) -> DominantMotion | None:
     """Explain the corners' paths from one image to the next by one rigid motion; None where too few are left.
 
@@ -117,6 +138,8 @@ def dominant_motion(
         before, after: Both images at the resolution in which corners are followed.
         small: Both at the resolution of the result.
         surfaces: Pieces of surface of both of these.
+        moved: (h, w) bool at that resolution, what is known to move in the first image; it has little say in what the
+            static world is.
     """
     first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
     pixels, targets, unlike = _followed(before, first, second)
@@ -125,10 +148,14 @@ def dominant_motion(
     columns, rows = pixels.T
     z = before.depth[rows, columns].astype(np.float64)
     points = _points(before.camera, columns, rows, z)
-    surface = z**2
+    surface, rests = z**2, np.ones(len(z), dtype=bool)
+    if moved is not None:
+        factor = before.depth.shape[1] // moved.shape[1]
+        rests = ~moved[rows // factor, columns // factor]
+        surface = np.where(rests, surface, MOVED_SAY * surface)
     T = _rigid_motion(points, targets, surface, before.camera)
     error = _reprojection_error(T, points, targets, before.camera)
-    if np.count_nonzero(error < NOISE_PX) < FEWEST:
+    if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
         return None
     share = float(surface[error < NOISE_PX].sum() / surface.sum())
     if share < LEAST_SHARE:

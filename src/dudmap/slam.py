@@ -27,10 +27,14 @@ from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
 from dudmap.tracker import Level, Tracker, TrackingResult
 from dudmap.trajectory import Trajectory
-from dudmap.volume import SURFACE, TsdfVolume
+from dudmap.volume import FREE, NOTHING, SURFACE, TsdfVolume
 
 AS_EXPECTED = 0.02
 """Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
+CLEARLY = 0.95
+"""A pose explains an image clearly better than another if its cost is below this share of the other's."""
+LEAST_KNOWN = 0.09
+"""Share of the readings that must rest on a surface of the map where most of the others move."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -169,7 +173,7 @@ class Slam:
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
             or self.health.doubt(tracked)
-            or self._undecided(levels, labels)
+            or self._undecided(levels, labels, tracked)
         )
         recognised = self._recognise(observation, levels, known, clock) if reason else None
         if recognised is not None:
@@ -241,9 +245,10 @@ class Slam:
     def _expect(
         self, observation: Observation, levels: dict[int, Level], clock: "Clock"
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
-        """First guess of the pose; while the map is young, from the last image to this, with what moves (h, w)."""
+        """First guess of the pose; with what moves (h, w) while the map is young, or movers hide most of the view:
+        both then come from the last image and this one."""
         T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
-        if not self.parallax.active(observation.timestamp):
+        if not self.parallax.active:
             return T_init, None
         with clock("parallax"):
             level, small = self._compared(levels)
@@ -252,11 +257,29 @@ class Slam:
             )
             if motion is None:
                 return T_init, None
+            T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
-            if observation.timestamp not in self._seen:
-                T_init = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
-            return T_init, motion.moving_after
+            elif observation.timestamp in self._seen:
+                T_seen = T_init
+            elif self._fits_better(T_init, T_seen, self._tracked(levels)[0]):
+                return T_init, None  # what most corners follow is not the static world
+            moving = motion.moving_after
+            if not self.parallax.young(observation.timestamp):  # elsewhere the map knows better what moves
+                moving = moving & (self._place(small, T_seen) == NOTHING)
+            return T_seen, moving
+
+    def _place(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+        """What the map knows of the points of an image (h, w): SURFACE, FREE or NOTHING."""
+        self.reference.look_at(T_world_camera)
+        return self.reference.sample(level.depth, level.intensity, level.camera, T_world_camera).place
+
+    def _fits_better(self, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level) -> bool:
+        """Whether a pose explains an image clearly better than another one, apart from what has just moved."""
+        weights = self._expected([level], None) or [np.ones_like(level.depth)]
+        static = np.where(self._place(level, T) == FREE, np.float32(0), weights[0])
+        cost, other = (self.tracker.linearize(self.reference, level, pose, static).cost for pose in (T, T_other))
+        return cost < CLEARLY * other
 
     def _start_again(
         self, first: Observation, known: NDArray[np.bool_], moving: NDArray[np.bool_], level: Level
@@ -274,9 +297,11 @@ class Slam:
         return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
 
     def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
-        if self.parallax.wanted(timestamp):
-            level, small = self._compared(levels)
-            self.parallax.remember(level, small, self.detector.pieces(small, self.volume))
+        level, small = self._compared(levels)
+        if self.parallax.wanted(timestamp, small, self._moved):
+            self.parallax.remember(level, small, self.detector.pieces(small, self.volume), self._moved)
+        else:
+            self.parallax.forget()
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
@@ -333,17 +358,20 @@ class Slam:
         registered again."""
         changed = labels.dynamic if self._moved is None else labels.dynamic != self._moved
         counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
-        return np.count_nonzero(changed & counted) <= AS_EXPECTED * np.count_nonzero(counted)
+        return bool(np.count_nonzero(changed & counted) <= AS_EXPECTED * np.count_nonzero(counted))
 
-    def _undecided(self, levels: dict[int, Level], labels: Labels | None) -> str:
-        """Sentence if so much seems to move that the static world cannot be told, else empty."""
+    def _undecided(self, levels: dict[int, Level], labels: Labels | None, tracked: TrackingResult) -> str:
+        """Sentence if so much seems to move, or so little of the rest is known, that nothing is certain."""
         if labels is None:
             return ""
         readings = levels[self._level(self.config.dynamics.width)].depth > 0
         share = np.count_nonzero(labels.dynamic & readings) / max(np.count_nonzero(readings), 1)
-        if share <= self.config.dynamics.max_share:
-            return ""
-        return f"{share:.0%} of the readings seem to move: the static world cannot be told"
+        if share > self.config.dynamics.max_share:
+            return f"{share:.0%} of the readings seem to move: the static world cannot be told"
+        known = (1 - share) * tracked.inlier_share
+        if share > 0.5 and known < LEAST_KNOWN:
+            return f"{share:.0%} of the readings seem to move, and only {known:.0%} rest where the map has a surface"
+        return ""
 
     def _remember(
         self,
@@ -389,7 +417,7 @@ class Slam:
         return None
 
     def _lose(self, timestamp: float) -> None:
-        self.motion.lost()
+        self.motion.lost(timestamp)
         self.health.lost()
         self.detector.memory.forget()
         self._moved = None
