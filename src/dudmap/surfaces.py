@@ -9,7 +9,6 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.config import DynamicsConfig
 from dudmap.kernels import segmentation
-from dudmap.kernels.threads import bands, run_bands
 from dudmap.tracker import Level
 
 REACH = 3
@@ -353,12 +352,9 @@ def _against(
     shape = level.depth.shape
     out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
     T = (se3.inverse(memory.T_world_camera) @ T_world_camera)[:3].astype(np.float32)
-    run_bands(
-        lambda start, stop: segmentation.against(
-            start, stop, level.depth, level.intensity, _intrinsics(level), T, memory.level.depth,
-            memory.level.intensity, memory.marks, *out,
-        ),
-        bands(shape[0], 30),
+    segmentation.against(  # in one piece: it takes no longer than waking a thread
+        0, shape[0], level.depth, level.intensity, _intrinsics(level), T, memory.level.depth,
+        memory.level.intensity, memory.marks, *out,
     )  # fmt: skip
     return out
 

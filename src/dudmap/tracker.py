@@ -105,7 +105,7 @@ class Tracker:
             T_init: (4, 4) first guess of T_world_camera.
             static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
             first_level: Number of the first of these levels in the configuration.
-            exposure: First guess of the gain and offset.
+            exposure: Gain and offset; fitted anew if the first of these levels is the coarsest.
         """
         volume.look_at(T_init)
         T, iterations, system, settled = T_init, 0, None, True
@@ -118,7 +118,7 @@ class Tracker:
             lit = exposed(level, exposure)
             system = self.linearize(volume, lit, T, weights)
             iterations += 1
-            if self.config.exposure and index == 0:
+            if self.config.exposure and index == 0 and first_level == 0:
                 change = fit_exposure(lit.intensity, system.residuals[1], weights)
                 if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
