@@ -112,7 +112,7 @@ def test_poses_and_masks_replace_the_stored_ones(room):
     history.reintegrate(thrice, [0], [Ts[0]], [left])
     slots = once.active_slots
     np.testing.assert_array_equal(slots, thrice.active_slots)
-    weights = [(v._geometry[slots] >> 8) & 0xFF for v in (once, thrice)]
+    weights = [(v.blocks.geometry[slots] >> 8) & 0xFF for v in (once, thrice)]
     known = weights[0] > 0
     assert known.any()
     np.testing.assert_array_equal(weights[1][known], np.minimum(3 * weights[0][known].astype(int), 255))

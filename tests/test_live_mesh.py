@@ -84,7 +84,7 @@ def test_blocks_that_give_back_their_voxels_leave_the_mesh():
         if number % 7 == 0:
             live.update()
             assert_equal(live, volume)
-    assert volume._unused or len(first - set(live.chunks)) > 0, "something must have been given back"
+    assert volume.blocks._unused or len(first - set(live.chunks)) > 0, "something must have been given back"
     live.update()
     assert_equal(live, volume)
 
@@ -96,10 +96,10 @@ def test_slots_that_changed_hands_between_updates(volume):
     live.update()
     slots = volume.active_slots
     volume._frame_number += 1
-    volume._written[slots] = volume._frame_number
+    volume.blocks.written[slots] = volume._frame_number
     volume._release(slots)
     volume.integrate(wall(1.5), turned(100))
-    assert not set(volume._unused) & set(volume.active_slots.tolist())
+    assert not set(volume.blocks._unused) & set(volume.active_slots.tolist())
     live.update()
     assert_equal(live, volume)
 

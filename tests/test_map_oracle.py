@@ -4,12 +4,13 @@ import numpy as np
 import pytest
 
 from dudmap import se3
+from dudmap.blocks import FULLEST
 from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
 from dudmap.kernels import hashing
-from dudmap.volume import FREE, FULLEST, TsdfVolume
+from dudmap.volume import FREE, TsdfVolume
 from oracle import fuse, trilinear
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -32,16 +33,16 @@ def poses(count: int) -> list[np.ndarray]:
 def voxels_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """World points, distances, weights and colours of all voxels of a volume."""
     slots = volume.active_slots
-    words, colors = volume._geometry[slots].reshape(-1), volume._colors[slots].reshape(-1)
+    words, colors = volume.blocks.geometry[slots].reshape(-1), volume.blocks.colors[slots].reshape(-1)
     local = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
-    points = (volume._slot_coords[slots][:, None, :] * 8 + local[None]).reshape(-1, 3) * volume.voxel_size
+    points = (volume.blocks.slot_coords[slots][:, None, :] * 8 + local[None]).reshape(-1, 3) * volume.voxel_size
     rgb = np.stack([(colors >> 20) & 1023, (colors >> 10) & 1023, colors & 1023], axis=1) / 4
     return points, (words >> 16) * volume.sdf_unit, (words >> 8) & 255, rgb
 
 
 def intensity(volume: TsdfVolume) -> np.ndarray:
     """Intensities (n,) 0..255 of all voxels."""
-    return volume._geometry[volume.active_slots].reshape(-1) & 255
+    return volume.blocks.geometry[volume.active_slots].reshape(-1) & 255
 
 
 def allowed(volume: TsdfVolume) -> float:
@@ -194,17 +195,17 @@ def test_the_index_of_blocks_grows_like_a_dictionary():
         assert entries.tolist() == [expected.setdefault(int(cell), len(expected)) for cell in cells]
         fresh = np.array([cell for cell in cells[:300].tolist() if cell not in marked], dtype=np.int32)
         volume._add_voxels(fresh)
-        volume._geometry[volume._window[fresh]] = fresh[:, None]
+        volume.blocks.geometry[volume._window[fresh]] = fresh[:, None]
         marked |= {int(cell): batch for cell in fresh}
-    assert volume._num_entries == len(expected) > 4 * (1 << 12)
-    assert len(volume._table) > 1 << 14
+    assert volume.blocks.num_entries == len(expected) > 4 * (1 << 12)
+    assert len(volume.blocks.table) > 1 << 14
     known = np.array(list(expected), dtype=np.int64)
     coords = np.stack(np.unravel_index(known, tuple(volume._shape)), axis=1) + volume._origin
-    assert np.array_equal(volume._coords[: len(known)], coords)
+    assert np.array_equal(volume.blocks.coords[: len(known)], coords)
     entries = volume._entries_of(known[::-1].astype(np.int32))
     assert entries.tolist() == list(range(len(known)))[::-1]
-    slots = volume._slot_of[[expected[cell] for cell in marked]]
-    assert np.all(volume._geometry[slots] == np.array(list(marked))[:, None])
+    slots = volume.blocks.slot_of[[expected[cell] for cell in marked]]
+    assert np.all(volume.blocks.geometry[slots] == np.array(list(marked))[:, None])
     assert np.array_equal(volume._window[list(marked)], slots)
 
 
@@ -316,8 +317,8 @@ def test_space_that_was_seen_empty_costs_a_hundredth_of_its_voxels():
         volume.integrate(wall(3.5), np.eye(4))
     assert volume.num_free_blocks > 1.5 * volume.num_blocks
     voxels = 2 * 512 * 4
-    index = volume.num_bytes - before - volume._num_slots * (voxels + 20)
-    assert 0 < index <= 0.01 * voxels * volume._num_entries
+    index = volume.num_bytes - before - volume.blocks.num_slots * (voxels + 20)
+    assert 0 < index <= 0.01 * voxels * volume.blocks.num_entries
 
 
 def test_an_occupied_block_costs_little_more_than_its_voxels():
@@ -331,8 +332,8 @@ def test_an_occupied_block_costs_little_more_than_its_voxels():
         volume._add_voxels(cells[: blocks - volume.num_blocks])
         known = 3 * blocks
         assert volume.num_blocks == blocks
-        assert volume._num_entries == known
-        assert volume._num_entries <= FULLEST * len(volume._table)
+        assert volume.blocks.num_entries == known
+        assert volume.blocks.num_entries <= FULLEST * len(volume.blocks.table)
         assert volume.num_bytes <= 4.2 * 1024 * blocks
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap import se3
+from dudmap.blocks import BLOCK, VoxelBlocks
 from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
@@ -18,10 +19,6 @@ from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 
 _BIRTHS = itertools.count()
-BLOCK = 8
-"""Voxels along the edge of a block."""
-FULLEST = 0.8
-"""Largest share of the hash table that may be taken: 16 ns per insertion then, 9 ns after it has grown."""
 FORMAT = "dudmap map 1"
 STEEPEST = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
@@ -63,9 +60,8 @@ class MapSample:
 class TsdfVolume:
     """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
 
-    An entry is a block that something is known of; an entry near a surface owns a slot of 512 voxels. The window is a
-    dense array of slots around the view, so that the inner loops find a voxel with one load; the hash table stays the
-    authoritative index and fills the window when the view leaves it.
+    The window is a dense array of slots around the view, so that the inner loops find a voxel with one load; the hash
+    table of the blocks stays the authoritative index and fills the window when the view leaves it.
 
     Args:
         camera: Camera of the frames that will be integrated.
@@ -75,6 +71,7 @@ class TsdfVolume:
         extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
+        blocks: What is known of space.
         born: Number of this map among all of the program; another one after the map was made anew.
 
     Raises:
@@ -116,18 +113,7 @@ class TsdfVolume:
         self._window = np.full(size**3, -1, dtype=np.int32)
         self._stamps = np.zeros(size**3, dtype=np.int32)
         self._origin: NDArray[np.int64] | None = None
-        self._table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
-        self._coords = np.empty((1 << 12, 3), dtype=np.int16)
-        self._slot_of = np.full(1 << 12, -1, dtype=np.int32)
-        self._free_count = np.zeros(1 << 12, dtype=np.uint8)
-        self._num_entries = 0
-        self._geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self._colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self._entry_of = np.full(1 << 10, -1, dtype=np.int32)
-        self._slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
-        self._written = np.zeros(1 << 10, dtype=np.int32)  # number of the frame that last wrote a slot
-        self._num_slots = 0
-        self._unused: list[int] = []
+        self.blocks = VoxelBlocks()
         self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
         self.born = next(_BIRTHS)
@@ -141,13 +127,12 @@ class TsdfVolume:
     @property
     def num_blocks(self) -> int:
         """Blocks that own voxels."""
-        return self._num_slots - len(self._unused)
+        return self.blocks.num_voxel_blocks
 
     @property
     def num_free_blocks(self) -> int:
         """Blocks known to be free space; they own no voxels."""
-        n = self._num_entries
-        return int(np.count_nonzero((self._free_count[:n] >= self.config.free_after) & (self._slot_of[:n] < 0)))
+        return self.blocks.num_free(self.config.free_after)
 
     @property
     def num_bytes(self) -> int:
@@ -156,21 +141,17 @@ class TsdfVolume:
         Arrays grow ahead of what they hold; that spare room is address space the system has not backed with memory, and
         is left out. So is the window, whose size depends on the view and the voxels, not on the map.
         """
-        slots = sum(_row_bytes(array) for array in (self._geometry, self._colors, self._slot_coords, self._entry_of))
-        entries = sum(_row_bytes(array) for array in (self._coords, self._slot_of, self._free_count))
-        slots += _row_bytes(self._written)
-        return self._num_slots * slots + self._num_entries * entries + self._table.nbytes
+        return self.blocks.num_bytes
 
     @property
     def entry_bytes(self) -> float:
         """Memory that knowing a block costs without voxels, such as free space: its entry and its share of the hash."""
-        entries = sum(_row_bytes(array) for array in (self._coords, self._slot_of, self._free_count))
-        return entries + self._table.nbytes / max(self._num_entries, 1)
+        return self.blocks.entry_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return np.flatnonzero(self._entry_of[: self._num_slots] >= 0).astype(np.int32)
+        return self.blocks.active_slots
 
     def noise_band(self) -> NDArray[np.float32]:
         """Band parameters (6,) of the kernels: truncation in front, behind, noise factor, sigma(z), block edge."""
@@ -196,7 +177,7 @@ class TsdfVolume:
     @property
     def window(self) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
         """Flat window of slots, its shape in blocks, and the flat packed voxels, as the kernels take them."""
-        return self._window, self._shape, self._geometry.reshape(-1)
+        return self._window, self._shape, self.blocks.geometry.reshape(-1)
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -260,7 +241,11 @@ class TsdfVolume:
         self._window.fill(-1)
         self._stamps.fill(0)
         hashing.fill_window(
-            self._window.reshape(tuple(self._shape)), origin, self._coords, self._slot_of, self._num_entries
+            self._window.reshape(tuple(self._shape)),
+            origin,
+            self.blocks.coords,
+            self.blocks.slot_of,
+            self.blocks.num_entries,
         )
         self._near = np.sort(self._window[self._window >= 0])
 
@@ -286,12 +271,7 @@ class TsdfVolume:
             self._add_voxels(cells)
 
     def _add_voxels(self, cells: NDArray[np.int32]) -> None:
-        entries = self._entries_of(cells)
-        slots = self._take_slots(len(entries))
-        self._entry_of[slots] = entries
-        self._slot_coords[slots] = self._coords[entries]
-        self._written[slots] = self._frame_number
-        self._slot_of[entries] = slots
+        slots = self.blocks.give_voxels(self._entries_of(cells), self._frame_number)
         self._window[cells] = slots
         self._near = np.concatenate([self._near, slots])
 
@@ -305,35 +285,8 @@ class TsdfVolume:
                 f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
                 f"{self.voxel_size} m it cannot be larger: set volume.voxel_size to a larger value"
             )
-        needed = self._num_entries + int(np.count_nonzero(self._window[cells] == -1))
-        if needed > len(self._coords):
-            capacity = max(needed, 2 * len(self._coords))
-            self._coords = _grown(self._coords, capacity, 0)
-            self._slot_of = _grown(self._slot_of, capacity, -1)
-            self._free_count = _grown(self._free_count, capacity, 0)
-        if needed > FULLEST * len(self._table):
-            size = max(int(needed / FULLEST), len(self._table)) * 3 // 2  # a full table would be searched for ever
-            self._table = np.full(size, hashing.EMPTY, dtype=np.int32)
-            hashing.rebuild(self._table, self._coords, self._num_entries)
-        entries, self._num_entries = hashing.insert_all(
-            self._table, self._coords, self._num_entries, coords.astype(np.int16)
-        )
-        return entries
-
-    def _take_slots(self, count: int) -> NDArray[np.int32]:
-        reused = [self._unused.pop() for _ in range(min(count, len(self._unused)))]
-        fresh = count - len(reused)
-        needed = self._num_slots + fresh
-        if needed > len(self._geometry):
-            capacity = max(needed, len(self._geometry) * 3 // 2)
-            self._geometry = _grown(self._geometry, capacity, 0)
-            self._colors = _grown(self._colors, capacity, 0)
-            self._entry_of = _grown(self._entry_of, capacity, -1)
-            self._slot_coords = _grown(self._slot_coords, capacity, 0)
-            self._written = _grown(self._written, capacity, 0)
-        slots = np.array(reused + list(range(self._num_slots, needed)), dtype=np.int32)
-        self._num_slots = needed
-        return slots
+        unknown = int(np.count_nonzero(self._window[cells] == -1))
+        return self.blocks.entries_at(coords.astype(np.int16), unknown)
 
     def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
         shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
@@ -355,7 +308,7 @@ class TsdfVolume:
         ranges = bands(len(slots), 2048)
         counts = run_bands(
             lambda start, stop: visibility.visible_slots(
-                start, stop, self._near, self._slot_coords, T_camera_world, self._intrinsics(), size,
+                start, stop, self._near, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size,
                 np.float32(self.block_size), nearest, farthest, self.noise_band(), np.float32(0.05),
                 np.float32(self.depth_max), slots,
             ),
@@ -363,7 +316,7 @@ class TsdfVolume:
         )  # fmt: skip
         visible = np.concatenate([slots[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)])
         count = len(visible)
-        self._written[visible] = self._frame_number
+        self.blocks.written[visible] = self._frame_number
         voxel = np.array(
             [
                 self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
@@ -376,8 +329,8 @@ class TsdfVolume:
         occupied = np.empty(count, dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate(
-                start, stop, visible, self._slot_coords, T_camera_world, self._intrinsics(), size, pixels,
-                self._geometry.reshape(-1), self._colors.reshape(-1), voxel, occupied,
+                start, stop, visible, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size, pixels,
+                self.blocks.geometry.reshape(-1), self.blocks.colors.reshape(-1), voxel, occupied,
             ),
             bands(count, 256),
         )  # fmt: skip
@@ -422,16 +375,10 @@ class TsdfVolume:
         if len(slots) == 0:
             return
         assert self._origin is not None
-        entries = self._entry_of[slots]
-        self._slot_of[entries] = -1
-        self._free_count[entries] = np.maximum(self._free_count[entries], self.config.free_after)
-        self._entry_of[slots] = -1
-        self._geometry[slots] = 0
-        self._colors[slots] = 0
-        cells = np.ravel_multi_index(tuple((self._coords[entries] - self._origin).T), tuple(self._shape))
+        entries = self.blocks.take_voxels(slots, self.config.free_after)
+        cells = np.ravel_multi_index(tuple((self.blocks.coords[entries] - self._origin).T), tuple(self._shape))
         self._window[cells] = -2 - entries
-        self._unused.extend(int(slot) for slot in slots[::-1])
-        self._near = self._near[self._entry_of[self._near] >= 0]
+        self._near = self._near[self.blocks.entry_of[self._near] >= 0]
 
     def _observe_free(
         self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]], count: int
@@ -450,7 +397,7 @@ class TsdfVolume:
             lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
                 self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
-                np.float32(self.depth_max), self._free_count, count, self.config.free_after, out,
+                np.float32(self.depth_max), self.blocks.free_count, count, self.config.free_after, out,
             ),
             ranges, found,
         )  # fmt: skip
@@ -458,7 +405,7 @@ class TsdfVolume:
         if len(cells) > 0:
             entries = self._entries_of(cells)
             self._window[cells] = -2 - entries
-            self._free_count[entries] = min(count, 255)
+            self.blocks.free_count[entries] = min(count, 255)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -478,7 +425,7 @@ class TsdfVolume:
         run_bands(
             lambda start, stop: sampling.sample_map(
                 start, stop, depth, intensity, intrinsics, T, window, cells, geometry,
-                np.float32(self.sdf_unit), self._free_count, self.config.free_after, *out,
+                np.float32(self.sdf_unit), self.blocks.free_count, self.config.free_after, *out,
             ),
             bands(shape[0], max(8, -(-shape[0] // 8))),
         )  # fmt: skip
@@ -490,8 +437,9 @@ class TsdfVolume:
         self.look_at(T_world_camera)
         assert self._origin is not None
         depth, color, normals = raycasting.raycast(
-            self._window.reshape(tuple(self._shape)), self._origin.astype(np.int32), self._geometry, self._colors,
-            self.voxel_size, self.sdf_unit, T_world_camera, camera, 0.05, self.depth_max, self.config.min_weight,
+            self._window.reshape(tuple(self._shape)), self._origin.astype(np.int32), self.blocks.geometry,
+            self.blocks.colors, self.voxel_size, self.sdf_unit, T_world_camera, camera, 0.05, self.depth_max,
+            self.config.min_weight,
         )  # fmt: skip
         return View(depth, color, normals)
 
@@ -505,8 +453,8 @@ class TsdfVolume:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         slots = self.active_slots
         vertices, faces, colors, normals = meshing.extract(
-            self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
-            self.sdf_unit, self.config.min_weight if min_weight is None else min_weight,
+            self.blocks.geometry, self.blocks.colors, slots, self.blocks.slot_coords, self.blocks.neighbours(slots),
+            self.voxel_size, self.sdf_unit, self.config.min_weight if min_weight is None else min_weight,
             STEEPEST * self.voxel_size,
         )  # fmt: skip
         return Mesh(vertices, faces, colors, normals)
@@ -519,8 +467,8 @@ class TsdfVolume:
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
         """
         parts = meshing.extract_chunks(
-            self._geometry, self._colors, slots, self._slot_coords, self._neighbours(slots), self.voxel_size,
-            self.sdf_unit, self.config.min_weight, chunks, STEEPEST * self.voxel_size,
+            self.blocks.geometry, self.blocks.colors, slots, self.blocks.slot_coords, self.blocks.neighbours(slots),
+            self.voxel_size, self.sdf_unit, self.config.min_weight, chunks, STEEPEST * self.voxel_size,
         )  # fmt: skip
         return [Mesh(*part) for part in parts]
 
@@ -534,21 +482,12 @@ class TsdfVolume:
 
         A slot whose block gave its voxels back is among them, with the coordinates of that block or of the next one.
         """
-        slots = np.flatnonzero(self._written[: self._num_slots] > num_integrated).astype(np.int32)
-        return slots, self._slot_coords[slots].astype(np.int32)
+        slots = np.flatnonzero(self.blocks.written[: self.blocks.num_slots] > num_integrated).astype(np.int32)
+        return slots, self.blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        entries = hashing.find_all(self._table, self._coords, coords)
-        return np.where(entries >= 0, self._slot_of[entries], -1).astype(np.int32)
-
-    def _neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
-        out = np.empty((len(slots), 8), dtype=np.int32)
-        for column in range(8):
-            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
-            out[:, column] = self.slots_at(self._slot_coords[slots] + offset)
-        return out
+        return self.blocks.slots_at(coords)
 
     # -- files -------------------------------------------------------------------------------------------------------
 
@@ -558,7 +497,7 @@ class TsdfVolume:
         Raises:
             MapError: The file cannot be written.
         """
-        n, slots = self._num_entries, self.active_slots
+        n, slots = self.blocks.num_entries, self.active_slots
         try:
             with Path(path).open("wb") as file:
                 np.savez_compressed(
@@ -569,11 +508,11 @@ class TsdfVolume:
                     config=self.config.model_dump_json(),
                     sensor=self.sensor.model_dump_json(),
                     depth_max=self.depth_max,
-                    coords=self._coords[:n].astype(np.int32),
-                    free_count=self._free_count[:n],
-                    entries=self._entry_of[slots],
-                    geometry=self._geometry[slots],
-                    colors=self._colors[slots],
+                    coords=self.blocks.coords[:n].astype(np.int32),
+                    free_count=self.blocks.free_count[:n],
+                    entries=self.blocks.entry_of[slots],
+                    geometry=self.blocks.geometry[slots],
+                    colors=self.blocks.colors[slots],
                 )
         except OSError as error:
             raise MapError(f"cannot write the map to {path}: {error}") from error
@@ -599,38 +538,9 @@ class TsdfVolume:
                     SensorConfig.model_validate_json(str(data["sensor"])),
                     float(data["depth_max"]),
                 )
-                volume._restore(data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"])
+                volume.blocks = VoxelBlocks.restored(
+                    data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
+                )
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
             raise MapError(f"{path} is not a readable map file: {error}") from error
         return volume
-
-    def _restore(
-        self,
-        coords: NDArray[np.int32],
-        free_count: NDArray[np.uint8],
-        entries: NDArray[np.int32],
-        geometry: NDArray[np.int32],
-        colors: NDArray[np.int32],
-    ) -> None:
-        n, m = len(coords), len(entries)
-        self._table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
-        self._coords, self._free_count, self._num_entries = coords.astype(np.int16), free_count.copy(), n
-        hashing.rebuild(self._table, self._coords, n)
-        self._geometry, self._colors, self._num_slots = geometry.copy(), colors.copy(), m
-        self._entry_of, self._slot_coords, self._written = entries.copy(), self._coords[entries], np.zeros(m, np.int32)
-        self._slot_of = np.full(n, -1, dtype=np.int32)
-        self._slot_of[entries] = np.arange(m, dtype=np.int32)
-        self._origin = None
-
-
-def _grown(array: NDArray, capacity: int, value: int) -> NDArray:
-    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
-    shape = (capacity, *array.shape[1:])
-    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
-    out[: len(array)] = array
-    return out
-
-
-def _row_bytes(array: NDArray) -> int:
-    """Memory of one element along the first axis."""
-    return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))

@@ -1,0 +1,174 @@
+"""Blocks of 8x8x8 voxels: the hash that finds them, the memory that holds them."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.kernels import hashing
+
+BLOCK = 8
+"""Voxels along the edge of a block."""
+FULLEST = 0.8
+"""Largest share of the hash table that may be taken: 16 ns per insertion then, 9 ns after it has grown."""
+
+
+class VoxelBlocks:
+    """Everything that is known of space, block by block.
+
+    An entry is a block that something is known of; an entry near a surface owns a slot of 512 voxels. Arrays grow ahead
+    of what they hold.
+
+    Attributes:
+        table: Hash table of entry numbers (``kernels/hashing.py``).
+        coords: (entries, 3) int16 block coordinates.
+        slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
+        free_count: (entries,) uint8 observations of emptiness.
+        num_entries: Entries that are in use.
+        geometry, colors: (slots, 512) int32 packed voxels.
+        entry_of: (slots,) int32 entry of each slot, -1 = unused.
+        slot_coords: (slots, 3) int16 block coordinates by slot.
+        written: (slots,) int32 number of the frame that last wrote a slot.
+        num_slots: Slots that are or were in use.
+    """
+
+    def __init__(self) -> None:
+        self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
+        self.coords = np.empty((1 << 12, 3), dtype=np.int16)
+        self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
+        self.free_count = np.zeros(1 << 12, dtype=np.uint8)
+        self.num_entries = 0
+        self.geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
+        self.colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
+        self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
+        self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
+        self.written = np.zeros(1 << 10, dtype=np.int32)
+        self.num_slots = 0
+        self._unused: list[int] = []
+
+    @property
+    def num_voxel_blocks(self) -> int:
+        """Blocks that own voxels."""
+        return self.num_slots - len(self._unused)
+
+    def num_free(self, observations: int) -> int:
+        """Blocks without voxels that were seen empty at least so often."""
+        n = self.num_entries
+        return int(np.count_nonzero((self.free_count[:n] >= observations) & (self.slot_of[:n] < 0)))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of all slots, also those given back and not taken again yet, of all entries, and of the hash.
+
+        What arrays hold ahead is address space that the system has not backed with memory, and is left out.
+        """
+        slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written)
+        return (
+            self.num_slots * sum(_row_bytes(array) for array in slots)
+            + self.num_entries * self._index_bytes
+            + self.table.nbytes
+        )
+
+    @property
+    def entry_bytes(self) -> float:
+        """Memory that knowing a block costs without voxels, such as free space: its entry and its share of the hash."""
+        return self._index_bytes + self.table.nbytes / max(self.num_entries, 1)
+
+    @property
+    def _index_bytes(self) -> int:
+        return sum(_row_bytes(array) for array in (self.coords, self.slot_of, self.free_count))
+
+    @property
+    def active_slots(self) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
+
+    def entries_at(self, coords: NDArray[np.int16], unknown: int) -> NDArray[np.int32]:
+        """Entries (n,) int32 of blocks at coordinates (n, 3), made for those, ``unknown`` at most, that have none."""
+        needed = self.num_entries + unknown
+        if needed > len(self.coords):
+            capacity = max(needed, 2 * len(self.coords))
+            self.coords = _grown(self.coords, capacity, 0)
+            self.slot_of = _grown(self.slot_of, capacity, -1)
+            self.free_count = _grown(self.free_count, capacity, 0)
+        if needed > FULLEST * len(self.table):
+            size = max(int(needed / FULLEST), len(self.table)) * 3 // 2  # a full table would be searched for ever
+            self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
+            hashing.rebuild(self.table, self.coords, self.num_entries)
+        entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
+        return entries
+
+    def give_voxels(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
+        """New slots (n,) int32 for entries that have none."""
+        reused = [self._unused.pop() for _ in range(min(len(entries), len(self._unused)))]
+        needed = self.num_slots + len(entries) - len(reused)
+        if needed > len(self.geometry):
+            capacity = max(needed, len(self.geometry) * 3 // 2)
+            self.geometry = _grown(self.geometry, capacity, 0)
+            self.colors = _grown(self.colors, capacity, 0)
+            self.entry_of = _grown(self.entry_of, capacity, -1)
+            self.slot_coords = _grown(self.slot_coords, capacity, 0)
+            self.written = _grown(self.written, capacity, 0)
+        slots = np.array(reused + list(range(self.num_slots, needed)), dtype=np.int32)
+        self.num_slots = needed
+        self.entry_of[slots] = entries
+        self.slot_coords[slots] = self.coords[entries]
+        self.written[slots] = frame_number
+        self.slot_of[entries] = slots
+        return slots
+
+    def take_voxels(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
+        """Take slots back; their entries (n,) int32 count as seen empty at least so often."""
+        entries = self.entry_of[slots]
+        self.slot_of[entries] = -1
+        self.free_count[entries] = np.maximum(self.free_count[entries], observations)
+        self.entry_of[slots] = -1
+        self.geometry[slots] = 0
+        self.colors[slots] = 0
+        self._unused.extend(int(slot) for slot in slots[::-1])
+        return entries
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        entries = hashing.find_all(self.table, self.coords, coords)
+        return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
+
+    def neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
+        out = np.empty((len(slots), 8), dtype=np.int32)
+        for column in range(8):
+            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
+            out[:, column] = self.slots_at(self.slot_coords[slots] + offset)
+        return out
+
+    @classmethod
+    def restored(
+        cls,
+        coords: NDArray[np.int32],
+        free_count: NDArray[np.uint8],
+        entries: NDArray[np.int32],
+        geometry: NDArray[np.int32],
+        colors: NDArray[np.int32],
+    ) -> "VoxelBlocks":
+        """Blocks from what a file holds: all entries, and entry and voxels of each slot."""
+        blocks, n, m = cls(), len(coords), len(entries)
+        blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
+        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n
+        hashing.rebuild(blocks.table, blocks.coords, n)
+        blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
+        blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
+        blocks.written = np.zeros(m, np.int32)
+        blocks.slot_of = np.full(n, -1, dtype=np.int32)
+        blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
+        return blocks
+
+
+def _grown(array: NDArray, capacity: int, value: int) -> NDArray:
+    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
+    shape = (capacity, *array.shape[1:])
+    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
+    out[: len(array)] = array
+    return out
+
+
+def _row_bytes(array: NDArray) -> int:
+    """Memory of one element along the first axis."""
+    return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))
