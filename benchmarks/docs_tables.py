@@ -3,8 +3,8 @@
     python benchmarks/docs_tables.py runs/benchmark/limits/limits.md runs/benchmark/synthetic/synthetic.md ...
 
 Takes limits.md (with the heat maps beside it), synthetic.md, recordings.md and ablation.md. Each replaces the text
-between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` in docs/limits.md or docs/benchmarks.md; nothing is changed on the
-way.
+between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` in docs/limits.md or docs/benchmarks.md; nothing is changed on
+the way.
 """
 
 import re
