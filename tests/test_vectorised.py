@@ -25,7 +25,7 @@ from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
     (registration, "linearize"): {"loops": 2, "fma": 48, "packed": 140, "converted": 2},
-    (integration, "integrate"): {"loops": 3, "fma": 9, "packed": 36, "converted": 16},
+    (integration, "integrate"): {"loops": 3, "fma": 9, "packed": 42, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample"): {"loops": 1, "packed": 3},
     (labeling, "smooth"): {"loops": 1},

@@ -67,7 +67,7 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
     noise, base, scale = voxel[4], voxel[5], voxel[6]
     max_weight, carve_rate, limit, depth_unit = voxel[7], voxel[8], voxel[9], voxel[10]
     by_unit = np.float32(1) / unit
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
+    zero, half, one, young = np.float32(0), np.float32(0.5), np.float32(1), np.float32(8)
     height, width = size[0], size[1]
     blank = np.float32(height * width)
     fx, fy = intrinsics[0], intrinsics[1]
@@ -87,7 +87,8 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
     pixel = np.empty(512, np.int32)
     seen = np.empty(512, np.int64)
     words = seen.view(np.int32)  # reading and colour of the voxel's pixel, side by side
-    known = np.empty((2, 512), np.float32)  # depth of the voxel; the share in which it takes on the pixel's colour
+    # depth of the voxel; the share in which it takes on the pixel's colour, -1: only if it has none yet
+    known = np.empty((2, 512), np.float32)
     max_u, max_v = np.float32(width), np.float32(height)
 
     for block in range(start, stop):
@@ -144,9 +145,10 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
             new_word = np.int32(new_word) if gain > zero else word
             geometry[n] = new_word
             near = abs(s) < max(np.float32(2.5) * voxel_size, np.float32(0.4) * tau)
-            share = share if near else zero
+            first_sight = banded & (old_weight < young)
+            share = share if near else (-one if first_sight else zero)
             known[1, n] = share
-            painted += one if share > zero else zero
+            painted += zero if share == zero else one
             surface = (bits(new_word, 8, 0xFF) == zero) | (upper_half(new_word) * unit < front * np.float32(0.9))
             held += one if surface else zero
         occupied[block] = np.int32(held)
@@ -156,7 +158,7 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
         for n in range(512):
             old, c = shades[n], words[2 * n + 1]
             share = known[1, n]
-            share = one if (old == 0) & (share > zero) else share
+            share = max(share, zero) if old != 0 else min(abs(share) * np.float32(1e6), one)
             r0, g0, b0 = bits(old, 20, 0x3FF), bits(old, 10, 0x3FF), bits(old, 0, 0x3FF)
             r1, g1, b1 = bits(c, 22, 0x3FC), bits(c, 14, 0x3FC), bits(c, 6, 0x3FC)
             r1, g1, b1 = r0 + (r1 - r0) * share, g0 + (g1 - g0) * share, b0 + (b1 - b0) * share
