@@ -18,6 +18,7 @@ from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
 from dudmap.history import History
+from dudmap.kernels.threads import beside
 from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
@@ -192,10 +193,14 @@ class Slam:
         result = self._result(
             observation, clock, levels, labels, known, tracked, "", fused=not redundant, relocalized=bool(recognised)
         )
-        self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
-        if not redundant:
-            with clock("integrate"):
-                self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
+        movers = beside(self._follow, observation, levels, labels, tracked, clock)
+        try:
+            self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
+            if not redundant:
+                with clock("integrate"):
+                    self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
+        finally:
+            result = replace(result, movers=movers.result())
         return self._as_recorded(self._close_loop(observation, levels, result, clock))
 
     def _keep(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> None:
@@ -563,20 +568,30 @@ class Slam:
                 residuals = labels.sample.distance
             if known is not None:
                 mask = mask | known
-        movers: tuple[Mover, ...] = ()
-        if self.config.movers.enabled and labels is not None and not reason:
-            with clock("movers"):
-                level = levels[self._level(self.config.dynamics.width)]
-                movers = tuple(self.movers.update(observation.timestamp, labels.dynamic, level, tracked.T_world_camera))
-            if self.fusion is not None:
-                with clock("bodies"):
-                    pose, exposure = tracked.T_world_camera, tracked.exposure
-                    movers = tuple(self.fusion.update(observation, movers, level, pose, exposure))
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
             fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
-            clock.timings, relocalized, movers, self.atlas.current,
+            clock.timings, relocalized, (), self.atlas.current,
         )  # fmt: skip
+
+    def _follow(
+        self,
+        observation: Observation,
+        levels: dict[int, Level],
+        labels: Labels | None,
+        tracked: TrackingResult,
+        clock: "Clock",
+    ) -> tuple[Mover, ...]:
+        """The movers of a frame; nothing of the map is read or written, so that it may be fused meanwhile."""
+        if not self.config.movers.enabled or labels is None:
+            return ()
+        pose, level = tracked.T_world_camera, levels[self._level(self.config.dynamics.width)]
+        with clock("movers"):
+            movers = self.movers.update(observation.timestamp, labels.dynamic, level, pose)
+        if self.fusion is not None:
+            with clock("bodies"):
+                movers = self.fusion.update(observation, movers, level, pose, tracked.exposure)
+        return tuple(movers)
 
 
 def _reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:

@@ -6,14 +6,17 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from numba import njit
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 kernel = njit(nogil=True, cache=True, fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy")
+
+
+Result = TypeVar("Result")
 
 
 def num_threads() -> int:
@@ -56,5 +59,15 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         work()
     finally:
         for other in others:
-            other.result()
+            if not other.cancel():  # one that has not begun finds nothing left to do
+                other.result()
     return results
+
+
+def beside(function: Callable[..., Result], *items: Any) -> "Future[Result]":
+    """Start a call that needs one core while the calling thread goes on with kernels. Where there is one, just call."""
+    if num_threads() > 1:
+        return _pool().submit(function, *items)
+    done: Future[Result] = Future()
+    done.set_result(function(*items))
+    return done
