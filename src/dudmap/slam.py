@@ -489,7 +489,10 @@ class Slam:
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            labels = self.detector.detect(self.reference, level, tracked.T_world_camera, tracked.exposure)
+            coarse = self._tracked(levels)[0]
+            weights = self._expected([coarse], self._unmasked([coarse], known)) or [np.ones_like(coarse.depth)]
+            T_depth = self.tracker.depth_pose(self.reference, coarse, tracked.T_world_camera, weights[0])
+            labels = self.detector.detect(self.reference, level, T_depth, tracked.exposure)
             if known is None:
                 return labels
             masked = _reduced(known, level)
