@@ -150,7 +150,9 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            seen_free, rested = self.memory.views(level, T_world_camera, np.float32(1.5) * noise.astype(np.float32))
+            unknown = float(np.mean(sample.place[level.depth > 0] == NOTHING)) if level.depth.any() else 0.0
+            reach = np.float32(1.5) * noise.astype(np.float32)
+            seen_free, rested = self.memory.views(level, T_world_camera, reach, unknown)
             evidence[(sample.place == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
