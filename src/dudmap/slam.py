@@ -208,7 +208,7 @@ class Slam:
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
-            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
+            self.detector.remember(level, tracked.T_world_camera, tracked.exposure, labels)
 
     def _as_recorded(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
@@ -419,7 +419,7 @@ class Slam:
     def _lose(self, timestamp: float) -> None:
         self.motion.lost(timestamp)
         self.health.lost()
-        self.detector.memory.forget()
+        self.detector.forget()
         self._moved = None
         self._lost_since = timestamp if self._lost_since is None else self._lost_since
 
