@@ -17,7 +17,9 @@ PIXELS_PER_BAND = 4800
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 APART = 0.01
-"""How far the depth image may have been taken from where the colour image was, standard deviation, metres."""
+"""How far the depth image was taken from where the colour image was, standard deviation, metres;"""
+FARTHEST = 3.0
+"""and at most, standard deviations."""
 ALIKE = 100.0
 """Readings that err alike and tell as much as one, where nothing but the depth is asked."""
 
@@ -91,6 +93,7 @@ class Tracker:
     def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
         self.config = config
         self.sensor = sensor
+        self._apart = np.zeros(6)  # twist from the pose of colour and depth to that of the depth, camera axes
 
     def align(
         self,
@@ -173,32 +176,34 @@ class Tracker:
         level: Level,
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
-        iterations: int = 2,
     ) -> NDArray[np.float64]:
         """Pose (4, 4) from which the depth image alone was taken: near that of depth and colour, where it fits better.
 
         Depth and colour are taken milliseconds apart and through two lenses, so that no pose fits both: a camera
-        moving at half a metre per second leaves a centimetre between them. Gauss-Newton steps on the distances with a
-        Gaussian prior on the joint pose, so that what the depth does not tell stays as it was.
+        moving at half a metre per second leaves a centimetre between them. One Gauss-Newton step on the distances, from
+        as far apart as they were in the last frame, with a Gaussian prior on the joint pose: what the depth does not
+        tell stays as it was.
 
         Args:
             volume: The map, which has been looked at from near the pose.
             level: A coarse level of the image.
             T_world_camera: (4, 4), the pose of depth and colour together.
             weights: (h, w) float32 static weights in [0, 1].
-            iterations: Gauss-Newton steps.
         """
         readings = level.depth[level.depth > 0]
         if len(readings) == 0:
             return T_world_camera
         variance = ALIKE * (self.sensor.sigma_base + self.sensor.sigma_scale) ** 2
         prior = np.repeat([1.0, float(np.median(readings)) ** 2], 3) / APART**2  # turns by what they move in the image
-        T, total = T_world_camera, np.zeros(6)
-        for _ in range(iterations):
-            system = self.linearize(volume, level, T, weights, color_weight=0.0)
-            step = -np.linalg.solve(system.H / variance + np.diag(prior), system.b / variance + prior * total)
-            T, total = moved(T, step), total + step
-        return T
+        R = T_world_camera[:3, :3]
+        apart = (self._apart.reshape(2, 3) @ R.T).reshape(6)
+        T = moved(T_world_camera, apart)
+        system = self.linearize(volume, level, T, weights, color_weight=0.0)
+        step = -np.linalg.solve(system.H / variance + np.diag(prior), system.b / variance + prior * apart)
+        apart = apart + step
+        apart *= min(1.0, FARTHEST / max(float(np.sqrt(prior @ apart**2)), 1e-9))
+        self._apart = (apart.reshape(2, 3) @ R).reshape(6)
+        return moved(T_world_camera, apart)
 
     def linearize(
         self,
