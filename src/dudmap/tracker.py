@@ -20,7 +20,7 @@ APART = 0.01
 """How far the depth image was taken from where the colour image was, standard deviation, metres;"""
 FARTHEST = 3.0
 """and at most, standard deviations."""
-ALIKE = 100.0
+ALIKE = 400.0
 """Readings that err alike and tell as much as one, where nothing but the depth is asked."""
 
 
