@@ -70,6 +70,16 @@ def test_what_was_seen_for_a_moment_or_in_another_world_is_no_background():
     assert not background.hidden(level, pose(5)).any()
 
 
+def test_a_seam_is_not_hidden():
+    """The sky above a wall: its edge wanders by a pixel or two."""
+    background = seen(15)
+    level = wall(pose(15))
+    seam = (V >= 50) & (V < 54)
+    background.begin(0.5)
+    sky = Level(CAMERA, np.where(seam, np.float32(0), level.depth), np.where(seam, np.float32(1), level.intensity))
+    assert not background.hidden(sky, pose(15)).any()
+
+
 def test_what_moved_is_no_background():
     background = Background(DynamicsConfig())
     for i in range(15):

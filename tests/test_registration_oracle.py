@@ -141,6 +141,10 @@ def test_where_the_depth_tells_nothing_its_pose_stays():
     assert T[2, 3] == pytest.approx(0.01, abs=0.001)
     assert np.abs(T[:2, 3]).max() < 0.001
     assert abs(T[1, 0]) < 0.001
+    together = Tracker(TrackerConfig(), SENSOR)  # less than the noise of this is no delay
+    assert np.array_equal(
+        together.depth_pose(wall, Level(CAMERA, rough, level.intensity), np.eye(4), ones(level)), np.eye(4)
+    )
     nothing = Level(CAMERA, np.zeros_like(depth), level.intensity)
     assert np.array_equal(tracker.depth_pose(wall, nothing, np.eye(4), ones(level)), np.eye(4))
 

@@ -79,9 +79,10 @@ class Background:
         known = hole & (cv2.dilate(rested.astype(np.uint8), square) > 0)
         limit = np.float32(DIFFERENT)
         unlike = known & ((intensity < darkest - limit) | (intensity > brightest + limit))
-        if not unlike.any():
+        solid = cv2.morphologyEx(unlike.astype(np.uint8), cv2.MORPH_OPEN, square)  # not the seam along an edge
+        if not solid.any():
             return nothing
-        votes = cv2.blur(unlike.astype(np.float32), (AROUND, AROUND))
+        votes = cv2.blur(solid.astype(np.float32), (AROUND, AROUND))
         asked = cv2.blur(known.astype(np.float32), (AROUND, AROUND))
         hidden = (hole & (asked >= np.float32(KNOWN)) & (votes > np.float32(0.5) * asked)).astype(np.uint8)
         _, numbers, stats, _ = cv2.connectedComponentsWithStats(hidden, connectivity=4)

@@ -18,8 +18,8 @@ EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 APART = 0.01
 """How far the depth image was taken from where the colour image was, standard deviation, metres;"""
-FARTHEST = 3.0
-"""and at most, standard deviations."""
+NEAREST, FARTHEST = 0.35, 3.0
+"""less than this is noise, more does not happen, standard deviations."""
 ALIKE = 400.0
 """Readings that err alike and tell as much as one, where nothing but the depth is asked."""
 
@@ -201,9 +201,10 @@ class Tracker:
         system = self.linearize(volume, level, T, weights, color_weight=0.0)
         step = -np.linalg.solve(system.H / variance + np.diag(prior), system.b / variance + prior * apart)
         apart = apart + step
-        apart *= min(1.0, FARTHEST / max(float(np.sqrt(prior @ apart**2)), 1e-9))
+        far = float(np.sqrt(prior @ apart**2))
+        apart *= min(1.0, FARTHEST / max(far, 1e-9))
         self._apart = (apart.reshape(2, 3) @ R).reshape(6)
-        return moved(T_world_camera, apart)
+        return moved(T_world_camera, apart) if far >= NEAREST else T_world_camera
 
     def linearize(
         self,
