@@ -137,9 +137,18 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
     free, _ = again.views(seen, np.eye(4), noise)
     assert free[board].mean() > 0.8
     assert not free[~board].any()
-    # a grown map knows free space itself
+    # a grown map knows free space itself, unless the camera has turned to where it knows nothing
     again.begin(10.0)
-    assert not np.any(again.views(seen, np.eye(4), noise))
+    assert not np.any(again.views(seen, np.eye(4), noise, unknown=0.05))
+    assert not np.any(again.views(seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
+    for i in range(16):
+        seen, board, X = image(0.0, -0.3 + 0.05 * i)
+        again.begin(10.0 + i / 30)
+        free, _ = again.views(seen, np.eye(4), noise, unknown=0.5)
+        assert not again.views(seen, np.eye(4), noise, unknown=0.05)[0].any()
+        again.remember(seen, np.eye(4), np.zeros_like(board), None)
+    assert free[board & (X > -0.3 + 0.2 + 0.03)].mean() > 0.9
+    assert not free[~board].any()
 
 
 def overlaps(sequence, frames):

@@ -6,10 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap import surfaces
+from dudmap.background import Background
 from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.kernels import labeling
 from dudmap.kernels.threads import bands, run_bands
-from dudmap.tracker import Level
+from dudmap.tracker import Level, exposed
 from dudmap.volume import FREE, NOTHING, SURFACE, MapSample, TsdfVolume
 
 BINS = 128
@@ -82,6 +83,7 @@ class Labels:
         histogram: (BINS,) normalised residuals.
         sample: What the map says at the points.
         surface: Pieces of surface, None where they are not asked.
+        hidden: (h, w) bool, pixels without a reading that hide something static; None where they are not asked for.
     """
 
     static_probability: NDArray[np.float32]
@@ -90,6 +92,7 @@ class Labels:
     histogram: NDArray[np.int64]
     sample: MapSample
     surface: surfaces.Pieces | None = None
+    hidden: NDArray[np.bool_] | None = None
 
 
 class DynamicDetector:
@@ -99,12 +102,14 @@ class DynamicDetector:
         self.config = config
         self.sensor = sensor
         self.memory = surfaces.StandStill(config)
+        self.background = Background(config)
         self.moving: NDArray[np.bool_] | None = None
         self._cut: tuple[Level, surfaces.Pieces] | None = None
 
     def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
         """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
         self.memory.begin(timestamp)
+        self.background.begin(timestamp)
         self.moving = moving
 
     def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
@@ -150,7 +155,9 @@ class DynamicDetector:
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            seen_free, rested = self.memory.views(level, T_world_camera, np.float32(1.5) * noise.astype(np.float32))
+            unknown = float(np.mean(sample.place[level.depth > 0] == NOTHING)) if level.depth.any() else 0.0
+            reach = np.float32(1.5) * noise.astype(np.float32)
+            seen_free, rested = self.memory.views(level, T_world_camera, reach, unknown)
             evidence[(sample.place == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
@@ -166,7 +173,20 @@ class DynamicDetector:
                 dynamic = dynamic | (self.moving & ~rested)
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
-        return Labels(probability, dynamic, mixture, histogram, sample, surface)
+        hidden = self.background.hidden(exposed(level, exposure), T_world_camera) if self.config.free_space else None
+        return Labels(probability, dynamic, mixture, histogram, sample, surface, hidden)
+
+    def remember(
+        self, level: Level, T_world_camera: NDArray[np.float64], exposure: tuple[float, float], labels: Labels
+    ) -> None:
+        """Take over a frame that was tracked: what the next one is compared with."""
+        self.memory.remember(level, T_world_camera, labels.dynamic, labels.surface)
+        self.background.update(exposed(level, exposure), T_world_camera, labels.dynamic)
+
+    def forget(self) -> None:
+        """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
+        self.memory.forget()
+        self.background.forget()
 
     def _sigma(self, depth: NDArray[np.float32], volume: TsdfVolume) -> NDArray[np.float32]:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
@@ -253,6 +273,8 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 
     low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, _ellipse(2))
     low[(level.depth > 0) & ~labels.dynamic] = 0
+    if labels.hidden is not None:
+        low[labels.hidden] = 1
     return full_size(low > 0, level.depth, depth)
 
 

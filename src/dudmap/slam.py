@@ -213,7 +213,7 @@ class Slam:
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
-            self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
+            self.detector.remember(level, tracked.T_world_camera, tracked.exposure, labels)
 
     def _as_recorded(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
@@ -424,7 +424,7 @@ class Slam:
     def _lose(self, timestamp: float) -> None:
         self.motion.lost(timestamp)
         self.health.lost()
-        self.detector.memory.forget()
+        self.detector.forget()
         self._moved = None
         self._lost_since = timestamp if self._lost_since is None else self._lost_since
 
@@ -494,7 +494,10 @@ class Slam:
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            labels = self.detector.detect(self.reference, level, tracked.T_world_camera, tracked.exposure)
+            coarse = self._tracked(levels)[0]
+            weights = self._expected([coarse], self._unmasked([coarse], known)) or [np.ones_like(coarse.depth)]
+            T_depth = self.tracker.depth_pose(self.reference, coarse, tracked.T_world_camera, weights[0])
+            labels = self.detector.detect(self.reference, level, T_depth, tracked.exposure)
             if known is None:
                 return labels
             masked = _reduced(known, level)

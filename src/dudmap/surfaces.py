@@ -41,6 +41,8 @@ SEAM = 3
 """What is thinner, pixels, may come from a pose that is a little off along a depth edge."""
 VIEWS = 6
 """Frames that are kept of `start_seconds` to know that."""
+UNKNOWN = 0.1
+"""Share of the readings in space the map has not seen from which on an old map counts as young, too."""
 
 
 MOVED, BODY = 1, 2
@@ -221,13 +223,15 @@ class StandStill:
         self._last: _Memory | None = None
         self._memories: deque[_Memory] = deque()
         self._young_until = -np.inf
-        self._views: list[_Memory] = []
-        self._complete = False  # they are those of another pass
+        self._views: list[_Memory] = []  # of the first seconds
+        self._recent: deque[_Memory] = deque()  # of the last moments
+        self._complete = False  # those of the first seconds come from another pass
 
     def start(self) -> None:
         """The frame that has begun is the first of a map."""
         self._young_until = self._now + YOUTH * self.config.start_seconds
         self._views = []
+        self._recent.clear()
 
     def know(self, other: "StandStill", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
         """Take over what another pass over the same frames has seen in the first seconds.
@@ -261,9 +265,12 @@ class StandStill:
         self._last = _Memory(self._now, level, T_world_camera, marks)
         if not self._memories or self._now - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
             self._memories.append(self._last)
-        if self._now < self._young_until and not self._complete:
-            if not self._views or self._now - self._views[-1].timestamp >= self.config.start_seconds / VIEWS:
+        if not self._recent or self._now - self._recent[-1].timestamp >= self.config.start_seconds / VIEWS:
+            self._recent.append(self._last)
+            if self._now < self._young_until and not self._complete:
                 self._views.append(self._last)
+        while self._now - self._recent[0].timestamp > self.config.start_seconds:
+            self._recent.popleft()
         while len(self._memories) > 1 and self._now - self._memories[1].timestamp >= self.config.settle_time:
             self._memories.popleft()
 
@@ -271,6 +278,7 @@ class StandStill:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
         self._last = None
         self._memories.clear()
+        self._recent.clear()
         self._views = self._views if self._complete else []
 
     def marks(self, level: Level, T_world_camera: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
@@ -282,16 +290,18 @@ class StandStill:
         return marks
 
     def views(
-        self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32]
+        self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32], unknown: float = 0.0
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """What single frames of the last moments say of each pixel, while the map is young; later nothing.
+        """What single frames of the last moments say of each pixel, while the map is young, or knows little of what is
+        in view; else nothing.
 
-        A second pass also asks the frames of the next moments.
+        In the first seconds a second pass also asks the frames of the next moments.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest gap between two readings of one point, metres.
+            unknown: Share of the readings that lie in space the map has not seen.
 
         Returns:
             (h, w) bool, pixels whose point lies in space through which those frames have seen farther,
@@ -300,7 +310,11 @@ class StandStill:
         import cv2
 
         free, there, alike, known, age = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(5))
-        for view in self._views if self._now < self._young_until else ():
+        if self._now < self._young_until:
+            views = self._views if self._complete else self._recent
+        else:
+            views = self._recent if unknown >= UNKNOWN else ()
+        for view in views:
             apart = abs(self._now - view.timestamp)
             if not 0 < apart <= self.config.start_seconds:
                 continue

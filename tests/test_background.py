@@ -1,0 +1,90 @@
+"""What a hole in the depth hides: points carried from image to image against plain geometry."""
+
+import numpy as np
+import pytest
+
+from dudmap import se3
+from dudmap.background import Background
+from dudmap.camera import Camera
+from dudmap.config import DynamicsConfig
+from dudmap.tracker import Level
+
+CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
+V, U = np.indices(CAMERA.shape)
+STILL = np.zeros(CAMERA.shape, bool)
+
+
+def wall(T: np.ndarray) -> Level:
+    """A smoothly shaded wall at z = 2 m, seen from a pose."""
+    rays = np.stack([(U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy, np.ones(U.shape)], -1) @ T[:3, :3].T
+    depth = (2 - T[2, 3]) / rays[..., 2]
+    x, y = (rays * depth[..., None] + T[:3, 3])[..., :2].transpose(2, 0, 1)
+    shade = 0.5 + 0.2 * np.sin(3 * x) * np.cos(2 * y)
+    return Level(CAMERA, depth.astype(np.float32), shade.astype(np.float32))
+
+
+def pose(i: int) -> np.ndarray:
+    return se3.exp(np.array([0.004, 0.002, 0.001, 0.0005, -0.001, 0.002]) * i)
+
+
+def seen(frames: int) -> Background:
+    background = Background(DynamicsConfig(settle_time=1.0))
+    for i in range(frames):
+        background.begin(i / 30)
+        assert not background.hidden(wall(pose(i)), pose(i)).any()
+        background.update(wall(pose(i)), pose(i), STILL)
+    return background
+
+
+def with_hole(i: int, shade: float | None) -> tuple[Level, np.ndarray]:
+    """The wall behind a disc without readings, of one shade or transparent."""
+    level = wall(pose(i))
+    disc = np.hypot(U - 70 - i / 2, V - 60) < 22
+    intensity = level.intensity if shade is None else np.where(disc, np.float32(shade), level.intensity)
+    return Level(CAMERA, np.where(disc, np.float32(0), level.depth), intensity.astype(np.float32)), disc
+
+
+@pytest.mark.parametrize("shade", [0.05, 0.95, None])
+def test_a_hole_hides_the_wall_if_it_looks_unlike_it(shade):
+    background = seen(15)
+    for i in range(15, 35):
+        level, disc = with_hole(i, shade)
+        background.begin(i / 30)
+        hidden = background.hidden(level, pose(i))
+        background.update(level, pose(i), STILL)
+        assert not hidden[~disc].any()
+        assert hidden[disc].mean() > 0.85 if shade else not hidden.any()
+    # what has not been read for the settle time is not known any more
+    background.begin(3.0)
+    assert not background.hidden(level, pose(34)).any()
+
+
+def test_what_was_seen_for_a_moment_or_in_another_world_is_no_background():
+    level, _ = with_hole(5, 0.05)
+    passing = seen(5)
+    passing.begin(5 / 30)
+    assert not passing.hidden(level, pose(5)).any()
+    background = seen(15)
+    background.forget()
+    background.begin(0.5)
+    assert not background.hidden(level, pose(5)).any()
+
+
+def test_a_seam_is_not_hidden():
+    """The sky above a wall: its edge wanders by a pixel or two."""
+    background = seen(15)
+    level = wall(pose(15))
+    seam = (V >= 50) & (V < 54)
+    background.begin(0.5)
+    sky = Level(CAMERA, np.where(seam, np.float32(0), level.depth), np.where(seam, np.float32(1), level.intensity))
+    assert not background.hidden(sky, pose(15)).any()
+
+
+def test_what_moved_is_no_background():
+    background = Background(DynamicsConfig())
+    for i in range(15):
+        background.begin(i / 30)
+        background.hidden(wall(pose(i)), pose(i))
+        background.update(wall(pose(i)), pose(i), ~STILL)
+    background.begin(0.5)
+    assert not background.hidden(with_hole(15, 0.05)[0], pose(15)).any()
