@@ -91,6 +91,17 @@ def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recordin
     assert len(slam.trajectory) == 11
 
 
+def test_a_turn_that_no_prediction_expects_is_followed():
+    sequence = synthetic.sequence("room", movers=(), frames=14, camera=SMALL, seed=1)
+    slam = Slam(sequence.camera, Config().override(["dynamics.start_seconds=0.1", "relocalization.enabled=false"]))
+    results = [slam.process(sequence[index]) for index in range(13)]
+    predict = slam.motion.predict
+    slam.motion.predict = lambda timestamp: predict(timestamp) @ se3.exp(np.array([0, 0, 0, 0, np.radians(6.0), 0]))
+    results.append(slam.process(sequence[13]))
+    assert results[-1].state == "tracked", results[-1].lost_reason
+    assert errors(sequence, results)[-1] < 0.02
+
+
 def test_another_room_is_never_taken_for_this_one(recording):
     sequence, frames = recording
     slam = Slam(sequence.camera)

@@ -8,6 +8,10 @@ from dudmap.tracker import TrackingResult
 
 MEMORY = 30
 """Tracked frames that are remembered."""
+DARK = 0.005
+"""Intensity differences below this are as good as none."""
+UNUSUAL_RESIDUAL, UNUSUAL_COLOR = 1.5, 1.8
+"""A registration whose residuals, or intensity differences, are more than this times the usual ones may be wrong."""
 
 
 class TrackingHealth:
@@ -45,6 +49,18 @@ class TrackingHealth:
         if tracked.color_residual > (max(0.02, 2.5 * color) if strict else max(0.03, 4.0 * color)):
             return f"the image differs by {tracked.color_residual:.1%} from the map, {color:.1%} were usual"
         return ""
+
+    def misfit(self, tracked: TrackingResult) -> tuple[float, float]:
+        """Residual and intensity difference over what was usual; (1, 1) before anything is."""
+        if len(self._residuals) < 5:
+            return 1.0, 1.0
+        residual, color = (float(np.median(q)) for q in (self._residuals, self._colors))
+        return tracked.residual / max(residual, 1e-6), tracked.color_residual / max(color, DARK)
+
+    def unusual(self, tracked: TrackingResult) -> bool:
+        """Whether a registration is bad enough to be worth another one from elsewhere."""
+        residual, color = self.misfit(tracked)
+        return not tracked.converged or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR
 
     def tracked(self, tracked: TrackingResult) -> None:
         """Take over a registration that passed."""

@@ -77,21 +77,20 @@ class Parallax:
     Args:
         seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found. 0 turns it
             off, later too.
+
+    Attributes:
+        active: Whether the next frame is to be compared with the remembered one in any case.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
         self._before: tuple[Level, Level, Pieces, NDArray[np.bool_] | None] | None = None
+        self.active = False
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
-
-    @property
-    def active(self) -> bool:
-        """Whether the next frame is to be compared with the one before it."""
-        return self._before is not None
 
     def young(self, timestamp: float) -> bool:
         """Whether the map cannot know yet what moves."""
@@ -102,17 +101,17 @@ class Parallax:
         covered = moving is not None and np.count_nonzero(moving) > COVERED * np.count_nonzero(small.depth)
         return bool(self.young(timestamp) or (covered and self.seconds > 0 and np.isfinite(self._longest)))
 
-    def remember(self, level: Level, small: Level, surface: Pieces, moving: NDArray[np.bool_] | None = None) -> None:
+    def remember(
+        self, timestamp: float, level: Level, small: Level, surface: Pieces, moving: NDArray[np.bool_] | None = None
+    ) -> None:
         """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
         self._before = level, small, surface, moving
-
-    def forget(self) -> None:
-        """Compare no more, until a frame is remembered again."""
-        self._before = None
+        self.active = self.wanted(timestamp, small, moving)
 
     def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
-        """The static world's motion since the remembered frame, and what does not follow it."""
-        assert self._before is not None
+        """The static world's motion since the remembered frame, and what does not follow it; None if unknown."""
+        if self._before is None:
+            return None
         before, small_before, surface_before, moved = self._before
         motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
         if motion is None or not self.young(timestamp):

@@ -33,6 +33,8 @@ AS_EXPECTED = 0.02
 """Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
 CLEARLY = 0.95
 """A pose explains an image clearly better than another if its cost is below this share of the other's."""
+SAME_START = 0.01, 0.25
+"""Poses nearer to each other than this (m, deg) lead to the same registration."""
 LEAST_KNOWN = 0.09
 """Share of the readings that must rest on a surface of the map where most of the others move."""
 
@@ -169,6 +171,8 @@ class Slam:
         T_init, moving = self._expect(observation, levels, clock)
         self.detector.begin(frame.timestamp, moving)
         tracked, labels = self._register(levels, T_init, known, clock)
+        if self.health.unusual(tracked):
+            tracked, labels = self._second_start(observation, levels, tracked, labels, known, clock)
         reason = (
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
@@ -297,11 +301,10 @@ class Slam:
         return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
 
     def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
+        if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
+            return
         level, small = self._compared(levels)
-        if self.parallax.wanted(timestamp, small, self._moved):
-            self.parallax.remember(level, small, self.detector.pieces(small, self.volume), self._moved)
-        else:
-            self.parallax.forget()
+        self.parallax.remember(timestamp, level, small, self.detector.pieces(small, self.volume), self._moved)
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
@@ -336,6 +339,36 @@ class Slam:
                 exposure=tracked.exposure,
             )
         return tracked, labels
+
+    def _second_start(
+        self,
+        observation: Observation,
+        levels: dict[int, Level],
+        tracked: TrackingResult,
+        labels: Labels | None,
+        known: NDArray[np.bool_] | None,
+        clock: "Clock",
+    ) -> tuple[TrackingResult, Labels | None]:
+        """Register once more from where the last image and this one put the camera, and take what fits the map better.
+
+        A hand that turns back, or frames that are missing, leave a first guess beyond the reach of the registration.
+        """
+        with clock("parallax"):
+            level, small = self._compared(levels)
+            motion = self.parallax.compare(
+                observation.timestamp, level, small, self.detector.pieces(small, self.volume)
+            )
+        if motion is None:
+            return tracked, labels
+        T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
+        if agree(T_seen, tracked.T_world_camera, *SAME_START):
+            return tracked, labels
+        again, labels_again = self._register(levels, T_seen, known, clock)
+        if not tracked.converged:
+            better = again.converged
+        else:
+            better = again.converged and sum(self.health.misfit(again)) < CLEARLY * sum(self.health.misfit(tracked))
+        return (again, labels_again) if better else (tracked, labels)
 
     def _unmasked(self, levels: list[Level], known: NDArray[np.bool_] | None) -> list[NDArray[np.float32]] | None:
         """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
