@@ -161,6 +161,19 @@ def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
     assert largest[0.0] > 0.1  # so that it was the parallax that helped
 
 
+def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():
+    sequence = synthetic.sequence(
+        "room", movers=("creeper",), start_dynamic=True, camera_path="orbit", frames=32, camera=CAMERA, seed=13
+    )
+    slam = Slam(CAMERA, Config())
+    results = [slam.process(sequence[index]) for index in range(len(sequence))]
+    truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
+    off = np.linalg.norm(truth[-1, :3, 3] - results[-1].T_world_camera[:3, 3])
+    assert off < 0.045, f"{off:.3f} m"
+    mask = sequence.mask(31)
+    assert results[-1].dynamic_mask[mask].mean() > 0.5
+
+
 def test_a_second_pass_of_a_short_recording_knows_who_stood_in_its_first_frame(crowd):
     first = Slam(crowd.camera)
     once = [first.process(crowd[index]).dynamic_mask for index in range(len(crowd))]

@@ -21,7 +21,7 @@ from dudmap.history import History
 from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
-from dudmap.parallax import Parallax
+from dudmap.parallax import Parallax, several
 from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
@@ -208,8 +208,8 @@ class Slam:
         self.health.tracked(tracked)
         self._lost_since = None
         self._moved = None if labels is None else labels.dynamic
-        self._compare_with_next(timestamp, levels)
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
+        self._compare_with_next(timestamp, levels)
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
             self.detector.memory.remember(level, tracked.T_world_camera, labels.dynamic, labels.surface)
@@ -256,9 +256,8 @@ class Slam:
             return T_init, None
         with clock("parallax"):
             level, small = self._compared(levels)
-            motion = self.parallax.compare(
-                observation.timestamp, level, small, self.detector.pieces(small, self.volume)
-            )
+            surface = self.detector.pieces(small, self.volume)
+            motion = self.parallax.compare(observation.timestamp, level, small, surface)
             if motion is None:
                 return T_init, None
             T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
@@ -269,6 +268,8 @@ class Slam:
             elif self._fits_better(T_init, T_seen, self._tracked(levels)[0]):
                 return T_init, None  # what most corners follow is not the static world
             moving = motion.moving_after
+            if not several(moving, small):  # else something slow hardly drags the camera on its own
+                moving = moving | self.parallax.slow(observation.timestamp, T_seen, level, small, surface)
             if not self.parallax.young(observation.timestamp):  # elsewhere the map knows better what moves
                 moving = moving & (self._place(small, T_seen) == NOTHING)
             return T_seen, moving
@@ -304,7 +305,8 @@ class Slam:
         if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
             return
         level, small = self._compared(levels)
-        self.parallax.remember(timestamp, level, small, self.detector.pieces(small, self.volume), self._moved)
+        pieces, T_world_camera = self.detector.pieces(small, self.volume), self.atlas.poses[-1].T_world_camera
+        self.parallax.remember(timestamp, T_world_camera, level, small, pieces, self._moved)
 
     def _register(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
