@@ -66,7 +66,8 @@ class TrackingHealth:
         """Take over a registration that passed."""
         self._residuals.append(tracked.residual)
         self._shares.append(tracked.inlier_share)
-        self._colors.append(tracked.color_residual)
+        if np.isfinite(tracked.color_residual):
+            self._colors.append(tracked.color_residual)
         self.recovering = False
 
     def lost(self) -> None:

@@ -33,6 +33,8 @@ AS_EXPECTED = 0.02
 """Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
 CLEARLY = 0.95
 """A pose explains an image clearly better than another if its cost is below this share of the other's."""
+FLAT = 0.01
+"""An image whose intensities (0..1) have a smaller standard deviation shows nothing: black, or blinded."""
 SAME_START = 0.01, 0.25
 """Poses nearer to each other than this (m, deg) lead to the same registration."""
 LEAST_KNOWN = 0.09
@@ -50,6 +52,7 @@ class FrameResult:
         T_world_camera: (4, 4), None if lost.
         fused: Whether the frame changed the map.
         skipped_similar: Whether it was left out of the fusion as a redundant view.
+        blind: Whether its image showed nothing (black, say) and the distances alone gave the pose; it is not fused.
         relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
         dynamic_mask: (H, W) bool, in the image as it was recorded.
         dynamic_share: Share of the readings that lie in the mask.
@@ -78,6 +81,7 @@ class FrameResult:
     movers: tuple[Mover, ...] = ()
     submap: int = 0
     corrected: bool = False
+    blind: bool = False
 
 
 class Slam:
@@ -96,6 +100,8 @@ class Slam:
         self.preprocess = Preprocessor(camera, self.config.preprocess)
         self.camera = self.preprocess.camera
         self.tracker = Tracker(self.config.tracker, self.config.sensor)
+        by_distance = self.config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
+        self.blind_tracker = Tracker(by_distance, self.config.sensor)
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
@@ -119,6 +125,7 @@ class Slam:
         self._lost_since: float | None = None
         self._T_world_fused: NDArray[np.float64] | None = None
         self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
+        self._blind, self._map_blind = False, False  # the present image, and that of the map's first frame, are flat
         self._untested = 0  # frames that are still fused without the similarity test
 
     @property
@@ -164,7 +171,10 @@ class Slam:
             observation = self.preprocess(frame)
             levels = self._levels(observation)
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
+            flat = bool(self._tracked(levels)[0].intensity.std() < FLAT)
+            self._blind = flat and not self._map_blind
         if self.reference.is_empty:
+            self._map_blind = flat
             return self._as_recorded(self._start(observation, levels, known, clock))
         if not self.atlas.poses and self.config.dynamics.method == "em":  # a second pass begins
             self.parallax.start(frame.timestamp)
@@ -192,12 +202,14 @@ class Slam:
             )
         self._keep(observation.timestamp, levels, tracked, labels)
         with clock("similarity"):
-            redundant = self._redundant(observation, tracked.T_world_camera)
+            redundant = not self._blind and self._redundant(observation, tracked.T_world_camera)
+        fused = not (redundant or self._blind)
         result = self._result(
-            observation, clock, levels, labels, known, tracked, "", fused=not redundant, relocalized=bool(recognised)
+            observation, clock, levels, labels, known, tracked, "", fused=fused, relocalized=bool(recognised)
         )
-        self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
-        if not redundant:
+        if not self._blind:
+            self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
+        if fused:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
         return self._as_recorded(self._close_loop(observation, levels, result, clock))
@@ -209,6 +221,8 @@ class Slam:
         self._lost_since = None
         self._moved = None if labels is None else labels.dynamic
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
+        if self._blind:
+            return
         self._compare_with_next(timestamp, levels)
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
@@ -317,22 +331,23 @@ class Slam:
         """
         tracked_levels = self._tracked(levels)
         unmasked = self._unmasked(tracked_levels, known)
+        tracker = self.blind_tracker if self._blind else self.tracker
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
-                tracked = self.tracker.align(self.reference, tracked_levels, T_init, unmasked)
+                tracked = tracker.align(self.reference, tracked_levels, T_init, unmasked)
             if self.config.dynamics.method == "none":
                 return tracked, None
             return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
             weights = self._expected(tracked_levels, unmasked)
-            tracked = self.tracker.align(self.reference, tracked_levels[:split], T_init, weights)
+            tracked = tracker.align(self.reference, tracked_levels[:split], T_init, weights)
         labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             enough = split < len(tracked_levels) and tracked.settled and self._as_expected(labels)
             first = split if enough else split - 1
             again = tracked_levels[first:]
-            tracked = self.tracker.align(
+            tracked = tracker.align(
                 self.reference,
                 again,
                 tracked.T_world_camera,
@@ -340,6 +355,8 @@ class Slam:
                 first_level=first,
                 exposure=tracked.exposure,
             )
+        if self._blind:
+            tracked = replace(tracked, color_residual=np.nan)
         return tracked, labels
 
     def _second_start(
@@ -479,7 +496,7 @@ class Slam:
     ) -> FrameResult:
         """Look for a place seen before; where the tracking has drifted since, everything moves."""
         tracked = result.tracking
-        if self.atlas.history is None or tracked is None:
+        if self.atlas.history is None or tracked is None or self._blind:
             return result
         with clock("loops"):
             tracked_levels = self._tracked(levels)
@@ -609,8 +626,8 @@ class Slam:
                     movers = tuple(self.fusion.update(observation, movers, level, pose, exposure))
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
-            fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
-            clock.timings, relocalized, movers, self.atlas.current,
+            fused, not (fused or reason or self._blind), mask, _share(mask, observation), residuals, labels, tracked,
+            clock.timings, relocalized, movers, self.atlas.current, blind=self._blind,
         )  # fmt: skip
 
 
