@@ -66,12 +66,14 @@ class DominantMotion:
     Attributes:
         T_after_before: (4, 4) the static world's motion from the first camera's frame to the second's.
         moving_before, moving_after: (h, w) bool, pixels with a reading that do not follow it, in either image.
+        resting_after: (h, w) bool, pieces of surface that do, by their corners; what has no corners is neither.
         share: Share of the corners, each counted by the surface it stands for, that follow it.
     """
 
     T_after_before: NDArray[np.float64]
     moving_before: NDArray[np.bool_]
     moving_after: NDArray[np.bool_]
+    resting_after: NDArray[np.bool_]
     share: float
 
 
@@ -225,6 +227,7 @@ def dominant_motion(
         T,
         _spread(small[0], surfaces[0], points, places[0], moves, whole),
         _spread(small[1], surfaces[1], points_after[seen], places[1], moves[seen], whole),
+        _rest(surfaces[1], places[1], moves[seen]),
         share,
     )
 
@@ -415,6 +418,16 @@ def _spread(
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
     out[rows, columns] = votes >= 2
     return out
+
+
+def _rest(surface: Pieces, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (h, w) of pieces that hold enough corners at rest, and not too many others; arguments as above."""
+    piece = surface.labels[pixels[:, 1], pixels[:, 0]]
+    resting = np.bincount(piece[~moves], minlength=surface.count + 1)
+    total = np.bincount(piece, minlength=surface.count + 1)
+    rest = (resting >= FEWEST_MOVING) & (resting > (1 - AGREED) * total)
+    rest[0] = False
+    return rest[surface.labels]
 
 
 def _points(camera: Camera, u: NDArray, v: NDArray, z: NDArray[np.float64]) -> NDArray[np.float64]:

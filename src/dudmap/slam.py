@@ -125,6 +125,8 @@ class Slam:
         self._lost_since: float | None = None
         self._T_world_fused: NDArray[np.float64] | None = None
         self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
+        self._unproven: NDArray[np.bool_] | None = None  # label image: what nothing shows to rest, while a crowd moves
+        self._crowd = False  # most of the view has moved from the first frame on
         self._blind, self._map_blind = False, False  # the present image, and that of the map's first frame, are flat
         self._untested = 0  # frames that are still fused without the similarity test
 
@@ -186,7 +188,9 @@ class Slam:
         reason = (
             tracked.reason
             or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
-            or self.health.doubt(tracked)
+            or self.health.doubt(
+                tracked, crowded=labels is not None and _mostly(labels.dynamic, self._compared(levels)[1])
+            )
             or self._undecided(levels, labels, tracked)
         )
         recognised = self._recognise(observation, levels, known, clock) if reason else None
@@ -248,6 +252,7 @@ class Slam:
                 self._integrate(observation, T, nothing)
             if self.config.dynamics.method == "em":
                 self.parallax.start(observation.timestamp)
+                self._crowd = True
                 self._first = observation, nothing
                 self.detector.begin(observation.timestamp)
                 self.detector.memory.start()
@@ -266,6 +271,7 @@ class Slam:
         """First guess of the pose; with what moves (h, w) while the map is young, or movers hide most of the view:
         both then come from the last image and this one."""
         T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
+        self._unproven = None
         if not self.parallax.active:
             return T_init, None
         with clock("parallax"):
@@ -284,6 +290,9 @@ class Slam:
             moving = motion.moving_after
             if not several(moving, small):  # else something slow hardly drags the camera on its own
                 moving = moving | self.parallax.slow(observation.timestamp, T_seen, level, small, surface)
+            self._crowd = self._crowd and self.parallax.young(observation.timestamp) and _mostly(moving, small)
+            if self._crowd:
+                self._unproven = ~motion.resting_after
             if not self.parallax.young(observation.timestamp):  # elsewhere the map knows better what moves
                 moving = moving & (self._place(small, T_seen) == NOTHING)
             return T_seen, moving
@@ -391,7 +400,7 @@ class Slam:
 
     def _unmasked(self, levels: list[Level], known: NDArray[np.bool_] | None) -> list[NDArray[np.float32]] | None:
         """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
-        masks = [mask for mask in (known, self.detector.moving) if mask is not None]
+        masks = [mask for mask in (known, self.detector.moving, self._unproven) if mask is not None]
         if not masks:
             return None
         return [(~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
@@ -553,6 +562,8 @@ class Slam:
         import cv2
 
         static = labels.static_probability
+        if self._unproven is not None:
+            static = np.where(self._unproven, np.float32(0), static)
         return [
             np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
             for level in levels
@@ -637,6 +648,11 @@ def _reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
     size = level.depth.shape[::-1]
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
+
+
+def _mostly(moving: NDArray[np.bool_], level: Level) -> bool:
+    """Whether more than half of the readings of an image move (h, w)."""
+    return bool(2 * np.count_nonzero(moving) > np.count_nonzero(level.depth))
 
 
 def _share(mask: NDArray[np.bool_], observation: Observation) -> float:
