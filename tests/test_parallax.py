@@ -9,9 +9,11 @@ import pytest
 from dudmap import parallax, se3, synthetic
 from dudmap.camera import Camera
 from dudmap.config import Config
+from dudmap.health import TrackingHealth
 from dudmap.kernels import labeling
 from dudmap.parallax import _flow_jacobian, _projected, _rests_as_well, dominant_motion
 from dudmap.slam import Slam
+from dudmap.tracker import TrackingResult
 
 CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 
@@ -159,6 +161,44 @@ def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
         largest[seconds] = np.linalg.norm(off, axis=1).max()
     assert largest[1.0] < 0.02
     assert largest[0.0] > 0.1  # so that it was the parallax that helped
+
+
+def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
+    sequence = synthetic.sequence("room", coverage=0.7, speed=1.0, start_dynamic=True, frames=20, camera=CAMERA, seed=0)
+    slam = Slam(CAMERA, Config())
+    truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
+    results = [slam.process(sequence[index]) for index in range(len(sequence))]
+    off = [
+        np.linalg.norm(T[:3, 3] - result.T_world_camera[:3, 3])
+        for T, result in zip(truth, results, strict=True)
+        if result.fused
+    ]
+    assert len(off) > 10
+    assert max(off) < 0.08, f"{max(off):.3f} m"
+
+
+def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
+    good = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.002, 0.01, 3, 0.01)
+    health = TrackingHealth()
+    for _ in range(6):
+        health.tracked(good)
+    dragged = replace(good, residual=0.0045)
+    assert not health.doubt(dragged)
+    assert "4.5 mm" in health.doubt(dragged, crowded=True)
+    assert not health.doubt(replace(good, residual=0.0035), crowded=True)
+
+
+def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():
+    sequence = synthetic.sequence(
+        "room", movers=("creeper",), start_dynamic=True, camera_path="orbit", frames=32, camera=CAMERA, seed=13
+    )
+    slam = Slam(CAMERA, Config())
+    results = [slam.process(sequence[index]) for index in range(len(sequence))]
+    truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
+    off = np.linalg.norm(truth[-1, :3, 3] - results[-1].T_world_camera[:3, 3])
+    assert off < 0.045, f"{off:.3f} m"
+    mask = sequence.mask(31)
+    assert results[-1].dynamic_mask[mask].mean() > 0.5
 
 
 def test_a_second_pass_of_a_short_recording_knows_who_stood_in_its_first_frame(crowd):

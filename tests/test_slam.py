@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -89,6 +90,33 @@ def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recordin
     again = slam.process(frames[11])
     assert again.state == "tracked"
     assert len(slam.trajectory) == 11
+
+
+@pytest.mark.parametrize("grey", [0, 255])
+def test_a_camera_that_is_blinded_goes_on_by_distances_and_fuses_nothing(recording, grey):
+    sequence, frames = recording
+    slam = Slam(sequence.camera)
+    results = [slam.process(frame) for frame in frames[:10]]
+    before = slam.volume.num_blocks
+    for frame in frames[10:18]:
+        results.append(slam.process(replace(frame, color=np.full_like(frame.color, grey))))
+    assert all(result.state == "tracked" for result in results), [result.lost_reason for result in results]
+    assert [(result.blind, result.fused) for result in results[10:]] == [(True, False)] * 8
+    assert slam.volume.num_blocks == before
+    results.append(slam.process(frames[18]))
+    assert (results[-1].blind, results[-1].fused) == (False, True)
+    assert errors(sequence, results).max() < 0.05
+
+
+def test_a_turn_that_no_prediction_expects_is_followed():
+    sequence = synthetic.sequence("room", movers=(), frames=14, camera=SMALL, seed=1)
+    slam = Slam(sequence.camera, Config().override(["dynamics.start_seconds=0.1", "relocalization.enabled=false"]))
+    results = [slam.process(sequence[index]) for index in range(13)]
+    predict = slam.motion.predict
+    slam.motion.predict = lambda timestamp: predict(timestamp) @ se3.exp(np.array([0, 0, 0, 0, np.radians(6.0), 0]))
+    results.append(slam.process(sequence[13]))
+    assert results[-1].state == "tracked", results[-1].lost_reason
+    assert errors(sequence, results)[-1] < 0.02
 
 
 def test_another_room_is_never_taken_for_this_one(recording):

@@ -8,6 +8,12 @@ from dudmap.tracker import TrackingResult
 
 MEMORY = 30
 """Tracked frames that are remembered."""
+SENSOR = 0.0015
+"""Residuals of this, metres at one metre depth, are good with any sensor."""
+DARK = 0.005
+"""Intensity differences below this are as good as none."""
+UNUSUAL_RESIDUAL, UNUSUAL_COLOR = 1.5, 1.8
+"""A registration whose residuals, or intensity differences, are more than this times the usual ones may be wrong."""
 
 
 class TrackingHealth:
@@ -24,19 +30,23 @@ class TrackingHealth:
         self._colors: deque[float] = deque(maxlen=MEMORY)
         self.recovering = False
 
-    def doubt(self, tracked: TrackingResult, *, recognised: bool = False) -> str:
+    def doubt(self, tracked: TrackingResult, *, recognised: bool = False, crowded: bool = False) -> str:
         """Sentence on what is much worse than before, empty if nothing is.
 
         Args:
             tracked: The registration.
             recognised: Whether features put the camera there too; then the distances alone need not be as usual, and
                 less of the view need be known: where the camera looks now, a young map may end.
+            crowded: Whether most of the view moves: a part of that, taken for the world, then drags the pose along, and
+                the distances are the first to tell.
         """
         if len(self._residuals) < 5:
             return ""
         strict = self.recovering or recognised
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
-        worst = 4.0 if not strict else 2.5 if recognised else 1.6
+        worst = 2.5 if recognised else 1.6 if self.recovering else 4.0
+        if crowded and not strict:
+            worst, residual = 2.0, max(residual, SENSOR)
         if tracked.residual > worst * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
         if self.recovering and not recognised and tracked.inlier_share < 0.6 * share:
@@ -46,11 +56,24 @@ class TrackingHealth:
             return f"the image differs by {tracked.color_residual:.1%} from the map, {color:.1%} were usual"
         return ""
 
+    def misfit(self, tracked: TrackingResult) -> tuple[float, float]:
+        """Residual and intensity difference over what was usual; (1, 1) before anything is."""
+        if len(self._residuals) < 5:
+            return 1.0, 1.0
+        residual, color = (float(np.median(q)) for q in (self._residuals, self._colors))
+        return tracked.residual / max(residual, 1e-6), tracked.color_residual / max(color, DARK)
+
+    def unusual(self, tracked: TrackingResult) -> bool:
+        """Whether a registration is bad enough to be worth another one from elsewhere."""
+        residual, color = self.misfit(tracked)
+        return not tracked.converged or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR
+
     def tracked(self, tracked: TrackingResult) -> None:
         """Take over a registration that passed."""
         self._residuals.append(tracked.residual)
         self._shares.append(tracked.inlier_share)
-        self._colors.append(tracked.color_residual)
+        if np.isfinite(tracked.color_residual):
+            self._colors.append(tracked.color_residual)
         self.recovering = False
 
     def lost(self) -> None:

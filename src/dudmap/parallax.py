@@ -6,6 +6,7 @@ does not follow the motion of most of the visible surface moves. Errors are coun
 counts no more than a far wall.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 import numpy as np
@@ -51,6 +52,9 @@ COVERED = 0.5
 nothing of free space."""
 MOVED_SAY = 0.1
 """What a corner on something known to move counts, against one that is not."""
+APART, LONGEST = 0.1, 0.4
+"""What is too slow to be seen from one image to the next is seen over this time and more, seconds, and at most that:
+the images of a young map are kept at these intervals."""
 SEVERAL = 0.02
 """Share of the readings that must move for it to be more than noise."""
 
@@ -62,12 +66,14 @@ class DominantMotion:
     Attributes:
         T_after_before: (4, 4) the static world's motion from the first camera's frame to the second's.
         moving_before, moving_after: (h, w) bool, pixels with a reading that do not follow it, in either image.
+        resting_after: (h, w) bool, pieces of surface that do, by their corners; what has no corners is neither.
         share: Share of the corners, each counted by the surface it stands for, that follow it.
     """
 
     T_after_before: NDArray[np.float64]
     moving_before: NDArray[np.bool_]
     moving_after: NDArray[np.bool_]
+    resting_after: NDArray[np.bool_]
     share: float
 
 
@@ -77,21 +83,21 @@ class Parallax:
     Args:
         seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found. 0 turns it
             off, later too.
+
+    Attributes:
+        active: Whether the next frame is to be compared with the remembered one in any case.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
         self._before: tuple[Level, Level, Pieces, NDArray[np.bool_] | None] | None = None
+        self._older: deque[tuple[float, NDArray[np.float64], Level, Level, Pieces]] = deque()
+        self.active = False
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
-
-    @property
-    def active(self) -> bool:
-        """Whether the next frame is to be compared with the one before it."""
-        return self._before is not None
 
     def young(self, timestamp: float) -> bool:
         """Whether the map cannot know yet what moves."""
@@ -102,24 +108,60 @@ class Parallax:
         covered = moving is not None and np.count_nonzero(moving) > COVERED * np.count_nonzero(small.depth)
         return bool(self.young(timestamp) or (covered and self.seconds > 0 and np.isfinite(self._longest)))
 
-    def remember(self, level: Level, small: Level, surface: Pieces, moving: NDArray[np.bool_] | None = None) -> None:
+    def remember(
+        self,
+        timestamp: float,
+        T_world_camera: NDArray[np.float64],
+        level: Level,
+        small: Level,
+        surface: Pieces,
+        moving: NDArray[np.bool_] | None = None,
+    ) -> None:
         """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
         self._before = level, small, surface, moving
-
-    def forget(self) -> None:
-        """Compare no more, until a frame is remembered again."""
-        self._before = None
+        self.active = self.wanted(timestamp, small, moving)
+        if not self.young(timestamp):
+            self._older.clear()
+        elif not self._older or timestamp - self._older[-1][0] >= APART:
+            self._older.append((timestamp, T_world_camera, level, small, surface))
 
     def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
-        """The static world's motion since the remembered frame, and what does not follow it."""
-        assert self._before is not None
+        """The static world's motion since the remembered frame, and what does not follow it; None if unknown."""
+        if self._before is None:
+            return None
         before, small_before, surface_before, moved = self._before
         motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
         if motion is None or not self.young(timestamp):
             return motion
-        if np.count_nonzero(motion.moving_after) > SEVERAL * np.count_nonzero(small.depth):
+        if several(motion.moving_after, small):
             self._until = min(timestamp + self.seconds, self._longest)
         return motion
+
+    def slow(
+        self, timestamp: float, T_world_camera: NDArray[np.float64], level: Level, small: Level, surface: Pieces
+    ) -> NDArray[np.bool_]:
+        """What has moved (h, w) since a somewhat older frame, as far as is known, while the map is young.
+
+        Args:
+            timestamp: Seconds, of the new frame.
+            T_world_camera: (4, 4) first guess of its pose.
+            level, small: The image in both resolutions.
+            surface: Its pieces.
+        """
+        while self._older and timestamp - self._older[0][0] > LONGEST:
+            self._older.popleft()
+        if not self._older or timestamp - self._older[0][0] < APART or not self.young(timestamp):
+            return np.zeros(small.depth.shape, dtype=bool)
+        _, T_world_before, before, small_before, surface_before = self._older[0]
+        T_expected = se3.inverse(T_world_camera) @ T_world_before
+        both = (small_before, small), (surface_before, surface)
+        motion = dominant_motion(before, level, *both, T_expected=T_expected, whole=True)
+        return np.zeros(small.depth.shape, dtype=bool) if motion is None else motion.moving_after
+
+
+def several(moving: NDArray[np.bool_], level: Level) -> bool:
+    """Whether so many readings of an image move (h, w) that it is more than noise."""
+    return bool(np.count_nonzero(moving) > SEVERAL * np.count_nonzero(level.depth))
 
 
 def dominant_motion(
@@ -128,6 +170,8 @@ def dominant_motion(
     small: tuple[Level, Level],
     surfaces: tuple[Pieces, Pieces],
     moved: NDArray[np.bool_] | None = None,
+    T_expected: NDArray[np.float64] | None = None,
+    whole: bool = False,
 ) -> DominantMotion | None:
     """Explain the corners' paths from one image to the next by one rigid motion; None where too few are left.
 
@@ -140,9 +184,11 @@ def dominant_motion(
         surfaces: Pieces of surface of both of these.
         moved: (h, w) bool at that resolution, what is known to move in the first image; it has little say in what the
             static world is.
+        T_expected: (4, 4) where the motion is looked for first; None: nowhere else than where it was.
+        whole: Only pieces most of whose corners move.
     """
     first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
-    pixels, targets, unlike = _followed(before, first, second)
+    pixels, targets, unlike = _followed(before, first, second, T_expected)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
@@ -179,14 +225,15 @@ def dominant_motion(
     places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
     return DominantMotion(
         T,
-        _spread(small[0], surfaces[0], points, places[0], moves),
-        _spread(small[1], surfaces[1], points_after[seen], places[1], moves[seen]),
+        _spread(small[0], surfaces[0], points, places[0], moves, whole),
+        _spread(small[1], surfaces[1], points_after[seen], places[1], moves[seen], whole),
+        _rest(surfaces[1], places[1], moves[seen]),
         share,
     )
 
 
 def _followed(
-    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8]
+    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8], T_expected: NDArray[np.float64] | None = None
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Corners (n, 2) int of the first image, their places (n, 2) in the second, found there and back, and what differs.
 
@@ -212,12 +259,13 @@ def _followed(
     if len(pixels) == 0:
         return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(
-        first, second, start, start.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
-    )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, there.copy(), winSize=(WINDOW, WINDOW), maxLevel=3
-    )
+    shift = np.zeros_like(start)
+    if T_expected is not None:
+        points = _points(before.camera, pixels[:, 0], pixels[:, 1], z[useful].astype(np.float64))
+        shift = _projected(T_expected, points, before.camera).astype(np.float32).reshape(-1, 1, 2) - start
+    search = dict(winSize=(WINDOW, WINDOW), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, start + shift, **search)
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there - shift, **search)
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
     good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
     return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
@@ -325,7 +373,12 @@ def _reprojection_error(
 
 
 def _spread(
-    level: Level, surface: Pieces, points: NDArray[np.float64], pixels: NDArray[np.int64], moves: NDArray[np.bool_]
+    level: Level,
+    surface: Pieces,
+    points: NDArray[np.float64],
+    pixels: NDArray[np.int64],
+    moves: NDArray[np.bool_],
+    only_whole: bool = False,
 ) -> NDArray[np.bool_]:
     """Moving pixels (h, w): those of pieces of surface whose corners move.
 
@@ -337,6 +390,7 @@ def _spread(
         points: (n, 3) the corners in space, metres.
         pixels: (n, 2) int, their pixels u, v.
         moves: (n,).
+        only_whole: Leave the pieces whose corners disagree.
     """
     from scipy.spatial import KDTree
 
@@ -350,6 +404,8 @@ def _spread(
     mixed = solid & ~whole & (moving >= 0.1 * total)
     whole[0] = mixed[0] = False
     out = whole[surface.labels]
+    if only_whole:
+        return out
     rows, columns = np.nonzero(mixed[surface.labels] & (level.depth > 0))
     if len(rows) == 0:
         return out
@@ -362,6 +418,16 @@ def _spread(
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
     out[rows, columns] = votes >= 2
     return out
+
+
+def _rest(surface: Pieces, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels (h, w) of pieces that hold enough corners at rest, and not too many others; arguments as above."""
+    piece = surface.labels[pixels[:, 1], pixels[:, 0]]
+    resting = np.bincount(piece[~moves], minlength=surface.count + 1)
+    total = np.bincount(piece, minlength=surface.count + 1)
+    rest = (resting >= FEWEST_MOVING) & (resting > (1 - AGREED) * total)
+    rest[0] = False
+    return rest[surface.labels]
 
 
 def _points(camera: Camera, u: NDArray, v: NDArray, z: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,11 +18,10 @@ from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
 from dudmap.history import History
-from dudmap.kernels.threads import beside
 from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
-from dudmap.parallax import Parallax
+from dudmap.parallax import Parallax, several
 from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
@@ -34,6 +33,10 @@ AS_EXPECTED = 0.02
 """Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
 CLEARLY = 0.95
 """A pose explains an image clearly better than another if its cost is below this share of the other's."""
+FLAT = 0.01
+"""An image whose intensities (0..1) have a smaller standard deviation shows nothing: black, or blinded."""
+SAME_START = 0.01, 0.25
+"""Poses nearer to each other than this (m, deg) lead to the same registration."""
 LEAST_KNOWN = 0.09
 """Share of the readings that must rest on a surface of the map where most of the others move."""
 
@@ -49,6 +52,7 @@ class FrameResult:
         T_world_camera: (4, 4), None if lost.
         fused: Whether the frame changed the map.
         skipped_similar: Whether it was left out of the fusion as a redundant view.
+        blind: Whether its image showed nothing (black, say) and the distances alone gave the pose; it is not fused.
         relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
         dynamic_mask: (H, W) bool, in the image as it was recorded.
         dynamic_share: Share of the readings that lie in the mask.
@@ -77,6 +81,7 @@ class FrameResult:
     movers: tuple[Mover, ...] = ()
     submap: int = 0
     corrected: bool = False
+    blind: bool = False
 
 
 class Slam:
@@ -95,6 +100,8 @@ class Slam:
         self.preprocess = Preprocessor(camera, self.config.preprocess)
         self.camera = self.preprocess.camera
         self.tracker = Tracker(self.config.tracker, self.config.sensor)
+        by_distance = self.config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
+        self.blind_tracker = Tracker(by_distance, self.config.sensor)
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
@@ -118,6 +125,9 @@ class Slam:
         self._lost_since: float | None = None
         self._T_world_fused: NDArray[np.float64] | None = None
         self._moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
+        self._unproven: NDArray[np.bool_] | None = None  # label image: what nothing shows to rest, while a crowd moves
+        self._crowd = False  # most of the view has moved from the first frame on
+        self._blind, self._map_blind = False, False  # the present image, and that of the map's first frame, are flat
         self._untested = 0  # frames that are still fused without the similarity test
 
     @property
@@ -163,19 +173,17 @@ class Slam:
             observation = self.preprocess(frame)
             levels = self._levels(observation)
             known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
+            flat = bool(self._tracked(levels)[0].intensity.std() < FLAT)
+            self._blind = flat and not self._map_blind
         if self.reference.is_empty:
+            self._map_blind = flat
             return self._as_recorded(self._start(observation, levels, known, clock))
         if not self.atlas.poses and self.config.dynamics.method == "em":  # a second pass begins
             self.parallax.start(frame.timestamp)
         T_init, moving = self._expect(observation, levels, clock)
         self.detector.begin(frame.timestamp, moving)
-        tracked, labels = self._register(levels, T_init, known, clock)
-        reason = (
-            tracked.reason
-            or self.motion.implausible(frame.timestamp, tracked.T_world_camera)
-            or self.health.doubt(tracked)
-            or self._undecided(levels, labels, tracked)
-        )
+        tracked, labels = self._register(observation, levels, T_init, known, clock)
+        reason = self._doubt(frame.timestamp, levels, tracked, labels)
         recognised = self._recognise(observation, levels, known, clock) if reason else None
         if recognised is not None:
             (tracked, labels), reason = recognised, ""
@@ -189,18 +197,15 @@ class Slam:
             )
         self._keep(observation.timestamp, levels, tracked, labels)
         with clock("similarity"):
-            redundant = self._redundant(observation, tracked.T_world_camera)
+            redundant = not self._blind and self._redundant(observation, tracked.T_world_camera)
+        fused = not (redundant or self._blind)
         result = self._result(
-            observation, clock, levels, labels, known, tracked, "", fused=not redundant, relocalized=bool(recognised)
+            observation, clock, levels, labels, known, tracked, "", fused=fused, relocalized=bool(recognised)
         )
-        movers = beside(self._follow, observation, levels, labels, tracked, clock)
-        try:
-            self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
-            if not redundant:
-                with clock("integrate"):
-                    self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
-        finally:
-            result = replace(result, movers=movers.result())
+        self._remember(observation, tracked.T_world_camera, result.dynamic_mask, clock)
+        if fused:
+            with clock("integrate"):
+                self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
         return self._as_recorded(self._close_loop(observation, levels, result, clock))
 
     def _keep(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> None:
@@ -209,8 +214,10 @@ class Slam:
         self.health.tracked(tracked)
         self._lost_since = None
         self._moved = None if labels is None else labels.dynamic
-        self._compare_with_next(timestamp, levels)
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
+        if self._blind:
+            return
+        self._compare_with_next(timestamp, levels)
         if labels is not None:
             level = levels[self._level(self.config.dynamics.width)]
             self.detector.remember(level, tracked.T_world_camera, tracked.exposure, labels)
@@ -235,6 +242,7 @@ class Slam:
                 self._integrate(observation, T, nothing)
             if self.config.dynamics.method == "em":
                 self.parallax.start(observation.timestamp)
+                self._crowd = True
                 self._first = observation, nothing
                 self.detector.begin(observation.timestamp)
                 self.detector.memory.start()
@@ -253,13 +261,13 @@ class Slam:
         """First guess of the pose; with what moves (h, w) while the map is young, or movers hide most of the view:
         both then come from the last image and this one."""
         T_init = self._seen.get(observation.timestamp, self.motion.predict(observation.timestamp))
+        self._unproven = None
         if not self.parallax.active:
             return T_init, None
         with clock("parallax"):
             level, small = self._compared(levels)
-            motion = self.parallax.compare(
-                observation.timestamp, level, small, self.detector.pieces(small, self.volume)
-            )
+            surface = self.detector.pieces(small, self.volume)
+            motion = self.parallax.compare(observation.timestamp, level, small, surface)
             if motion is None:
                 return T_init, None
             T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
@@ -270,6 +278,11 @@ class Slam:
             elif self._fits_better(T_init, T_seen, self._tracked(levels)[0]):
                 return T_init, None  # what most corners follow is not the static world
             moving = motion.moving_after
+            if not several(moving, small):  # else something slow hardly drags the camera on its own
+                moving = moving | self.parallax.slow(observation.timestamp, T_seen, level, small, surface)
+            self._crowd = self._crowd and self.parallax.young(observation.timestamp) and _mostly(moving, small)
+            if self._crowd:
+                self._unproven = ~motion.resting_after
             if not self.parallax.young(observation.timestamp):  # elsewhere the map knows better what moves
                 moving = moving & (self._place(small, T_seen) == NOTHING)
             return T_seen, moving
@@ -302,13 +315,43 @@ class Slam:
         return levels[self._level(max(self.config.tracker.widths))], levels[self._level(self.config.dynamics.width)]
 
     def _compare_with_next(self, timestamp: float, levels: dict[int, Level]) -> None:
+        if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
+            return
         level, small = self._compared(levels)
-        if self.parallax.wanted(timestamp, small, self._moved):
-            self.parallax.remember(level, small, self.detector.pieces(small, self.volume), self._moved)
-        else:
-            self.parallax.forget()
+        pieces, T_world_camera = self.detector.pieces(small, self.volume), self.atlas.poses[-1].T_world_camera
+        self.parallax.remember(timestamp, T_world_camera, level, small, pieces, self._moved)
 
     def _register(
+        self,
+        observation: Observation,
+        levels: dict[int, Level],
+        T_init: NDArray[np.float64],
+        known: NDArray[np.bool_] | None,
+        clock: "Clock",
+    ) -> tuple[TrackingResult, Labels | None]:
+        """Register and label a frame; if it fits unusually badly, once more from where the last image puts the camera.
+
+        A hand that turns back, or frames that are missing, leave a first guess beyond the reach of the registration.
+        What fits the map better is taken.
+        """
+        tracked, labels = self._register_from(levels, T_init, known, clock)
+        if not self.health.unusual(tracked):
+            return tracked, labels
+        with clock("parallax"):
+            level, small = self._compared(levels)
+            surface = self.detector.pieces(small, self.volume)
+            motion = self.parallax.compare(observation.timestamp, level, small, surface)
+        if motion is None:
+            return tracked, labels
+        T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
+        if agree(T_seen, tracked.T_world_camera, *SAME_START):
+            return tracked, labels
+        again, labels_again = self._register_from(levels, T_seen, known, clock)
+        misfit, misfit_again = sum(self.health.misfit(tracked)), sum(self.health.misfit(again))
+        better = again.converged and (not tracked.converged or misfit_again < CLEARLY * misfit)
+        return (again, labels_again) if better else (tracked, labels)
+
+    def _register_from(
         self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
     ) -> tuple[TrackingResult, Labels | None]:
         """Register without labels, find what moves, register again without that (thesis algorithm 4).
@@ -317,22 +360,23 @@ class Slam:
         """
         tracked_levels = self._tracked(levels)
         unmasked = self._unmasked(tracked_levels, known)
+        tracker = self.blind_tracker if self._blind else self.tracker
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with clock("track"):
-                tracked = self.tracker.align(self.reference, tracked_levels, T_init, unmasked)
+                tracked = tracker.align(self.reference, tracked_levels, T_init, unmasked)
             if self.config.dynamics.method == "none":
                 return tracked, None
             return tracked, self._detect(levels, tracked, known, clock)
         split = max(1, len(tracked_levels) - 1)
         with clock("track"):
             weights = self._expected(tracked_levels, unmasked)
-            tracked = self.tracker.align(self.reference, tracked_levels[:split], T_init, weights)
+            tracked = tracker.align(self.reference, tracked_levels[:split], T_init, weights)
         labels = self._detect(levels, tracked, known, clock)
         with clock("track_again"):
             enough = split < len(tracked_levels) and tracked.settled and self._as_expected(labels)
             first = split if enough else split - 1
             again = tracked_levels[first:]
-            tracked = self.tracker.align(
+            tracked = tracker.align(
                 self.reference,
                 again,
                 tracked.T_world_camera,
@@ -340,11 +384,13 @@ class Slam:
                 first_level=first,
                 exposure=tracked.exposure,
             )
+        if self._blind:
+            tracked = replace(tracked, color_residual=np.nan)
         return tracked, labels
 
     def _unmasked(self, levels: list[Level], known: NDArray[np.bool_] | None) -> list[NDArray[np.float32]] | None:
         """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
-        masks = [mask for mask in (known, self.detector.moving) if mask is not None]
+        masks = [mask for mask in (known, self.detector.moving, self._unproven) if mask is not None]
         if not masks:
             return None
         return [(~np.any([_reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
@@ -364,6 +410,16 @@ class Slam:
         changed = labels.dynamic if self._moved is None else labels.dynamic != self._moved
         counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
         return bool(np.count_nonzero(changed & counted) <= AS_EXPECTED * np.count_nonzero(counted))
+
+    def _doubt(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> str:
+        """Sentence on why a registration is not to be believed, empty if it is."""
+        crowded = labels is not None and _mostly(labels.dynamic, self._compared(levels)[1])
+        return (
+            tracked.reason
+            or self.motion.implausible(timestamp, tracked.T_world_camera)
+            or self.health.doubt(tracked, crowded=crowded)
+            or self._undecided(levels, labels, tracked)
+        )
 
     def _undecided(self, levels: dict[int, Level], labels: Labels | None, tracked: TrackingResult) -> str:
         """Sentence if so much seems to move, or so little of the rest is known, that nothing is certain."""
@@ -385,8 +441,8 @@ class Slam:
         dynamic_mask: NDArray[np.bool_],
         clock: "Clock",
     ) -> None:
-        """Keep the frame as a keyframe if the camera has been nowhere near."""
-        if self.config.relocalization.enabled:
+        """Keep the frame as a keyframe if the camera has been nowhere near and the image shows something."""
+        if self.config.relocalization.enabled and not self._blind:
             with clock("keyframe"):
                 self.keyframes.add(observation, T_world_camera, ~dynamic_mask, self.atlas.current)
 
@@ -409,7 +465,7 @@ class Slam:
         candidates.sort(key=lambda place: place.keyframe.submap != lost_in)  # rather stay than change the map
         for place in candidates:
             T_world_camera, self.atlas.current = place.T_world_camera, place.keyframe.submap
-            tracked, labels = self._register(levels, T_world_camera, known, clock)
+            tracked, labels = self._register_from(levels, T_world_camera, known, clock)
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
                 tracked.converged
@@ -449,7 +505,7 @@ class Slam:
     ) -> FrameResult:
         """Look for a place seen before; where the tracking has drifted since, everything moves."""
         tracked = result.tracking
-        if self.atlas.history is None or tracked is None:
+        if self.atlas.history is None or tracked is None or self._blind:
             return result
         with clock("loops"):
             tracked_levels = self._tracked(levels)
@@ -498,6 +554,8 @@ class Slam:
             weights = self._expected([coarse], self._unmasked([coarse], known)) or [np.ones_like(coarse.depth)]
             T_depth = self.tracker.depth_pose(self.reference, coarse, tracked.T_world_camera, weights[0])
             labels = self.detector.detect(self.reference, level, T_depth, tracked.exposure)
+            if self._blind:
+                labels = replace(labels, hidden=None)
             if known is None:
                 return labels
             masked = _reduced(known, level)
@@ -509,6 +567,8 @@ class Slam:
         import cv2
 
         static = labels.static_probability
+        if self._unproven is not None:
+            static = np.where(self._unproven, np.float32(0), static)
         return [
             np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
             for level in levels
@@ -571,30 +631,20 @@ class Slam:
                 residuals = labels.sample.distance
             if known is not None:
                 mask = mask | known
+        movers: tuple[Mover, ...] = ()
+        if self.config.movers.enabled and labels is not None and not reason:
+            with clock("movers"):
+                level = levels[self._level(self.config.dynamics.width)]
+                movers = tuple(self.movers.update(observation.timestamp, labels.dynamic, level, tracked.T_world_camera))
+            if self.fusion is not None:
+                with clock("bodies"):
+                    pose, exposure = tracked.T_world_camera, tracked.exposure
+                    movers = tuple(self.fusion.update(observation, movers, level, pose, exposure))
         return FrameResult(
             observation.timestamp, "lost" if reason else "tracked", reason, None if reason else tracked.T_world_camera,
-            fused, not fused and not reason, mask, _share(mask, observation), residuals, labels, tracked,
-            clock.timings, relocalized, (), self.atlas.current,
+            fused, not (fused or reason or self._blind), mask, _share(mask, observation), residuals, labels, tracked,
+            clock.timings, relocalized, movers, self.atlas.current, blind=self._blind,
         )  # fmt: skip
-
-    def _follow(
-        self,
-        observation: Observation,
-        levels: dict[int, Level],
-        labels: Labels | None,
-        tracked: TrackingResult,
-        clock: "Clock",
-    ) -> tuple[Mover, ...]:
-        """The movers of a frame; nothing of the map is read or written, so that it may be fused meanwhile."""
-        if not self.config.movers.enabled or labels is None:
-            return ()
-        pose, level = tracked.T_world_camera, levels[self._level(self.config.dynamics.width)]
-        with clock("movers"):
-            movers = self.movers.update(observation.timestamp, labels.dynamic, level, pose)
-        if self.fusion is not None:
-            with clock("bodies"):
-                movers = self.fusion.update(observation, movers, level, pose, tracked.exposure)
-        return tuple(movers)
 
 
 def _reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
@@ -603,6 +653,11 @@ def _reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
     size = level.depth.shape[::-1]
     return np.asarray(cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_AREA)) > 0
+
+
+def _mostly(moving: NDArray[np.bool_], level: Level) -> bool:
+    """Whether more than half of the readings of an image move (h, w)."""
+    return bool(2 * np.count_nonzero(moving) > np.count_nonzero(level.depth))
 
 
 def _share(mask: NDArray[np.bool_], observation: Observation) -> float:

@@ -71,7 +71,8 @@ class TrackingResult:
         residual: Root mean square distance residual, metres at one metre depth.
         condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
         iterations: Linearisations over all levels.
-        color_residual: Median absolute intensity difference (0..1) to the map at the static readings.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings; NaN where the
+            image shows nothing.
         settled: Whether the last level ended with a step too small to matter, not for want of iterations.
     """
 

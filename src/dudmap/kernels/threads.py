@@ -6,17 +6,14 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 
 import os
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any, TypeVar
+from typing import Any
 
 from numba import njit
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 kernel = njit(nogil=True, cache=True, fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy")
-
-
-Result = TypeVar("Result")
 
 
 def num_threads() -> int:
@@ -59,15 +56,5 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         work()
     finally:
         for other in others:
-            if not other.cancel():  # one that has not begun finds nothing left to do
-                other.result()
+            other.result()
     return results
-
-
-def beside(function: Callable[..., Result], *items: Any) -> "Future[Result]":
-    """Start a call that needs one core while the calling thread goes on with kernels. Where there is one, just call."""
-    if num_threads() > 1:
-        return _pool().submit(function, *items)
-    done: Future[Result] = Future()
-    done.set_result(function(*items))
-    return done
