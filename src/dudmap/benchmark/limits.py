@@ -58,7 +58,7 @@ class Sweep(NamedTuple):
 
 
 SWEEPS = (
-    Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9)),
+    Sweep("speed", "mover speed, m/s", (0.02, 0.1, 0.3, 1.0, 2.0, 3.0), (0.0, 0.3, 0.5, 0.7, 0.9)),
     Sweep("start", "share of frames with movers, from the first on", (0.25, 0.5, 1.0), (0.2, 0.4, 0.6)),
     Sweep("camera", "camera path", CAMERA_PATHS, (0.0, 0.3, 0.7)),
 )
