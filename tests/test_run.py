@@ -37,6 +37,7 @@ class Result:
     skipped_similar: bool = False
     relocalized: bool = False
     corrected: bool = False
+    blind: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None

@@ -51,6 +51,7 @@ class RunRecord:
     skipped_similar: int = 0
     relocalized: int = 0
     corrected: int = 0
+    blind: int = 0
     masked: int | None = None
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -84,6 +85,7 @@ class RunRecord:
         self.skipped_similar += result.skipped_similar
         self.relocalized += result.relocalized
         self.corrected += result.corrected
+        self.blind += result.blind
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -132,6 +134,7 @@ class RunRecord:
             "lost": len(self.lost),
             "relocalized": self.relocalized,
             "corrected": self.corrected,
+            "blind": self.blind,
             "unreadable": len(self.unreadable),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),
