@@ -114,41 +114,6 @@ def test_alignment_finds_a_known_motion(volume):
     assert np.degrees(se3.rotation_angle(error)) < 0.15
 
 
-def test_a_depth_image_from_elsewhere_is_found_whatever_the_colour_shows(volume):
-    """Colour as from the first pose, depth from another: the joint pose stays with the colour."""
-    tracker = Tracker(TrackerConfig(widths=(80,), iterations=(10,)), SENSOR)
-    xi = np.array([0.012, -0.005, 0.004, 0.002, -0.003, 0.004])
-    apart = Level(CAMERA, corner(xi).depth, level_of(corner()).intensity)
-    joint = tracker.align(volume, [apart], np.eye(4)).T_world_camera
-    found = [tracker.depth_pose(volume, apart, joint, ones(apart)) for _ in range(2)]  # of two frames
-    error = [np.linalg.norm((se3.inverse(se3.exp(xi)) @ T)[:3, 3]) for T in (joint, *found)]
-    assert error[0] > 0.005
-    assert error[1] < 0.75 * error[0]
-    assert error[2] < error[1]
-
-
-def test_where_the_depth_tells_nothing_its_pose_stays():
-    """A wall says nothing of motions along it."""
-    depth = np.full(CAMERA.shape, 1.5, np.float32)
-    wall = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
-    for _ in range(3):
-        wall.integrate(Frame(0.0, depth, corner().color), np.eye(4))
-    tracker = Tracker(TrackerConfig(), SENSOR)
-    rough = depth + np.random.default_rng(0).normal(0, 0.004, depth.shape).astype(np.float32)
-    level = Level(CAMERA, rough - np.float32(0.01), level_of(corner()).intensity)
-    wall.look_at(np.eye(4))
-    T = tracker.depth_pose(wall, level, np.eye(4), ones(level))
-    assert T[2, 3] == pytest.approx(0.01, abs=0.001)
-    assert np.abs(T[:2, 3]).max() < 0.001
-    assert abs(T[1, 0]) < 0.001
-    together = Tracker(TrackerConfig(), SENSOR)  # less than the noise of this is no delay
-    assert np.array_equal(
-        together.depth_pose(wall, Level(CAMERA, rough, level.intensity), np.eye(4), ones(level)), np.eye(4)
-    )
-    nothing = Level(CAMERA, np.zeros_like(depth), level.intensity)
-    assert np.array_equal(tracker.depth_pose(wall, nothing, np.eye(4), ones(level)), np.eye(4))
-
-
 def test_pixels_of_weight_zero_have_no_say(volume):
     tracker, level = Tracker(TrackerConfig(), SENSOR), level_of(corner())
     weights = ones(level)

@@ -104,10 +104,12 @@ class DynamicDetector:
         self.memory = surfaces.StandStill(config)
         self.background = Background(config)
         self.moving: NDArray[np.bool_] | None = None
+        self.now = 0.0
         self._cut: tuple[Level, surfaces.Pieces] | None = None
 
     def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
         """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
+        self.now = timestamp
         self.memory.begin(timestamp)
         self.background.begin(timestamp)
         self.moving = moving

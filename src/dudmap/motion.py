@@ -29,9 +29,14 @@ class MotionModel:
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Take over the pose of a tracked frame."""
         if self._known:
-            motion = se3.log(se3.inverse(self._T_world_camera) @ T_world_camera)
-            self._velocity = motion / max(self._elapsed(timestamp), 1e-6)
+            self._velocity = self.velocity_to(timestamp, T_world_camera)
         self._timestamp, self._T_world_camera, self._known = timestamp, T_world_camera, True
+
+    def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, that leads from the last pose to this one; 0 where there is none."""
+        if not self._known:
+            return np.zeros(6)
+        return se3.log(se3.inverse(self._T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
 
     def lost(self, timestamp: float) -> None:
         """Take note of a frame without a pose; after a few, the next are tried from the last good pose."""

@@ -14,6 +14,7 @@ from dudmap.atlas import Atlas
 from dudmap.bodies import Body, RigidFusion
 from dudmap.camera import Camera
 from dudmap.config import Config
+from dudmap.delay import DepthDelay
 from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
 from dudmap.frame import Frame
 from dudmap.health import TrackingHealth
@@ -105,6 +106,7 @@ class Slam:
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.similarity = SimilarityTest(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
+        self.delay = DepthDelay()
         self.health = TrackingHealth()
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self.atlas = Atlas(self._empty_volume, self.keyframes, self._history())
@@ -552,7 +554,8 @@ class Slam:
         with clock("label"):
             coarse = self._tracked(levels)[0]
             weights = self._expected([coarse], self._unmasked([coarse], known)) or [np.ones_like(coarse.depth)]
-            T_depth = self.tracker.depth_pose(self.reference, coarse, tracked.T_world_camera, weights[0])
+            T, velocity = tracked.T_world_camera, self.motion.velocity_to(self.detector.now, tracked.T_world_camera)
+            T_depth = self.delay.depth_pose(self.tracker, self.reference, coarse, T, velocity, weights[0])
             labels = self.detector.detect(self.reference, level, T_depth, tracked.exposure)
             if self._blind:
                 labels = replace(labels, hidden=None)

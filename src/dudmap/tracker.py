@@ -16,12 +16,6 @@ PIXELS_PER_BAND = 4800
 """What a thread is woken for; the coarsest level is one band."""
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
-APART = 0.01
-"""How far the depth image was taken from where the colour image was, standard deviation, metres;"""
-NEAREST, FARTHEST = 0.35, 3.0
-"""less than this is noise, more does not happen, standard deviations."""
-ALIKE = 400.0
-"""Readings that err alike and tell as much as one, where nothing but the depth is asked."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,7 +88,6 @@ class Tracker:
     def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
         self.config = config
         self.sensor = sensor
-        self._apart = np.zeros(6)  # twist from the pose of colour and depth to that of the depth, camera axes
 
     def align(
         self,
@@ -170,42 +163,6 @@ class Tracker:
             else:
                 damping *= 5
         return T, system, used, False
-
-    def depth_pose(
-        self,
-        volume: TsdfVolume,
-        level: Level,
-        T_world_camera: NDArray[np.float64],
-        weights: NDArray[np.float32],
-    ) -> NDArray[np.float64]:
-        """Pose (4, 4) from which the depth image alone was taken: near that of depth and colour, where it fits better.
-
-        Depth and colour are taken milliseconds apart and through two lenses, so that no pose fits both: a camera
-        moving at half a metre per second leaves a centimetre between them. One Gauss-Newton step on the distances, from
-        as far apart as they were in the last frame, with a Gaussian prior on the joint pose: what the depth does not
-        tell stays as it was.
-
-        Args:
-            volume: The map, which has been looked at from near the pose.
-            level: A coarse level of the image.
-            T_world_camera: (4, 4), the pose of depth and colour together.
-            weights: (h, w) float32 static weights in [0, 1].
-        """
-        readings = level.depth[level.depth > 0]
-        if len(readings) == 0:
-            return T_world_camera
-        variance = ALIKE * (self.sensor.sigma_base + self.sensor.sigma_scale) ** 2
-        prior = np.repeat([1.0, float(np.median(readings)) ** 2], 3) / APART**2  # turns by what they move in the image
-        R = T_world_camera[:3, :3]
-        apart = (self._apart.reshape(2, 3) @ R.T).reshape(6)
-        T = moved(T_world_camera, apart)
-        system = self.linearize(volume, level, T, weights, color_weight=0.0)
-        step = -np.linalg.solve(system.H / variance + np.diag(prior), system.b / variance + prior * apart)
-        apart = apart + step
-        far = float(np.sqrt(prior @ apart**2))
-        apart *= min(1.0, FARTHEST / max(far, 1e-9))
-        self._apart = (apart.reshape(2, 3) @ R).reshape(6)
-        return moved(T_world_camera, apart) if far >= NEAREST else T_world_camera
 
     def linearize(
         self,
