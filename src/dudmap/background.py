@@ -88,7 +88,14 @@ class Background:
         _, numbers, stats, _ = cv2.connectedComponentsWithStats(hidden, connectivity=4)
         large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST * hidden.size
         large[0] = False
-        found = cv2.resize(large[numbers].astype(np.uint8), nothing.shape[::-1], interpolation=cv2.INTER_NEAREST) > 0
+        found = (
+            cv2.resize(
+                large[np.asarray(numbers, np.int32)].astype(np.uint8),
+                nothing.shape[::-1],
+                interpolation=cv2.INTER_NEAREST,
+            )
+            > 0
+        )
         return found & (level.depth <= 0)
 
     def update(self, level: Level, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:

@@ -263,9 +263,13 @@ def _followed(
     if T_expected is not None:
         points = _points(before.camera, pixels[:, 0], pixels[:, 1], z[useful].astype(np.float64))
         shift = _projected(T_expected, points, before.camera).astype(np.float32).reshape(-1, 1, 2) - start
-    search = dict(winSize=(WINDOW, WINDOW), maxLevel=3, flags=cv2.OPTFLOW_USE_INITIAL_FLOW)
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, start + shift, **search)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(second, first, there, there - shift, **search)
+    size, flags = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(
+        first, second, start, start + shift, winSize=size, maxLevel=3, flags=flags
+    )
+    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
+        second, first, there, there - shift, winSize=size, maxLevel=3, flags=flags
+    )
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
     good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
     return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
