@@ -4,21 +4,18 @@ import numpy as np
 import pytest
 
 from dudmap import se3
-from dudmap.config import TrackerConfig, VolumeConfig
+from dudmap.config import TrackerConfig
 from dudmap.delay import LONGEST, DepthDelay
 from dudmap.tracker import Level, Tracker
 from dudmap.volume import TsdfVolume
-from test_registration_oracle import CAMERA, SENSOR, corner, level_of, ones
+from test_registration_oracle import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 FPS = 30.0
 
 
 @pytest.fixture(scope="module")
 def volume() -> TsdfVolume:
-    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
-    for _ in range(3):
-        volume.integrate(corner(), np.eye(4))
-    return volume
+    return corner_map()
 
 
 def swing(time: float) -> np.ndarray:
@@ -37,7 +34,8 @@ def learnt(volume: TsdfVolume, delay: float, spoil=None, frames: int = 20) -> tu
             level = Level(CAMERA, spoil(level.depth.copy(), number), level.intensity)
         velocity = se3.log(se3.inverse(before) @ T) * FPS
         volume.look_at(T)
-        T_depth = found.depth_pose(tracker, volume, level, T, velocity, ones(level))
+        found.learn(tracker, volume, level, T, velocity, ones(level))
+        T_depth = found.depth_pose(level, T, velocity)
         errors.append(se3.log(se3.inverse(se3.exp(swing(time + delay))) @ T_depth))
         before = T
     return found, errors
@@ -72,11 +70,13 @@ def test_what_moves_on_its_own_is_no_delay(volume):
 def test_a_camera_at_rest_and_a_wrong_pose_teach_nothing(volume):
     tracker, found, level = Tracker(TrackerConfig(), SENSOR), DepthDelay(), level_of(corner())
     volume.look_at(np.eye(4))
-    for velocity in (np.zeros(6), np.full(6, 50.0)):
-        assert np.array_equal(found.depth_pose(tracker, volume, level, np.eye(4), velocity, ones(level)), np.eye(4))
     nothing = Level(CAMERA, np.zeros_like(level.depth), level.intensity)
-    assert np.array_equal(found.depth_pose(tracker, volume, nothing, np.eye(4), np.ones(6), ones(level)), np.eye(4))
-    assert found.seconds == 0
+    for seen, velocity in ((level, np.zeros(6)), (level, np.full(6, 50.0)), (nothing, np.ones(6))):
+        found.learn(tracker, volume, seen, np.eye(4), velocity, ones(level))
+        assert found.seconds == 0
+    found.seconds = 0.02
+    for seen, velocity in ((level, np.zeros(6)), (level, np.full(6, 50.0)), (nothing, np.ones(6))):
+        assert np.array_equal(found.depth_pose(seen, np.eye(4), velocity), np.eye(4))
 
 
 def test_a_delay_has_a_limit(volume):

@@ -97,6 +97,20 @@ def test_images_without_corners_tell_nothing(crowd):
     assert compare(blank, blank) is None
 
 
+def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd):
+    known, before, after = parallax.Parallax(1.0), levels(crowd, 6), levels(crowd, 7)
+    known.start(0.0)
+    assert known.compare(0.0, *before) is None
+    known.remember(0.0, np.eye(4), *before)
+    motion = known.compare(0.1, *after)
+    assert motion is not None
+    assert known.compare(0.1, *after) is motion
+    assert known.compare(0.2, *after) is not motion
+    known.forget()
+    assert known.compare(0.1, *after) is None
+    assert not known.active
+
+
 def test_where_everything_is_known_to_move_nothing_tells_the_world(crowd):
     before, after = levels(crowd, 6), levels(crowd, 7)
     assert compare(before, after, np.ones(before[1].depth.shape, bool)) is None

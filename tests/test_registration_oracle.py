@@ -35,12 +35,17 @@ def level_of(frame: Frame) -> Level:
     return Level(CAMERA, frame.depth, frame.color[..., 0].astype(np.float32) / 255)
 
 
-@pytest.fixture(scope="module")
-def volume() -> TsdfVolume:
+def corner_map() -> TsdfVolume:
+    """The corner after three frames from where it is known."""
     volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
     for _ in range(3):
         volume.integrate(corner(), np.eye(4))
     return volume
+
+
+@pytest.fixture(scope="module")
+def volume() -> TsdfVolume:
+    return corner_map()
 
 
 def ones(level: Level) -> np.ndarray:

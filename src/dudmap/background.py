@@ -46,7 +46,7 @@ class Background:
         self._known = None
 
     def hidden(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) without a reading that look unlike the static world behind them; moves on to this image.
+        """Pixels (h, w) without a reading that look unlike the static world behind them.
 
         Args:
             level: The image, its intensities as the map has them.
@@ -58,19 +58,9 @@ class Background:
         nothing = np.zeros(level.depth.shape, dtype=bool)
         if self._known is None:
             return nothing
-        shape = depth.shape
-        old_points, old_shades, old_times = self._known
-        points, shades, times = np.empty((*shape, 3), np.float32), np.empty(shape, np.float32), np.zeros((*shape, 2))
-        splatting.splat(
-            old_points.reshape(-1, 3), old_shades.reshape(-1), old_times.reshape(-1, 2),
-            self._now - self.config.settle_time, se3.inverse(T_world_camera)[:3].astype(np.float32),
-            _intrinsics(level), points, shades, times,
-        )  # fmt: skip
-        self._known = points, shades, times
-        hole = (
-            cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE]
-            <= 0
-        )
+        _, shades, times = self._seen_from(level, depth.shape, T_world_camera)
+        farthest = cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))
+        hole = farthest[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE] <= 0
         missing = np.isnan(shades)
         square = np.ones((3, 3), np.uint8)
         darkest = cv2.erode(np.where(missing, np.float32(9), shades), square)
@@ -88,26 +78,36 @@ class Background:
         _, numbers, stats, _ = cv2.connectedComponentsWithStats(hidden, connectivity=4)
         large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST * hidden.size
         large[0] = False
-        found = (
-            cv2.resize(
-                large[np.asarray(numbers, np.int32)].astype(np.uint8),
-                nothing.shape[::-1],
-                interpolation=cv2.INTER_NEAREST,
-            )
-            > 0
-        )
-        return found & (level.depth <= 0)
+        found = large[np.asarray(numbers, np.int32)].astype(np.uint8)
+        found = cv2.resize(found, nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        return (found > 0) & (level.depth <= 0)
 
     def update(self, level: Level, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
         """Take over the readings of an image that rest; ``moving`` (h, w) bool do not."""
         depth, intensity = _asked(level)
-        if self._known is None:
-            shape = depth.shape
-            self._known = np.zeros((*shape, 3), np.float32), np.full(shape, np.float32(np.nan)), np.zeros((*shape, 2))
+        self._known = self._seen_from(level, depth.shape, T_world_camera)
         splatting.overwrite(
             depth, intensity, ~moving[::STRIDE, ::STRIDE], self._now, T_world_camera[:3].astype(np.float32),
             _intrinsics(level), *self._known,
         )  # fmt: skip
+
+    def _seen_from(
+        self, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
+        """The known points, their intensities (NaN: none) and times as the image's camera sees them."""
+        points, shades, times = (
+            np.zeros((*shape, 3), np.float32),
+            np.full(shape, np.float32(np.nan)),
+            np.zeros((*shape, 2)),
+        )
+        if self._known is not None:
+            old_points, old_shades, old_times = self._known
+            splatting.splat(
+                old_points.reshape(-1, 3), old_shades.reshape(-1), old_times.reshape(-1, 2),
+                self._now - self.config.settle_time, se3.inverse(T_world_camera)[:3].astype(np.float32),
+                _intrinsics(level), points, shades, times,
+            )  # fmt: skip
+        return points, shades, times
 
 
 def _asked(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

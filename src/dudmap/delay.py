@@ -36,6 +36,21 @@ class DepthDelay:
         self._information, self._evidence = 0.0, 0.0
 
     def depth_pose(
+        self, level: Level, T_world_camera: NDArray[np.float64], velocity: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Pose (4, 4) from which the depth was taken.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4), the pose of depth and colour together.
+            velocity: (6,) twist per second of the camera on its way to this pose, camera axes.
+        """
+        twist, speed = _seen_motion(level, T_world_camera, velocity)
+        if speed >= LARGEST or abs(self.seconds) * speed < NOISE:
+            return T_world_camera
+        return moved(T_world_camera, self.seconds * twist)
+
+    def learn(
         self,
         tracker: Tracker,
         volume: TsdfVolume,
@@ -43,35 +58,36 @@ class DepthDelay:
         T_world_camera: NDArray[np.float64],
         velocity: NDArray[np.float64],
         weights: NDArray[np.float32],
-    ) -> NDArray[np.float64]:
-        """Pose (4, 4) from which the depth was taken; learns from the frame.
+    ) -> None:
+        """Take in a frame whose pose is believed.
 
         Args:
             tracker: Gives the normal equations.
             volume: The map, which has been looked at from near the pose.
             level: A coarse level of the image.
-            T_world_camera: (4, 4), the pose of depth and colour together.
-            velocity: (6,) twist per second of the camera on its way to this pose, camera axes.
+            T_world_camera, velocity: As above.
             weights: (h, w) float32 static weights in [0, 1].
         """
-        readings = level.depth[level.depth > 0]
-        if len(readings) == 0:
-            return T_world_camera
-        twist = (velocity.reshape(2, 3) @ T_world_camera[:3, :3].T).reshape(6)  # world axes
-        middle = float(np.median(readings))
-        speed = float(np.linalg.norm(twist[:3]) + middle * np.linalg.norm(twist[3:]))  # of what is seen, at most
+        twist, speed = _seen_motion(level, T_world_camera, velocity)
         if not 0 < speed < LARGEST:
-            return T_world_camera
-        sensor = tracker.sensor
-        variance = ALIKE * (sensor.sigma_base + sensor.sigma_scale) ** 2
-        system = tracker.linearize(
-            volume, level, moved(T_world_camera, self.seconds * twist), weights, color_weight=0.0
-        )
+            return
+        variance = ALIKE * (tracker.sensor.sigma_base + tracker.sensor.sigma_scale) ** 2
+        T_depth = moved(T_world_camera, self.seconds * twist)
+        system = tracker.linearize(volume, level, T_depth, weights, color_weight=0.0)
         information = float(twist @ system.H @ twist) / variance
         evidence = information * self.seconds - float(twist @ system.b) / variance
         self._information = MEMORY * self._information + information
         self._evidence = MEMORY * self._evidence + evidence
         self.seconds = float(np.clip(self._evidence / (self._information + USUAL**-2), -LONGEST, LONGEST))
-        if abs(self.seconds) * speed < NOISE:
-            return T_world_camera
-        return moved(T_world_camera, self.seconds * twist)
+
+
+def _seen_motion(
+    level: Level, T_world_camera: NDArray[np.float64], velocity: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], float]:
+    """Twist per second (6,) about the camera's centre, world axes, and how fast what is at the middle distance
+    moves in the image at most, m/s; 0 where there are no readings."""
+    twist = (velocity.reshape(2, 3) @ T_world_camera[:3, :3].T).reshape(6)
+    readings = level.depth[level.depth > 0]
+    if len(readings) == 0:
+        return twist, 0.0
+    return twist, float(np.linalg.norm(twist[:3]) + float(np.median(readings)) * np.linalg.norm(twist[3:]))

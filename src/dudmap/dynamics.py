@@ -183,7 +183,8 @@ class DynamicDetector:
     ) -> None:
         """Take over a frame that was tracked: what the next one is compared with."""
         self.memory.remember(level, T_world_camera, labels.dynamic, labels.surface)
-        self.background.update(exposed(level, exposure), T_world_camera, labels.dynamic)
+        if self.config.free_space:
+            self.background.update(exposed(level, exposure), T_world_camera, labels.dynamic)
 
     def forget(self) -> None:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""

@@ -93,6 +93,7 @@ class Parallax:
         self._until, self._longest = -np.inf, -np.inf
         self._before: tuple[Level, Level, Pieces, NDArray[np.bool_] | None] | None = None
         self._older: deque[tuple[float, NDArray[np.float64], Level, Level, Pieces]] = deque()
+        self._compared: tuple[float, DominantMotion | None] | None = None  # time of the last comparison, and its result
         self.active = False
 
     def start(self, timestamp: float) -> None:
@@ -118,24 +119,31 @@ class Parallax:
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
         """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
-        self._before = level, small, surface, moving
+        self._before, self._compared = (level, small, surface, moving), None
         self.active = self.wanted(timestamp, small, moving)
         if not self.young(timestamp):
             self._older.clear()
         elif not self._older or timestamp - self._older[-1][0] >= APART:
             self._older.append((timestamp, T_world_camera, level, small, surface))
 
+    def forget(self) -> None:
+        """Compare no more until a frame is remembered again: the last one showed nothing."""
+        self._before, self._compared, self.active = None, None, False
+
     def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
-        """The static world's motion since the remembered frame, and what does not follow it; None if unknown."""
+        """The static world's motion since the remembered frame, and what does not follow it; None if unknown.
+
+        Asked once more for the same time, it answers without looking again.
+        """
         if self._before is None:
             return None
-        before, small_before, surface_before, moved = self._before
-        motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
-        if motion is None or not self.young(timestamp):
-            return motion
-        if several(motion.moving_after, small):
-            self._until = min(timestamp + self.seconds, self._longest)
-        return motion
+        if self._compared is None or self._compared[0] != timestamp:
+            before, small_before, surface_before, moved = self._before
+            motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
+            self._compared = timestamp, motion
+            if motion is not None and self.young(timestamp) and several(motion.moving_after, small):
+                self._until = min(timestamp + self.seconds, self._longest)
+        return self._compared[1]
 
     def slow(
         self, timestamp: float, T_world_camera: NDArray[np.float64], level: Level, small: Level, surface: Pieces

@@ -22,7 +22,7 @@ from dudmap.history import History
 from dudmap.loops import LoopCloser, View
 from dudmap.motion import MotionModel
 from dudmap.movers import Mover, MoverTracker
-from dudmap.parallax import Parallax, several
+from dudmap.parallax import DominantMotion, Parallax, several
 from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.similarity import SimilarityTest
@@ -212,16 +212,20 @@ class Slam:
 
     def _keep(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> None:
         """Take over a frame whose pose is believed: what the next one is predicted and judged from."""
+        velocity = self.motion.velocity_to(timestamp, tracked.T_world_camera)
         self.motion.update(timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
         self._lost_since = None
         self._moved = None if labels is None else labels.dynamic
         self.atlas.add_pose(timestamp, tracked.T_world_camera)
         if self._blind:
+            self.parallax.forget()
             return
         self._compare_with_next(timestamp, levels)
         if labels is not None:
-            level = levels[self._level(self.config.dynamics.width)]
+            coarse, level = self._tracked(levels)[0], levels[self._level(self.config.dynamics.width)]
+            weights = self._weights(labels, [coarse])[0]
+            self.delay.learn(self.tracker, self.reference, coarse, tracked.T_world_camera, velocity, weights)
             self.detector.remember(level, tracked.T_world_camera, tracked.exposure, labels)
 
     def _as_recorded(self, result: FrameResult) -> FrameResult:
@@ -267,12 +271,11 @@ class Slam:
         if not self.parallax.active:
             return T_init, None
         with clock("parallax"):
-            level, small = self._compared(levels)
-            surface = self.detector.pieces(small, self.volume)
-            motion = self.parallax.compare(observation.timestamp, level, small, surface)
-            if motion is None:
+            seen = self._see(observation, levels)
+            if seen is None:
                 return T_init, None
-            T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
+            motion, T_seen = seen
+            level, small = self._compared(levels)
             if self._first is not None:
                 self._start_again(*self._first, motion.moving_before, small)
             elif observation.timestamp in self._seen:
@@ -281,13 +284,26 @@ class Slam:
                 return T_init, None  # what most corners follow is not the static world
             moving = motion.moving_after
             if not several(moving, small):  # else something slow hardly drags the camera on its own
-                moving = moving | self.parallax.slow(observation.timestamp, T_seen, level, small, surface)
+                moving = moving | self.parallax.slow(
+                    observation.timestamp, T_seen, level, small, self.detector.pieces(small, self.volume)
+                )
             self._crowd = self._crowd and self.parallax.young(observation.timestamp) and _mostly(moving, small)
             if self._crowd:
                 self._unproven = ~motion.resting_after
             if not self.parallax.young(observation.timestamp):  # elsewhere the map knows better what moves
                 moving = moving & (self._place(small, T_seen) == NOTHING)
             return T_seen, moving
+
+    def _see(
+        self, observation: Observation, levels: dict[int, Level]
+    ) -> tuple[DominantMotion, NDArray[np.float64]] | None:
+        """The static world's motion from the last image to this one, and the pose (4, 4) it leads to, if known."""
+        level, small = self._compared(levels)
+        surface = self.detector.pieces(small, self.volume)
+        motion = self.parallax.compare(observation.timestamp, level, small, surface)
+        if motion is None:
+            return None
+        return motion, self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
 
     def _place(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
         """What the map knows of the points of an image (h, w): SURFACE, FREE or NOTHING."""
@@ -340,15 +356,10 @@ class Slam:
         if not self.health.unusual(tracked):
             return tracked, labels
         with clock("parallax"):
-            level, small = self._compared(levels)
-            surface = self.detector.pieces(small, self.volume)
-            motion = self.parallax.compare(observation.timestamp, level, small, surface)
-        if motion is None:
+            seen = self._see(observation, levels)
+        if seen is None or agree(seen[1], tracked.T_world_camera, *SAME_START):
             return tracked, labels
-        T_seen = self.atlas.poses[-1].T_world_camera @ se3.inverse(motion.T_after_before)
-        if agree(T_seen, tracked.T_world_camera, *SAME_START):
-            return tracked, labels
-        again, labels_again = self._register_from(levels, T_seen, known, clock)
+        again, labels_again = self._register_from(levels, seen[1], known, clock)
         misfit, misfit_again = sum(self.health.misfit(tracked)), sum(self.health.misfit(again))
         better = again.converged and (not tracked.converged or misfit_again < CLEARLY * misfit)
         return (again, labels_again) if better else (tracked, labels)
@@ -552,10 +563,10 @@ class Slam:
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
-            coarse = self._tracked(levels)[0]
-            weights = self._expected([coarse], self._unmasked([coarse], known)) or [np.ones_like(coarse.depth)]
-            T, velocity = tracked.T_world_camera, self.motion.velocity_to(self.detector.now, tracked.T_world_camera)
-            T_depth = self.delay.depth_pose(self.tracker, self.reference, coarse, T, velocity, weights[0])
+            T_depth = tracked.T_world_camera
+            if not self._blind:
+                velocity = self.motion.velocity_to(self.detector.now, T_depth)
+                T_depth = self.delay.depth_pose(self._tracked(levels)[0], T_depth, velocity)
             labels = self.detector.detect(self.reference, level, T_depth, tracked.exposure)
             if self._blind:
                 labels = replace(labels, hidden=None)

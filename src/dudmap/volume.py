@@ -100,6 +100,7 @@ class TsdfVolume:
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
                          max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
         extent = depth_max if extent is None else extent
+        self._extent = extent
         self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
         cells = int(np.ceil(2 * (self._reach + self._limit) / self.block_size)) + 8
         if cells > 288:
@@ -225,7 +226,7 @@ class TsdfVolume:
 
     def clear(self) -> None:
         """Forget everything."""
-        self.__init__(self.camera, self.config, self.sensor, self.depth_max)
+        self.__init__(self.camera, self.config, self.sensor, self.depth_max, self._extent)
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Become the map that ``other`` is; ``other`` must not be used afterwards."""
