@@ -126,6 +126,8 @@ class TrackerConfig(Part):
     """Image width per level, coarse to fine, pixels; the nearest halving of the camera's image is taken."""
     stop: float = Field(default=5e-4, gt=0)
     """A level ends when the step's norm falls below this."""
+    stop_gain: float = Field(default=3e-3, ge=0, lt=1)
+    """A level also ends when a step changes the cost by less than this share; 0 turns it off."""
     second_pass: bool = True
     """Register again with the dynamic labels (algorithm 4)."""
     constant_velocity: bool = True
@@ -361,6 +363,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "noise_weighting": False,
             "exposure": False,
             "stop": 1e-3,
+            "stop_gain": 0.0,
         },
         "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},

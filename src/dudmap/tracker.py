@@ -158,10 +158,13 @@ class Tracker:
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
+            settled = abs(trial.cost - system.cost) < self.config.stop_gain * system.cost
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
                 damping *= 5
+            if settled:
+                return T, system, used, True
         return T, system, used, False
 
     def linearize(
