@@ -203,11 +203,8 @@ class Tracker:
             ranges, list(sums),
         )  # fmt: skip
         total = sums.sum(axis=0)
-        H = np.zeros((6, 6))
-        H[np.triu_indices(6)] = total[:21]
-        H = H + np.triu(H, 1).T
         return LinearSystem(
-            H, total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]), float(total[31]),
+            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]), float(total[31]),
             residuals,
         )  # fmt: skip
 

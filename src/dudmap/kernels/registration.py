@@ -13,6 +13,9 @@ from dudmap.kernels.threads import kernel
 NUM_SUMS = 32
 """21 of H, 6 of b, cost, pixels on the map, weight of all readings, weight of those on the map, weighted squares."""
 
+SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
+"""Where the sums hold each element of H, its upper triangle row by row."""
+SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 
 AHEAD = 16
 """Pixels between asking for voxels and loading them."""
