@@ -10,6 +10,7 @@ from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
 from dudmap.kernels import hashing
+from dudmap.kernels.visibility import SETTLED
 from dudmap.volume import FREE, TsdfVolume
 from oracle import fuse, trilinear
 
@@ -114,6 +115,35 @@ def test_weights_are_the_cosine_over_the_error(tilt_deg):
     found = TsdfVolume(camera, VolumeConfig(), sensor)._weights(jump)
     assert found[24, 31] == round(4 * 0.3 * 0.003 / 0.0015)  # at a depth edge the angle is not known: taken as slanted
     assert found[10, 10] == 0
+
+
+def test_far_blocks_that_take_turns_hold_what_they_would_without():
+    """Two walls: in front of the nearer one the noise is finer than the voxels, in front of the other it is not."""
+    config = VolumeConfig(voxel_size=0.05, weighting="constant", carving=False)
+    sensor = SensorConfig(sigma_base=0.001, sigma_scale=0.03)  # three sigma are four voxels at 1.47 m
+    frame, volumes = wall(1.2), []
+    frame.depth[:, 32:] += 1.3
+    for take_turns in (True, False):
+        volume = TsdfVolume(CAMERA, config.model_copy(update={"take_turns": take_turns}), sensor, depth_max=4.0)
+        for _ in range(SETTLED):
+            volume.integrate(frame, np.eye(4))
+        before, settled = set(volume.active_slots.tolist()), volume.num_integrated
+        written = []
+        for number in range(2):
+            volume.integrate(frame, np.eye(4))
+            written.append(set(volume.written_since(settled + number)[0].tolist()))
+        volumes.append((volume, before, written))
+    (turns, before, (first, second)), (every, *_) = volumes
+    assert before <= first | second  # each in one frame or the other, the near ones in both
+    depth = (turns.blocks.slot_coords[:, 2] + 0.5) * turns.block_size
+    near = {slot for slot in before if depth[slot] < 1.4}
+    assert near <= first & second
+    assert 0.4 * len(before - near) < len(first - second) < 0.6 * len(before - near)
+    places, distance, weight, _ = voxels_of(turns)
+    places_every, distance_every, weight_every, _ = voxels_of(every)
+    assert np.array_equal(places, places_every)
+    assert np.array_equal(weight, weight_every)
+    assert np.abs(distance - distance_every).max() < allowed(turns)
 
 
 @pytest.mark.parametrize(("carving", "carve_rate", "within"), [(False, 1, 2.0), (True, 1, 2.0), (True, 4, 0.5)])

@@ -119,6 +119,27 @@ def test_alignment_finds_a_known_motion(volume):
     assert np.degrees(se3.rotation_angle(error)) < 0.15
 
 
+def test_a_level_that_gains_nothing_more_ends_there(volume):
+    """Noise makes steps that lead nowhere; poses found in fewer of them are as good."""
+    xi = np.array([0.004, -0.003, 0.002, 0.002, -0.003, 0.003])
+    found: dict[float, list[TrackingResult]] = {0.0: [], 3e-3: []}
+    for seed in range(8):
+        rng, level = np.random.default_rng(seed), level_of(corner(xi))
+        depth = level.depth + rng.normal(0, 0.01, level.depth.shape)
+        intensity = level.intensity + rng.normal(0, 0.1, level.depth.shape)
+        noisy = Level(CAMERA, depth.astype(np.float32), intensity.astype(np.float32))
+        for stop_gain, results in found.items():
+            config = TrackerConfig(widths=(80,), iterations=(30,), stop=2e-4, stop_gain=stop_gain, exposure=False)
+            results.append(Tracker(config, SENSOR).align(volume, [noisy], np.eye(4)))
+    iterations = {gain: sum(result.iterations for result in results) for gain, results in found.items()}
+    errors = {
+        gain: np.mean([np.linalg.norm(result.T_world_camera[:3, 3] - se3.exp(xi)[:3, 3]) for result in results])
+        for gain, results in found.items()
+    }
+    assert iterations[3e-3] < 0.9 * iterations[0.0]
+    assert errors[3e-3] < errors[0.0] + 0.0005
+
+
 def test_pixels_of_weight_zero_have_no_say(volume):
     tracker, level = Tracker(TrackerConfig(), SENSOR), level_of(corner())
     weights = ones(level)

@@ -3,7 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels import hashing
+from dudmap.kernels import hashing, integration
+from dudmap.kernels.threads import bands, run_bands
 
 BLOCK = 8
 """Voxels along the edge of a block."""
@@ -27,6 +28,7 @@ class VoxelBlocks:
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
         slot_coords: (slots, 3) int16 block coordinates by slot.
         written: (slots,) int32 number of the frame that last wrote a slot.
+        fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
         num_slots: Slots that are or were in use.
     """
 
@@ -41,8 +43,9 @@ class VoxelBlocks:
         self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
         self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
         self.written = np.zeros(1 << 10, dtype=np.int32)
+        self.fused = np.zeros(1 << 10, dtype=np.uint8)
         self.num_slots = 0
-        self._unused: list[int] = []
+        self._unused = np.empty(0, dtype=np.int32)
 
     @property
     def num_voxel_blocks(self) -> int:
@@ -60,7 +63,7 @@ class VoxelBlocks:
 
         What arrays hold ahead is address space that the system has not backed with memory, and is left out.
         """
-        slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written)
+        slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
         return (
             self.num_slots * sum(_row_bytes(array) for array in slots)
             + self.num_entries * self._index_bytes
@@ -98,7 +101,8 @@ class VoxelBlocks:
 
     def give_voxels(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
         """New slots (n,) int32 for entries that have none."""
-        reused = [self._unused.pop() for _ in range(min(len(entries), len(self._unused)))]
+        kept = max(len(self._unused) - len(entries), 0)
+        reused, self._unused = self._unused[kept:][::-1], self._unused[:kept]
         needed = self.num_slots + len(entries) - len(reused)
         if needed > len(self.geometry):
             capacity = max(needed, len(self.geometry) * 3 // 2)
@@ -107,11 +111,13 @@ class VoxelBlocks:
             self.entry_of = _grown(self.entry_of, capacity, -1)
             self.slot_coords = _grown(self.slot_coords, capacity, 0)
             self.written = _grown(self.written, capacity, 0)
-        slots = np.array(reused + list(range(self.num_slots, needed)), dtype=np.int32)
+            self.fused = _grown(self.fused, capacity, 0)
+        slots = np.concatenate([reused, np.arange(self.num_slots, needed, dtype=np.int32)])
         self.num_slots = needed
         self.entry_of[slots] = entries
         self.slot_coords[slots] = self.coords[entries]
         self.written[slots] = frame_number
+        self.fused[slots] = 0
         self.slot_of[entries] = slots
         return slots
 
@@ -121,9 +127,11 @@ class VoxelBlocks:
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
         self.entry_of[slots] = -1
-        self.geometry[slots] = 0
-        self.colors[slots] = 0
-        self._unused.extend(int(slot) for slot in slots[::-1])
+        run_bands(
+            lambda start, stop: integration.clear(start, stop, slots, self.geometry, self.colors),
+            bands(len(slots), 512),
+        )
+        self._unused = np.concatenate([self._unused, slots[::-1]])
         return entries
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -156,6 +164,7 @@ class VoxelBlocks:
         blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
         blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
         blocks.written = np.zeros(m, np.int32)
+        blocks.fused = np.zeros(m, np.uint8)
         blocks.slot_of = np.full(n, -1, dtype=np.int32)
         blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
         return blocks

@@ -87,6 +87,8 @@ class VolumeConfig(Part):
     """Band behind a surface that is stored, voxels."""
     truncation_noise: float = Field(default=3.0, ge=0)
     """The band is at least this many standard deviations of the depth reading wide; 0 keeps it fixed."""
+    take_turns: bool = True
+    """Fuse into a block only in every second frame, with double weight, where the noise is coarser than the voxels."""
     max_weight: int = Field(default=255, ge=1, le=255)
     """Cap of the running average (eq. 4.19)."""
     weighting: Literal["constant", "angle"] = "angle"
@@ -127,7 +129,7 @@ class TrackerConfig(Part):
     stop: float = Field(default=5e-4, gt=0)
     """A level ends when the step's norm falls below this."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
-    """A level also ends when a step changes the cost by less than this share; 0 turns it off."""
+    """A level also ends when a short step changes the cost by less than this share; 0 turns it off."""
     second_pass: bool = True
     """Register again with the dynamic labels (algorithm 4)."""
     constant_velocity: bool = True
@@ -354,7 +356,7 @@ class Config(Part):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
-        "volume": {"voxel_size": 0.01, "truncation_noise": 0.0, "weighting": "constant"},
+        "volume": {"voxel_size": 0.01, "truncation_noise": 0.0, "weighting": "constant", "take_turns": False},
         "tracker": {
             "huber": 0.01,
             "damping": 0.02,

@@ -14,6 +14,8 @@ from dudmap.volume import TsdfVolume
 
 PIXELS_PER_BAND = 4800
 """What a thread is woken for; the coarsest level is one band."""
+SHORT = 4
+"""Only steps shorter than this many times ``stop`` end a level by how little they gain."""
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 
@@ -151,14 +153,13 @@ class Tracker:
                 break
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
-            T_trial = moved(T, step)
-            if (
-                np.linalg.norm(step) < self.config.stop
-            ):  # the step is known to be small before it is tried: take it and be done
+            T_trial, length = moved(T, step), np.linalg.norm(step)
+            if length < self.config.stop:  # known to be small before it is tried: take it and be done
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
-            settled = abs(trial.cost - system.cost) < self.config.stop_gain * system.cost
+            gain = abs(trial.cost - system.cost)
+            settled = length < SHORT * self.config.stop and gain < self.config.stop_gain * system.cost
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
@@ -204,8 +205,8 @@ class Tracker:
         )  # fmt: skip
         total = sums.sum(axis=0)
         return LinearSystem(
-            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]), float(total[31]),
-            residuals,
+            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
+            float(total[30]), float(total[31]), residuals,
         )  # fmt: skip
 
     def _judge(

@@ -305,19 +305,23 @@ class TsdfVolume:
     ) -> None:
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
-        slots = np.empty(len(self._near), dtype=np.int32)
+        slots, repeats = np.empty(len(self._near), dtype=np.int32), np.empty(len(self._near), dtype=np.float32)
+        turn = self._frame_number if self.config.take_turns else -1
         ranges = bands(len(slots), 2048)
         counts = run_bands(
             lambda start, stop: visibility.visible_slots(
-                start, stop, self._near, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size,
-                np.float32(self.block_size), nearest, farthest, self.noise_band(), np.float32(0.05),
-                np.float32(self.depth_max), slots,
+                start, stop, self._near, self.blocks.slot_coords, self.blocks.fused, turn, T_camera_world,
+                self._intrinsics(), size, np.float32(self.block_size), nearest, farthest, self.noise_band(),
+                np.float32(0.05), np.float32(self.depth_max), slots, repeats,
             ),
             ranges,
         )  # fmt: skip
-        visible = np.concatenate([slots[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)])
+        taken = [np.s_[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)]
+        visible = np.concatenate([slots[part] for part in taken])
+        repeats = np.concatenate([repeats[part] for part in taken])
         count = len(visible)
         self.blocks.written[visible] = self._frame_number
+        self.blocks.fused[visible] = np.minimum(self.blocks.fused[visible], 254) + 1
         voxel = np.array(
             [
                 self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
@@ -330,8 +334,8 @@ class TsdfVolume:
         occupied = np.empty(count, dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate(
-                start, stop, visible, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size, pixels,
-                self.blocks.geometry.reshape(-1), self.blocks.colors.reshape(-1), voxel, occupied,
+                start, stop, visible, repeats, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size,
+                pixels, self.blocks.geometry.reshape(-1), self.blocks.colors.reshape(-1), voxel, occupied,
             ),
             bands(count, 256),
         )  # fmt: skip

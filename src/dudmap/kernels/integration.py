@@ -47,12 +47,15 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, bands, pixels):
 
 
 @kernel
-def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geometry, map_colors, voxel, occupied):
+def integrate(
+    start, stop, slots, repeats, coords, T, intrinsics, size, pixels, map_geometry, map_colors, voxel, occupied
+):
     """Fuse one frame into blocks ``slots[start:stop]`` (eq. 4.18-4.23).
 
     Args:
         start, stop: Range of blocks.
         slots: (n,) int32.
+        repeats: (n,) float32, how many frames this one stands for.
         coords: (num_slots, 3) int16.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
@@ -111,6 +114,7 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
             seen[n] = pixels[np.uintp(pixel[n])]
         first = np.int64(slot) * 512
         geometry = map_geometry[first : first + 512]
+        times = repeats[block]
         held = painted = zero  # counted in float32: an integer sum has 64 bits, half as many in a register
         for n in range(512):
             word, reading, c = geometry[n], words[2 * n], words[2 * n + 1]
@@ -125,7 +129,7 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
             old_sdf = upper_half(word) * unit
             old_weight = bits(word, 8, 0xFF)
             holds = (old_weight > zero) & (old_sdf < tau * np.float32(0.9))
-            gain = bits(c, 0, 0xFF)
+            gain = bits(c, 0, 0xFF) * times
             gain = gain * carve_rate if empty & holds else gain
             gain = gain if banded | empty else zero
             total = old_weight + gain
@@ -165,6 +169,16 @@ def integrate(start, stop, slots, coords, T, intrinsics, size, pixels, map_geome
             shades[n] = (
                 (np.int32(r1 + half) << np.int32(20)) | (np.int32(g1 + half) << np.int32(10)) | np.int32(b1 + half)
             )
+
+
+@kernel
+def clear(start, stop, slots, geometry, colors):
+    """Empty the voxels of ``slots[start:stop]`` (n,) int32, rows of ``geometry`` and ``colors`` (num_slots, 512)."""
+    for n in range(start, stop):
+        shapes, shades = geometry[slots[n]], colors[slots[n]]
+        for voxel in range(512):
+            shapes[voxel] = 0
+            shades[voxel] = 0
 
 
 @kernel

@@ -6,6 +6,8 @@ from dudmap.kernels.threads import kernel
 
 TILE = 8
 """Edge of a depth tile of the finest level, pixels."""
+SETTLED = 8
+"""Frames that are fused into a block before it waits for its turn."""
 
 
 @kernel
@@ -82,14 +84,20 @@ def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
 
 @kernel
 def visible_slots(
-    start, stop, slots, coords, T, intrinsics, size, edge, nearest, farthest, bands, depth_min, depth_max, out
-):
-    """Slots of the blocks that a depth image can change.
+    start, stop, slots, coords, fused, turn, T, intrinsics, size, edge, nearest, farthest, bands, depth_min, depth_max,
+    out, repeats,
+):  # fmt: skip
+    """Slots of the blocks that a depth image can change, and whose turn it is.
+
+    Blocks so far away that the sensor's noise alone fills the band, which have been fused into often enough to hold
+    that noise's mean, take turns: half of them are fused into in one frame, the others in the next, with double weight.
 
     Args:
         start, stop: Range of candidates.
         slots: (n,) int32 candidates.
         coords: (num_slots, 3) int16 block coordinates by slot.
+        fused: (num_slots,) uint8 frames that were fused into a slot.
+        turn: Number of this frame; negative where no block waits for its turn.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
@@ -98,13 +106,14 @@ def visible_slots(
         bands: See ``mark_blocks``.
         depth_min, depth_max: Range of the readings, metres.
         out: (n,) int32 out, written from ``start`` on.
+        repeats: (n,) float32 out, how many frames this one stands for.
 
     Returns:
         How many slots were written.
     """
     count = start
     radius = np.float32(0.8661) * edge
-    behind, noise, base, scale = bands[1], bands[2], bands[3], bands[4]
+    front, behind, noise, base, scale = bands[0], bands[1], bands[2], bands[3], bands[4]
     for n in range(start, stop):
         slot = slots[n]
         x = (np.float32(coords[slot, 0]) + np.float32(0.5)) * edge
@@ -131,7 +140,11 @@ def visible_slots(
                     far = max(far, farthest[ty, tx])
             if cz - radius > far + max(behind, noise * (base + scale * far * far)):
                 continue
+        waits = (turn >= 0) & (fused[slot] >= SETTLED) & (noise * (base + scale * cz * cz) > front)
+        if waits and (coords[slot, 0] + coords[slot, 1] + coords[slot, 2] + turn) & 1:
+            continue
         out[count] = slot
+        repeats[count] = np.float32(2) if waits else np.float32(1)
         count += 1
     return count - start
 
