@@ -347,13 +347,15 @@ class Slam:
         known: NDArray[np.bool_] | None,
         clock: "Clock",
     ) -> tuple[TrackingResult, Labels | None]:
-        """Register and label a frame; if it fits unusually badly, once more from where the last image puts the camera.
+        """Register and label a frame; if it fits unusually badly, or the registration was still on its way, once more
+        from where the last image puts the camera.
 
         A hand that turns back, or frames that are missing, leave a first guess beyond the reach of the registration.
         What fits the map better is taken.
         """
         tracked, labels = self._register_from(levels, T_init, known, clock)
-        if not self.health.unusual(tracked):
+        arrived = tracked.settled or agree(T_init, tracked.T_world_camera, *SAME_START)
+        if arrived and not self.health.unusual(tracked):
             return tracked, labels
         with clock("parallax"):
             seen = self._see(observation, levels)
