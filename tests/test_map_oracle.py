@@ -294,6 +294,18 @@ def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     assert np.mean(empty[18:32, 24:41]) > 0.9
 
 
+def test_blocks_do_not_come_and_go_with_the_noise():
+    config, sensor = VolumeConfig(voxel_size=0.02), SensorConfig(sigma_base=0.001, sigma_scale=0.015)
+    volume, given = TsdfVolume(CAMERA, config, sensor, depth_max=4.0), []
+    give = volume.blocks.give_voxels
+    volume.blocks.give_voxels = lambda entries, number: given.append(len(entries)) or give(entries, number)
+    for number in range(40):
+        frame = wall(2.0)
+        noise = np.random.default_rng(number).normal(0, 0.05, CAMERA.shape).astype(np.float32)
+        volume.integrate(Frame(float(number), frame.depth + noise, frame.color), np.eye(4))
+    assert np.mean(given[-10:]) < 0.01 * volume.num_blocks
+
+
 def test_masked_pixels_change_nothing():
     volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
     static = np.ones(CAMERA.shape, dtype=bool)

@@ -263,7 +263,8 @@ class TsdfVolume:
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
                 stride * start, min(stride * stop, depth.shape[0]), stride, depth, self._intrinsics(), T, self._shape,
-                self._window, self._frame_number, self._stamps, self.noise_band(), out,
+                self._window, self.blocks.free_count, self.config.free_after, self._frame_number, self._stamps,
+                self.noise_band(), out,
             ),
             ranges, found,
         )  # fmt: skip

@@ -11,8 +11,14 @@ SETTLED = 8
 
 
 @kernel
-def mark_blocks(row_start, row_stop, stride, depth, intrinsics, T, shape, window, stamp, stamps, bands, found):
+def mark_blocks(
+    row_start, row_stop, stride, depth, intrinsics, T, shape, window, free_count, free_after, stamp, stamps, bands,
+    found,
+):  # fmt: skip
     """Window cells of blocks without voxels that the truncation bands of a depth image touch.
+
+    What is known to be free takes more to get voxels: there the band does not grow with the noise, in the outskirts of
+    which blocks would come and go with every frame.
 
     Args:
         row_start, row_stop, stride: Rows of the band, and the step between pixels.
@@ -21,6 +27,8 @@ def mark_blocks(row_start, row_stop, stride, depth, intrinsics, T, shape, window
         T: (3, 4) float32, camera to window blocks: block units, origin at the window's first block.
         shape: (3,) int64 blocks of the window.
         window: (cells,) int32.
+        free_count: (entries,) uint8 observations of emptiness.
+        free_after: How many make a block known free space.
         stamp: Number of this frame.
         stamps: (cells,) int32, the frame a cell was last named in. Two bands may both name one cell.
         bands: (5,) float32 truncation, truncation behind, truncation_noise, sigma_base, sigma_scale; block edge last.
@@ -51,7 +59,11 @@ def mark_blocks(row_start, row_stop, stride, depth, intrinsics, T, shape, window
                 bz = np.int64(np.floor(T[2, 0] * x + T[2, 1] * y + T[2, 2] * d + T[2, 3]))
                 if 0 <= bx < shape[0] and 0 <= by < shape[1] and 0 <= bz < shape[2]:
                     cell = (bx * shape[1] + by) * shape[2] + bz
-                    if window[cell] < 0 and stamps[cell] != stamp and count < len(found):
+                    held = window[cell]
+                    outside = d < z - bands[0] or d > z + bands[1]
+                    if held >= 0 or (held <= -2 and outside and free_count[-2 - held] >= free_after):
+                        continue
+                    if stamps[cell] != stamp and count < len(found):
                         stamps[cell] = stamp
                         found[count] = cell
                         count += 1
