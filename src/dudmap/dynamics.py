@@ -1,5 +1,6 @@
 """Which pixels move: mixture of residual densities, known free space, regions (thesis section 4.6, algorithm 3)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,7 +10,7 @@ from dudmap import surfaces
 from dudmap.background import Background
 from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.kernels import labeling
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.kernels.threads import bands, begun, run_bands
 from dudmap.tracker import Level, exposed
 from dudmap.volume import FREE, NOTHING, SURFACE, MapSample, TsdfVolume
 
@@ -50,26 +51,9 @@ def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iter
     The static density is kept at one to two standard deviations of the sensor and the dynamic one at no less than
     three times the static one, so that the names of the components cannot swap.
     """
-    counts = histogram.astype(np.float64)
-    total = counts.sum()
-    if total == 0:
-        return Mixture((0.9, 0.1), (1.0, 6.0))
     centers = (edges[:-1] + edges[1:]) / 2
-    prior, sigma = np.array([0.9, 0.1]), np.array([1.0, 6.0])
-    for _ in range(iterations):
-        density = prior[:, None] / sigma[:, None] * np.exp(-0.5 * (centers / sigma[:, None]) ** 2)
-        responsibility = density / np.maximum(density.sum(axis=0), 1e-300)  # E-step
-        mass = responsibility @ counts  # M-step
-        new_prior = np.clip(mass / total, 0.02, 0.98)
-        new_prior /= new_prior.sum()
-        new_sigma = np.sqrt((responsibility * centers**2) @ counts / np.maximum(mass, 1e-9))
-        new_sigma[0] = np.clip(new_sigma[0], 0.5, 2.0)
-        new_sigma[1] = np.clip(new_sigma[1], 3 * new_sigma[0], LARGEST)
-        done = np.abs(new_prior - prior).max() < 1e-4 and np.abs(new_sigma - sigma).max() < 1e-3
-        prior, sigma = new_prior, new_sigma
-        if done:
-            break
-    return Mixture((float(prior[0]), float(prior[1])), (float(sigma[0]), float(sigma[1])))
+    prior, static, dynamic = labeling.fit_mixture(histogram.astype(np.float64), centers, iterations, LARGEST)
+    return Mixture((1 - prior, prior), (static, dynamic))
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +89,7 @@ class DynamicDetector:
         self.background = Background(config)
         self.moving: NDArray[np.bool_] | None = None
         self.now = 0.0
-        self._cut: tuple[Level, surfaces.Pieces] | None = None
+        self._cut: tuple[Level, Callable[[], surfaces.Pieces]] | None = None
 
     def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
         """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
@@ -114,11 +98,17 @@ class DynamicDetector:
         self.background.begin(timestamp)
         self.moving = moving
 
+    def cut(self, level: Level, volume: TsdfVolume) -> None:
+        """Begin to cut an image into pieces of surface, while its pose is still being looked for."""
+        tolerance = self._tolerance(self._sigma(level.depth, volume), level.depth)
+        self._cut = level, begun(lambda: surfaces.pieces(level, tolerance))
+
     def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
         """Pieces of surface of an image; cut only once for the image that was asked for last."""
         if self._cut is None or self._cut[0] is not level:
-            self._cut = level, surfaces.pieces(level, self._tolerance(self._sigma(level.depth, volume), level.depth))
-        return self._cut[1]
+            self.cut(level, volume)
+        assert self._cut is not None
+        return self._cut[1]()
 
     def detect(
         self,

@@ -180,8 +180,10 @@ class Slam:
         if self.reference.is_empty:
             self._map_blind = flat
             return self._as_recorded(self._start(observation, levels, known, clock))
-        if not self.atlas.poses and self.config.dynamics.method == "em":  # a second pass begins
-            self.parallax.start(frame.timestamp)
+        if self.config.dynamics.method == "em":
+            self.detector.cut(self._compared(levels)[1], self.volume)
+            if not self.atlas.poses:  # a second pass begins
+                self.parallax.start(frame.timestamp)
         T_init, moving = self._expect(observation, levels, clock)
         self.detector.begin(frame.timestamp, moving)
         tracked, labels = self._register(observation, levels, T_init, known, clock)

@@ -6,6 +6,44 @@ from dudmap.kernels.threads import kernel
 
 
 @kernel
+def fit_mixture(counts, centers, iterations, largest):
+    """Expectation maximisation of two half-normal densities on a histogram (thesis eq. 4.52-4.56).
+
+    Args:
+        counts: (n,) float64.
+        centers: (n,) float64, normalised residuals.
+        iterations: Most iterations.
+        largest: Largest standard deviation of the dynamic density.
+
+    Returns:
+        Prior of the dynamic density, standard deviations of the static and of the dynamic one.
+    """
+    total = counts.sum()
+    prior, static, dynamic = 0.1, 1.0, 6.0
+    if total == 0:
+        return prior, static, dynamic
+    for _ in range(iterations):
+        mass, static_squares, dynamic_squares = 0.0, 0.0, 0.0
+        for n in range(len(counts)):  # E-step: responsibility of the dynamic density for each bin
+            square = centers[n] * centers[n]
+            p = (1 - prior) / static * np.exp(-0.5 * square / (static * static))
+            q = prior / dynamic * np.exp(-0.5 * square / (dynamic * dynamic))
+            share = q / max(p + q, 1e-300)
+            mass += share * counts[n]
+            dynamic_squares += share * counts[n] * square
+            static_squares += (1 - share) * counts[n] * square
+        new_prior = min(max(mass / total, 0.02), 0.98)  # M-step
+        new_static = min(max(np.sqrt(static_squares / max(total - mass, 1e-9)), 0.5), 2.0)
+        new_dynamic = min(max(np.sqrt(dynamic_squares / max(mass, 1e-9)), 3 * new_static), largest)
+        moved = max(abs(new_static - static), abs(new_dynamic - dynamic))
+        done = abs(new_prior - prior) < 1e-4 and moved < 1e-3
+        prior, static, dynamic = new_prior, new_static, new_dynamic
+        if done:
+            break
+    return prior, static, dynamic
+
+
+@kernel
 def grow(seeds, open_pixels, depth, tolerance, labels):
     """Regions that grow from seeds over open pixels without crossing a depth edge.
 

@@ -8,12 +8,14 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
-from typing import Any
+from typing import Any, TypeVar
 
 from numba import njit
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
 kernel = njit(nogil=True, cache=True, fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy")
+
+Result = TypeVar("Result")
 
 
 def num_threads() -> int:
@@ -29,6 +31,14 @@ def num_threads() -> int:
 @cache
 def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, num_threads() - 1), thread_name_prefix="dudmap")
+
+
+def begun(function: Callable[[], Result]) -> Callable[[], Result]:
+    """Begin ``function`` beside the caller, where there is a core for it; what is returned waits for its result."""
+    if num_threads() > 1:
+        return _pool().submit(function).result
+    result = function()
+    return lambda: result
 
 
 def bands(n: int, size: int) -> list[tuple[int, int]]:
