@@ -10,7 +10,7 @@ _HOMES = {
     "Config": "config",
     "DudmapError": "errors",
     "Frame": "frame",
-    "FrameResult": "slam",
+    "FrameResult": "result",
     "Mesh": "mesh",
     "Slam": "slam",
     "Trajectory": "trajectory",
@@ -38,8 +38,9 @@ if TYPE_CHECKING:
     from dudmap.errors import DudmapError
     from dudmap.frame import Frame
     from dudmap.mesh import Mesh
+    from dudmap.result import FrameResult
     from dudmap.sequences import open_sequence
-    from dudmap.slam import FrameResult, Slam
+    from dudmap.slam import Slam
     from dudmap.trajectory import Trajectory
     from dudmap.volume import TsdfVolume
 

@@ -20,7 +20,7 @@ from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from dudmap.movers import Mover
-    from dudmap.slam import FrameResult
+    from dudmap.result import FrameResult
 
 SCORED_COVERAGE = 0.05
 """Masks are scored in frames where more than this share of the image truly moves."""

@@ -10,7 +10,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 if TYPE_CHECKING:
-    from dudmap.slam import FrameResult
+    from dudmap.result import FrameResult
 
 
 class RunProgress:

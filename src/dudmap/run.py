@@ -23,9 +23,10 @@ from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from dudmap.bodies import Body
+    from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
-    from dudmap.slam import FrameResult, Slam
+    from dudmap.slam import Slam
 
 AHEAD = 4
 """Frames of a recording on disk that are read while an earlier one is processed."""
@@ -368,6 +369,7 @@ def _write(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
+    metrics["depth_delay_ms"] = 1000 * slam.delay.seconds
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()

@@ -1,10 +1,6 @@
 """The algorithm: track a frame against the map, find what moves, fuse what does not (thesis algorithm 4)."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
-from typing import Literal
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +21,7 @@ from dudmap.movers import Mover, MoverTracker
 from dudmap.parallax import DominantMotion, Parallax, several
 from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
+from dudmap.result import Clock, FrameResult
 from dudmap.similarity import SimilarityTest
 from dudmap.tracker import Level, Tracker, TrackingResult
 from dudmap.trajectory import Trajectory
@@ -40,49 +37,6 @@ SAME_START = 0.01, 0.25
 """Poses nearer to each other than this (m, deg) lead to the same registration."""
 LEAST_KNOWN = 0.09
 """Share of the readings that must rest on a surface of the map where most of the others move."""
-
-
-@dataclass(frozen=True, eq=False)
-class FrameResult:
-    """What one frame gave.
-
-    Attributes:
-        timestamp: Seconds, of the depth image.
-        state: "tracked" or "lost".
-        lost_reason: The check that failed, empty for a tracked frame.
-        T_world_camera: (4, 4), None if lost.
-        fused: Whether the frame changed the map.
-        skipped_similar: Whether it was left out of the fusion as a redundant view.
-        blind: Whether its image showed nothing (black, say) and the distances alone gave the pose; it is not fused.
-        relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
-        dynamic_mask: (H, W) bool, in the image as it was recorded.
-        dynamic_share: Share of the readings that lie in the mask.
-        residuals: (h, w) float32 signed distance to the map in metres at the label resolution, NaN off the map.
-        labels: The label step's full outcome, None where it did not run.
-        tracking: The registration's full outcome, None for the first frame.
-        timings: Milliseconds per stage.
-        movers: The moving bodies, by number; none in a lost frame.
-        submap: Number of the map that the pose belongs to, 0 the first.
-        corrected: Whether a known place was seen again here and all poses so far have moved.
-    """
-
-    timestamp: float
-    state: Literal["tracked", "lost"]
-    lost_reason: str
-    T_world_camera: NDArray[np.float64] | None
-    fused: bool
-    skipped_similar: bool
-    dynamic_mask: NDArray[np.bool_]
-    dynamic_share: float
-    residuals: NDArray[np.float32]
-    labels: Labels | None
-    tracking: TrackingResult | None
-    timings: dict[str, float] = field(default_factory=dict)
-    relocalized: bool = False
-    movers: tuple[Mover, ...] = ()
-    submap: int = 0
-    corrected: bool = False
-    blind: bool = False
 
 
 class Slam:
@@ -235,7 +189,7 @@ class Slam:
         return replace(result, dynamic_mask=self.preprocess.distorted(result.dynamic_mask))
 
     def _start(
-        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: Clock
     ) -> FrameResult:
         """The first frame with readings is the world: identity pose, what is not known to move is taken as static."""
         nothing = np.zeros(observation.depth.shape, dtype=bool) if known is None else known
@@ -264,7 +218,7 @@ class Slam:
         )  # fmt: skip
 
     def _expect(
-        self, observation: Observation, levels: dict[int, Level], clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], clock: Clock
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_] | None]:
         """First guess of the pose; with what moves (h, w) while the map is young, or movers hide most of the view:
         both then come from the last image and this one."""
@@ -347,7 +301,7 @@ class Slam:
         levels: dict[int, Level],
         T_init: NDArray[np.float64],
         known: NDArray[np.bool_] | None,
-        clock: "Clock",
+        clock: Clock,
     ) -> tuple[TrackingResult, Labels | None]:
         """Register and label a frame; if it fits unusually badly, or the registration was still on its way, once more
         from where the last image puts the camera.
@@ -369,7 +323,7 @@ class Slam:
         return (again, labels_again) if better else (tracked, labels)
 
     def _register_from(
-        self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: "Clock"
+        self, levels: dict[int, Level], T_init: NDArray[np.float64], known: NDArray[np.bool_] | None, clock: Clock
     ) -> tuple[TrackingResult, Labels | None]:
         """Register without labels, find what moves, register again without that (thesis algorithm 4).
 
@@ -456,7 +410,7 @@ class Slam:
         observation: Observation,
         T_world_camera: NDArray[np.float64],
         dynamic_mask: NDArray[np.bool_],
-        clock: "Clock",
+        clock: Clock,
     ) -> None:
         """Keep the frame as a keyframe if the camera has been nowhere near and the image shows something."""
         if self.config.relocalization.enabled and not self._blind:
@@ -464,7 +418,7 @@ class Slam:
                 self.keyframes.add(observation, T_world_camera, ~dynamic_mask, self.atlas.current)
 
     def _recognise(
-        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], known: NDArray[np.bool_] | None, clock: Clock
     ) -> tuple[TrackingResult, Labels | None] | None:
         """Registration of a lost frame from the pose of a place it shows; None where nothing is beyond doubt.
 
@@ -518,7 +472,7 @@ class Slam:
         return True
 
     def _close_loop(
-        self, observation: Observation, levels: dict[int, Level], result: FrameResult, clock: "Clock"
+        self, observation: Observation, levels: dict[int, Level], result: FrameResult, clock: Clock
     ) -> FrameResult:
         """Look for a place seen before; where the tracking has drifted since, everything moves."""
         tracked = result.tracking
@@ -563,7 +517,7 @@ class Slam:
         return [levels[self._level(width)] for width in self.config.tracker.widths]
 
     def _detect(
-        self, levels: dict[int, Level], tracked: TrackingResult, known: NDArray[np.bool_] | None, clock: "Clock"
+        self, levels: dict[int, Level], tracked: TrackingResult, known: NDArray[np.bool_] | None, clock: Clock
     ) -> Labels:
         level = levels[self._level(self.config.dynamics.width)]
         with clock("label"):
@@ -629,7 +583,7 @@ class Slam:
     def _result(
         self,
         observation: Observation,
-        clock: "Clock",
+        clock: Clock,
         levels: dict[int, Level],
         labels: Labels | None,
         known: NDArray[np.bool_] | None,
@@ -682,17 +636,3 @@ def _share(mask: NDArray[np.bool_], observation: Observation) -> float:
     """Share of the readings that lie in a mask."""
     readings = observation.depth > 0
     return float(np.count_nonzero(mask & readings) / max(np.count_nonzero(readings), 1))
-
-
-class Clock:
-    """Milliseconds per stage; a stage that runs twice adds up."""
-
-    def __init__(self) -> None:
-        self.timings: dict[str, float] = {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time a block of code."""
-        start = time.perf_counter()
-        yield
-        self.timings[stage] = self.timings.get(stage, 0.0) + 1000 * (time.perf_counter() - start)

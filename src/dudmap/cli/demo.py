@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from dudmap.camera import Camera
     from dudmap.frame import Frame
+    from dudmap.result import FrameResult
     from dudmap.run import Reading
-    from dudmap.slam import FrameResult
 
 app = typer.Typer(add_completion=False)
 
