@@ -5,6 +5,7 @@ import json
 import sys
 import types
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import ClassVar
 
 import cv2
@@ -66,6 +67,7 @@ class StandIn:
 
     def __init__(self, camera, config, first_pass=None):
         self.volume, self.poses, self.frames, self.first_pass = Volume(), [], [], first_pass
+        self.delay = SimpleNamespace(seconds=-0.015)
 
     @property
     def trajectory(self):
@@ -74,6 +76,9 @@ class StandIn:
     @property
     def maps(self):
         return [(self.trajectory, self.volume)]
+
+    def prepare(self, frame):
+        return frame
 
     def process(self, frame):
         index = len(self.frames)
@@ -129,7 +134,7 @@ def test_the_run_folder(slam, recording, tmp_path):
     expected = {
         "sequence": "desk", "complete": True, "frames": 8, "tracked": 7, "fused": 6, "skipped_similar": 1, "lost": 1,
         "unreadable": 0, "map_blocks": 3, "map_bytes": 12345, "mesh_vertices": 3, "mesh_triangles": 1,
-        "lost_frames": [{"timestamp": 100.2, "reason": "too few inliers"}],
+        "depth_delay_ms": -15.0, "lost_frames": [{"timestamp": 100.2, "reason": "too few inliers"}],
     }  # fmt: skip
     assert {key: metrics[key] for key in expected} == expected
     for key in ("ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "cpu_s", "wall_s", "peak_rss_mb"):

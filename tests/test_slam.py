@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import numpy as np
@@ -90,6 +91,19 @@ def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recordin
     again = slam.process(frames[11])
     assert again.state == "tracked"
     assert len(slam.trajectory) == 11
+
+
+def test_frames_made_ready_ahead_by_another_thread_give_the_same(recording):
+    sequence, frames = recording
+    alone, ahead = Slam(sequence.camera), Slam(sequence.camera)
+    with ThreadPoolExecutor(1) as reader:
+        for frame, prepared in zip(
+            frames[:8], [reader.submit(ahead.prepare, frame) for frame in frames[:8]], strict=True
+        ):
+            expected, found = alone.process(frame), ahead.process(prepared.result())
+            assert np.array_equal(expected.T_world_camera, found.T_world_camera)
+            assert np.array_equal(expected.dynamic_mask, found.dynamic_mask)
+            assert set(found.timings) == set(expected.timings)
 
 
 @pytest.mark.parametrize("grey", [0, 255])

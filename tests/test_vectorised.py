@@ -32,7 +32,7 @@ FEWEST = {
     (filtering, "bilateral"): {"loops": 2, "fma": 3, "packed": 28},
     (filtering, "limit_depth"): {"loops": 1},
     (filtering, "pad"): {"loops": 1},
-    (filtering, "pack_colors"): {"loops": 1, "fma": 2, "packed": 3, "converted": 2},
+    (filtering, "intensities"): {"loops": 1, "fma": 2, "packed": 3, "converted": 2},
     (filtering, "halve_intensity"): {"loops": 1, "packed": 3},
     (filtering, "halve_depth"): {"loops": 1, "fma": 3, "packed": 6},
 }

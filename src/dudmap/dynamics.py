@@ -98,16 +98,19 @@ class DynamicDetector:
         self.background.begin(timestamp)
         self.moving = moving
 
-    def cut(self, level: Level, volume: TsdfVolume) -> None:
-        """Begin to cut an image into pieces of surface, while its pose is still being looked for."""
+    def cut(self, level: Level, volume: TsdfVolume) -> Callable[[], surfaces.Pieces]:
+        """Begin to cut an image into pieces of surface, which needs no pose; what is returned waits for them."""
         tolerance = self._tolerance(self._sigma(level.depth, volume), level.depth)
-        self._cut = level, begun(lambda: surfaces.pieces(level, tolerance))
+        return begun(lambda: surfaces.pieces(level, tolerance))
+
+    def take(self, level: Level, surface: Callable[[], surfaces.Pieces]) -> None:
+        """Take over the pieces of the image that comes next, as ``cut`` gives them."""
+        self._cut = level, surface
 
     def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
         """Pieces of surface of an image; cut only once for the image that was asked for last."""
         if self._cut is None or self._cut[0] is not level:
-            self.cut(level, volume)
-        assert self._cut is not None
+            self._cut = level, self.cut(level, volume)
         return self._cut[1]()
 
     def detect(

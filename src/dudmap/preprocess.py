@@ -30,7 +30,6 @@ class Observation:
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
         raw_depth: (H, W) float32, metres, limited and undistorted only, 0 = none.
         intensity: (H, W) float32, 0..1.
-        color: (H, W) int32, r << 20 | g << 10 | b, ten bits per channel (8-bit value * 4).
         rgb: (H, W, 3) uint8.
     """
 
@@ -39,7 +38,6 @@ class Observation:
     depth: NDArray[np.float32]
     raw_depth: NDArray[np.float32]
     intensity: NDArray[np.float32]
-    color: NDArray[np.int32]
     rgb: NDArray[np.uint8]
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
@@ -80,14 +78,13 @@ class Preprocessor:
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
         # One allocation: above 4 MB NumPy asks for huge pages, and faulting five single images in costs 2 ms.
-        planes = np.empty((4, *self.camera.shape), dtype=np.float32)
-        smooth, raw_depth, intensity, color = planes[0], planes[1], planes[2], planes[3].view(np.int32)
+        smooth, raw_depth, intensity = np.empty((3, *self.camera.shape), dtype=np.float32)
         low, high = np.float32(max(self.config.depth_min, 1e-3)), np.float32(self.config.depth_max)
         filtering.limit_depth(depth, low, high, raw_depth)
         self._fill(raw_depth, smooth)
         self._smooth(smooth)
-        filtering.pack_colors(0, self.camera.height, rgb, intensity, color)
-        return Observation(frame.timestamp, self.camera, smooth, raw_depth, intensity, color, rgb)
+        filtering.intensities(0, self.camera.height, rgb, intensity)
+        return Observation(frame.timestamp, self.camera, smooth, raw_depth, intensity, rgb)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Mask (H, W) bool of a frame as a lens without distortion sees it.

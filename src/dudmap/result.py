@@ -60,8 +60,8 @@ class FrameResult:
 class Clock:
     """Milliseconds per stage; a stage that runs twice adds up."""
 
-    def __init__(self) -> None:
-        self.timings: dict[str, float] = {}
+    def __init__(self, timings: dict[str, float] | None = None) -> None:
+        self.timings = timings or {}
 
     @contextmanager
     def __call__(self, stage: str) -> Iterator[None]:

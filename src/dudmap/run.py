@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
-    from dudmap.slam import Slam
+    from dudmap.slam import Prepared, Slam
 
 AHEAD = 4
 """Frames of a recording on disk that are read while an earlier one is processed."""
@@ -64,12 +64,14 @@ class Reading(NamedTuple):
         mask: (H, W) its true dynamic mask, None if not known, or why it cannot be read.
         ms: Reading time of the frame.
         known: (H, W) what a mask from outside says moves, None if there is none, or why it cannot be read.
+        prepared: The frame as the system takes it, where it was made ready ahead.
     """
 
     frame: Frame | FrameError
     mask: NDArray[np.bool_] | FrameError | None
     ms: float
     known: NDArray[np.bool_] | FrameError | None = None
+    prepared: "Prepared | None" = None
 
 
 class Turn(NamedTuple):
@@ -168,7 +170,7 @@ def run(
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(
-                    _live(sequence, count, known) if live else _waiting(sequence, count, ahead, known)
+                    _live(sequence, count, known) if live else _waiting(sequence, count, ahead, known, slam)
                 ) as turns:
                     for turn in turns:
                         _process(
@@ -222,23 +224,25 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
 
 
 def read_ahead(
-    sequence: "Sequence", count: int, ahead: int = AHEAD, known: "MaskFolder | None" = None
+    sequence: "Sequence", count: int, ahead: int = AHEAD, known: "MaskFolder | None" = None, slam: "Slam | None" = None
 ) -> "Generator[Reading]":
-    """The first ``count`` frames in order, read by one thread up to ``ahead`` frames ahead."""
+    """The first ``count`` frames in order, read and made ready for ``slam`` by one thread up to ``ahead`` ahead."""
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
     pending: deque[Future[Reading]] = deque()
     try:
         for index in range(count + ahead):
             if index < count:
-                pending.append(reader.submit(_read, sequence, index, known))
+                pending.append(reader.submit(_read, sequence, index, known, slam))
             if index >= ahead:
                 yield pending.popleft().result()
     finally:
         reader.shutdown(cancel_futures=True)
 
 
-def _waiting(sequence: "Sequence", count: int, ahead: int, known: "MaskFolder | None") -> "Generator[Turn]":
-    for index, reading in enumerate(read_ahead(sequence, count, ahead, known)):
+def _waiting(
+    sequence: "Sequence", count: int, ahead: int, known: "MaskFolder | None", slam: "Slam"
+) -> "Generator[Turn]":
+    for index, reading in enumerate(read_ahead(sequence, count, ahead, known, slam if ahead else None)):
         yield Turn(index, reading)
 
 
@@ -260,14 +264,15 @@ def _load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
             slam.process(frame)
 
 
-def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None) -> Reading:
+def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> Reading:
     start = time.perf_counter()
     try:
         frame: Frame | FrameError = sequence[index]
     except FrameError as error:
         return Reading(error, None, 1000 * (time.perf_counter() - start))
     ms = 1000 * (time.perf_counter() - start)
-    return Reading(frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index))
+    prepared = None if slam is None else slam.prepare(frame)
+    return Reading(frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared)
 
 
 def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:
@@ -303,7 +308,8 @@ def _process(
     if record.masked is not None:
         record.masked += known is not None
     start = time.perf_counter()
-    result = slam.process(reading.frame) if known is None else slam.process(reading.frame, known)
+    frame = reading.prepared or reading.frame
+    result = slam.process(frame) if known is None else slam.process(frame, known)
     end = time.perf_counter()
     delays = {} if turn.arrival is None else {"dropped": turn.dropped, "latency": 1000 * (end - turn.arrival)}
     record.add(result, 1000 * (end - start), reading.ms, truth, **delays)

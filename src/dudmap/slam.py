@@ -1,6 +1,8 @@
 """The algorithm: track a frame against the map, find what moves, fuse what does not (thesis algorithm 4)."""
 
-from dataclasses import replace
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +25,7 @@ from dudmap.preprocess import Observation, Preprocessor, exposed_color, pyramid
 from dudmap.relocalization import Keyframes, agree
 from dudmap.result import Clock, FrameResult
 from dudmap.similarity import SimilarityTest
+from dudmap.surfaces import Pieces
 from dudmap.tracker import Level, Tracker, TrackingResult
 from dudmap.trajectory import Trajectory
 from dudmap.volume import FREE, NOTHING, SURFACE, TsdfVolume
@@ -37,6 +40,23 @@ SAME_START = 0.01, 0.25
 """Poses nearer to each other than this (m, deg) lead to the same registration."""
 LEAST_KNOWN = 0.09
 """Share of the readings that must rest on a surface of the map where most of the others move."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """A frame made ready by ``Slam.prepare``.
+
+    Attributes:
+        observation: Its images, filtered.
+        levels: Image pyramid by number of halvings.
+        surface: Gives its pieces of surface, None where they are not asked; waits until they are cut.
+        ms: How long that took.
+    """
+
+    observation: Observation
+    levels: dict[int, Level]
+    surface: Callable[[], Pieces] | None
+    ms: float
 
 
 class Slam:
@@ -113,41 +133,54 @@ class Slam:
             return []
         return self.fusion.bodies({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
-    def process(self, frame: Frame, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
+    def prepare(self, frame: Frame) -> Prepared:
+        """The part of a frame's work that needs no other frame, for ``process`` to go on with.
+
+        Another thread may do it while an earlier frame is processed; one frame at a time.
+
+        Raises:
+            DatasetError: The images do not fit the camera or each other.
+        """
+        start = time.perf_counter()
+        observation = self.preprocess(frame)
+        levels = self._levels(observation)
+        labelled = self.config.dynamics.method == "em"
+        surface = self.detector.cut(self._compared(levels)[1], self.volume) if labelled else None
+        return Prepared(observation, levels, surface, 1000 * (time.perf_counter() - start))
+
+    def process(self, frame: Frame | Prepared, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
 
         Args:
-            frame: Depth and colour with a timestamp later than all before.
+            frame: Depth and colour with a timestamp later than all before; prepared or not, the result is the same.
             dynamic_mask: (H, W) bool, pixels of the frame that are known to move, e.g. of a segmentation network;
                 they count as moving from the first registration on, whatever is found besides.
 
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        clock = Clock()
-        with clock("preprocess"):
-            observation = self.preprocess(frame)
-            levels = self._levels(observation)
-            known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
-            flat = bool(self._tracked(levels)[0].intensity.std() < FLAT)
-            self._blind = flat and not self._map_blind
+        prepared = frame if isinstance(frame, Prepared) else self.prepare(frame)
+        observation, levels, clock = prepared.observation, prepared.levels, Clock({"preprocess": prepared.ms})
+        known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
+        flat = bool(self._tracked(levels)[0].intensity.std() < FLAT)
+        self._blind = flat and not self._map_blind
         if self.reference.is_empty:
             self._map_blind = flat
             return self._as_recorded(self._start(observation, levels, known, clock))
-        if self.config.dynamics.method == "em":
-            self.detector.cut(self._compared(levels)[1], self.volume)
+        if prepared.surface is not None:
+            self.detector.take(self._compared(levels)[1], prepared.surface)
             if not self.atlas.poses:  # a second pass begins
-                self.parallax.start(frame.timestamp)
+                self.parallax.start(observation.timestamp)
         T_init, moving = self._expect(observation, levels, clock)
-        self.detector.begin(frame.timestamp, moving)
+        self.detector.begin(observation.timestamp, moving)
         tracked, labels = self._register(observation, levels, T_init, known, clock)
-        reason = self._doubt(frame.timestamp, levels, tracked, labels)
+        reason = self._doubt(observation.timestamp, levels, tracked, labels)
         recognised = self._recognise(observation, levels, known, clock) if reason else None
         if recognised is not None:
             (tracked, labels), reason = recognised, ""
-            self.motion.restart(frame.timestamp, tracked.T_world_camera)
+            self.motion.restart(observation.timestamp, tracked.T_world_camera)
         if reason:
-            self._lose(frame.timestamp)
+            self._lose(observation.timestamp)
             if self._start_submap(observation):
                 return self._as_recorded(self._start(observation, levels, known, clock))
             return self._as_recorded(

@@ -7,6 +7,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,6 +27,8 @@ if TYPE_CHECKING:
 
 WARM_UP = 10
 """First frames of a run that are not timed."""
+IN_TURN = 20
+"""Frames of one system before it is the other's turn."""
 
 
 class Figure(NamedTuple):
@@ -157,15 +160,20 @@ def _room(frames: int) -> "Sequence":
 
 
 def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
-    """The system and the milliseconds of every frame of a recording; rendering is not timed."""
+    """The system and the milliseconds of every frame of a recording, until it and the next one, which is made ready
+    meanwhile as in a run, are both done; rendering is not timed."""
     from dudmap.slam import Slam
 
     slam = Slam(sequence.camera, config)
-    for index in range(frames):
-        frame = sequence[index]
-        start = time.perf_counter()
-        slam.process(frame)
-        yield slam, 1000 * (time.perf_counter() - start)
+    with ThreadPoolExecutor(1) as reader:
+        prepared = slam.prepare(sequence[0])
+        for index in range(frames):
+            following = sequence[min(index + 1, frames - 1)]
+            start = time.perf_counter()
+            coming = reader.submit(slam.prepare, following)
+            slam.process(prepared)
+            prepared = coming.result()
+            yield slam, 1000 * (time.perf_counter() - start)
 
 
 def _time_frames(job: tuple[float, int]) -> Row:
@@ -228,17 +236,29 @@ def _time_iteration(frames: int) -> Row:
 
 
 def _time_walk(frames: int) -> Row:
-    """Median time of the first and the last tenth of a walk through space that is always new."""
+    """Median time of the first and the last tenth of a walk through space that is always new.
+
+    The machine's speed changes within minutes, so a second system walks the first tenth while the first one walks the
+    last, a few frames each in turn.
+    """
     from dudmap.benchmark.passage import passage
 
-    sequence, slam, times = passage(frames + 1), None, []
-    for slam, ms in _processed(Config(), sequence, frames):  # noqa: B007
-        times.append(ms)
+    sequence, slam = passage(frames + 1), None
+    start = min(60, frames // 4)
+    tenth = max((frames - start) // 10, 1)
+    old, new = _processed(Config(), sequence, frames), _processed(Config(), sequence, frames)
+    for _ in range(frames - tenth):
+        slam, _ = next(old)
+    for _ in range(start):
+        next(new)
+    first: list[float] = []
+    last: list[float] = []
+    while len(last) < tenth:
+        for walk, times in ((new, first), (old, last)):
+            times += [next(walk)[1] for _ in range(min(IN_TURN, tenth - len(times)))]
     assert slam is not None
-    timed = times[min(60, frames // 4) :]
-    tenth = max(len(timed) // 10, 1)
-    first, last = statistics.median(timed[:tenth]), statistics.median(timed[-tenth:])
-    row: Row = {"first_ms": first, "last_ms": last, "growth": last / first}
+    row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
+    row["growth"] = row["last_ms"] / row["first_ms"]
     row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
     return row | _time_again(slam, sequence[frames])
 

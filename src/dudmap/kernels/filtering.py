@@ -1,4 +1,4 @@
-"""Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, colour packing, halving.
+"""Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, intensities, halving.
 
 Rows are cut into slices before the inner loop: an index that the compiler cannot prove positive costs numba's
 wrap-around test, and with it the vectorisation (measured: a factor 4).
@@ -163,15 +163,14 @@ def pad(row_start, row_stop, depth, margin, out):
 
 
 @kernel
-def pack_colors(row_start, row_stop, rgb, intensity, packed):
-    """Intensity 0.299 R + 0.587 G + 0.114 B in 0..1, and r << 20 | g << 10 | b with ten bits (8-bit value * 4)."""
+def intensities(row_start, row_stop, rgb, out):
+    """Intensity 0.299 R + 0.587 G + 0.114 B in 0..1 of ``rgb`` (H, W, 3) uint8 into ``out`` (H, W) float32."""
     red, green, blue = np.float32(0.299 / 255), np.float32(0.587 / 255), np.float32(0.114 / 255)
     for v in range(row_start, row_stop):
-        source, shade, word = rgb[v].reshape(-1), intensity[v], packed[v]
+        source, shade = rgb[v].reshape(-1), out[v]
         for u in range(shade.size):
             r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
             shade[u] = red * np.float32(r) + green * np.float32(g) + blue * np.float32(b)
-            word[u] = (np.int32(r) << 22) | (np.int32(g) << 12) | (np.int32(b) << 2)
 
 
 @kernel
