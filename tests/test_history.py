@@ -65,8 +65,8 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
 
     monkeypatch.setattr("dudmap.history.tempfile.TemporaryFile", full)
     history = History(CAMERA, gap=1)
-    history.add(smooth_frame(np.random.default_rng(3), 0.0), np.ones((120, 160), dtype=bool), shifted(0))
-    with pytest.raises(MapError, match=r"No space left.*TMPDIR"):
+    with pytest.raises(MapError, match=r"No space left.*TMPDIR"):  # at the latest when it is read
+        history.add(smooth_frame(np.random.default_rng(3), 0.0), np.ones((120, 160), dtype=bool), shifted(0))
         history[0]
 
 

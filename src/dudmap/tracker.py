@@ -14,8 +14,10 @@ from dudmap.volume import TsdfVolume
 
 PIXELS_PER_BAND = 4800
 """What a thread is woken for; the coarsest level is one band."""
+COARSE = 2
+"""The coarser levels end with a step below this many times ``stop``: they only lead to the next."""
 SHORT = 4
-"""Only steps shorter than this many times ``stop`` end a level by how little they gain."""
+"""Only steps shorter than this many times that end a level by how little they gain."""
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
 
@@ -128,7 +130,9 @@ class Tracker:
                     lit = exposed(level, exposure)
                     system = self.linearize(volume, lit, T, weights)
                     iterations += 1
-            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit)
+            finest = first_level + index == len(self.config.iterations) - 1
+            stop = self.config.stop if finest else COARSE * self.config.stop
+            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop)
             iterations += used
         if system is None:  # every level is left out: judge the first guess
             system = self.linearize(volume, levels[-1], T, weights)
@@ -144,6 +148,7 @@ class Tracker:
         weights: NDArray[np.float32],
         system: LinearSystem,
         limit: int,
+        stop: float,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
         damping, used = self.config.damping, 0
@@ -154,12 +159,12 @@ class Tracker:
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
             T_trial, length = moved(T, step), np.linalg.norm(step)
-            if length < self.config.stop:  # known to be small before it is tried: take it and be done
+            if length < stop:  # known to be small before it is tried: take it and be done
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
             gain = abs(trial.cost - system.cost)
-            settled = length < SHORT * self.config.stop and gain < self.config.stop_gain * system.cost
+            settled = length < SHORT * stop and gain < self.config.stop_gain * system.cost
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
