@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.config import DynamicsConfig
 from dudmap.kernels import segmentation
+from dudmap.kernels.threads import bands, run_bands
 from dudmap.tracker import Level
 
 REACH = 3
@@ -314,11 +315,10 @@ class StandStill:
             views = self._views if self._complete else self._recent
         else:
             views = self._recent if unknown >= UNKNOWN else ()
-        for view in views:
+        asked = [view for view in views if 0 < abs(self._now - view.timestamp) <= self.config.start_seconds]
+        answers = run_bands(lambda n, _: _against(level, T_world_camera, asked[n]), bands(len(asked), 1))
+        for view, (gap, difference, _) in zip(asked, answers, strict=True):
             apart = abs(self._now - view.timestamp)
-            if not 0 < apart <= self.config.start_seconds:
-                continue
-            gap, difference, _ = _against(level, T_world_camera, view)
             seen, close = ~np.isnan(gap), np.abs(gap) <= noise
             free += gap > noise
             there += close

@@ -159,7 +159,7 @@ def speed(
     from dudmap.benchmark.interleaved import find_open3d
     from dudmap.metrics import machine, versions
 
-    frames, long_frames = (20, 60) if quick else (120, 2000)
+    frames, long_frames = (20, 60) if quick else (300, 2000)
     figures = timing.speed_figures(
         frames,
         long_frames if long else 0,
