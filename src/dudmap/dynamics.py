@@ -98,9 +98,9 @@ class DynamicDetector:
         self.background.begin(timestamp)
         self.moving = moving
 
-    def cut(self, level: Level, volume: TsdfVolume) -> Callable[[], surfaces.Pieces]:
-        """Begin to cut an image into pieces of surface, which needs no pose; what is returned waits for them."""
-        tolerance = self._tolerance(self._sigma(level.depth, volume), level.depth)
+    def cut(self, level: Level, voxel_size: float) -> Callable[[], surfaces.Pieces]:
+        """Begin to cut an image into pieces of surface, which needs no map; what is returned waits for them."""
+        tolerance = self._tolerance(self._sigma(level.depth, voxel_size), level.depth)
         return begun(lambda: surfaces.pieces(level, tolerance))
 
     def take(self, level: Level, surface: Callable[[], surfaces.Pieces]) -> None:
@@ -110,7 +110,7 @@ class DynamicDetector:
     def pieces(self, level: Level, volume: TsdfVolume) -> surfaces.Pieces:
         """Pieces of surface of an image; cut only once for the image that was asked for last."""
         if self._cut is None or self._cut[0] is not level:
-            self._cut = level, self.cut(level, volume)
+            self._cut = level, self.cut(level, volume.voxel_size)
         return self._cut[1]()
 
     def detect(
@@ -129,7 +129,7 @@ class DynamicDetector:
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        sigma = self._sigma(level.depth, volume)
+        sigma = self._sigma(level.depth, volume.voxel_size)
         tolerance = self._tolerance(sigma, level.depth)
         residual = np.abs(sample.distance) / sigma
         counted = residual[sample.place == SURFACE]
@@ -184,10 +184,10 @@ class DynamicDetector:
         self.memory.forget()
         self.background.forget()
 
-    def _sigma(self, depth: NDArray[np.float32], volume: TsdfVolume) -> NDArray[np.float32]:
+    def _sigma(self, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
         sensor = self.sensor.sigma_base + self.sensor.sigma_scale * depth**2
-        return np.hypot(sensor, 0.4 * volume.voxel_size).astype(np.float32)
+        return np.hypot(sensor, 0.4 * voxel_size).astype(np.float32)
 
     @staticmethod
     def _tolerance(sigma: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -144,8 +144,9 @@ class Slam:
         start = time.perf_counter()
         observation = self.preprocess(frame)
         levels = self._levels(observation)
-        labelled = self.config.dynamics.method == "em"
-        surface = self.detector.cut(self._compared(levels)[1], self.volume) if labelled else None
+        surface = None
+        if self.config.dynamics.method == "em":
+            surface = self.detector.cut(self._compared(levels)[1], self.config.volume.voxel_size)
         return Prepared(observation, levels, surface, 1000 * (time.perf_counter() - start))
 
     def process(self, frame: Frame | Prepared, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
