@@ -14,6 +14,8 @@ from numpy.typing import NDArray
 
 from dudmap import se3
 from dudmap.camera import Camera
+from dudmap.kernels import consensus
+from dudmap.kernels.threads import bands, run_bands
 from dudmap.surfaces import Pieces
 from dudmap.tracker import Level
 
@@ -346,9 +348,15 @@ def _rigid_motion(
     guesses = np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0]
     guesses = guesses[np.linalg.norm(guesses, axis=1) < 0.5]
     guesses = np.concatenate([np.zeros((1, 6)), guesses])
-    error = flow[None] - np.einsum("nij,gj->gni", J, guesses)
-    square = np.minimum((error**2).sum(axis=2) / NOISE_PX**2, 1.0)
-    T = se3.exp(guesses[int(np.argmax((1 - square) @ surface))])
+    by_axis, flow_by_axis = np.ascontiguousarray(J.transpose(1, 2, 0)), np.ascontiguousarray(flow.T)
+    explained = np.empty(len(guesses))
+    run_bands(
+        lambda start, stop: consensus.explained(
+            start, stop, guesses, by_axis, flow_by_axis, surface, NOISE_PX, explained
+        ),
+        bands(len(guesses), 64),
+    )
+    T = se3.exp(guesses[int(np.argmax(explained))])
     for scale in (3.0, 2.0, 1.0, 1.0, 1.0):
         residual = targets - _projected(T, points, camera)
         kept = np.linalg.norm(residual, axis=1) < scale * NOISE_PX
