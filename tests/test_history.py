@@ -64,10 +64,14 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("dudmap.history.tempfile.TemporaryFile", full)
-    history = History(CAMERA, gap=1)
-    with pytest.raises(MapError, match=r"No space left.*TMPDIR"):  # at the latest when it is read
-        history.add(smooth_frame(np.random.default_rng(3), 0.0), np.ones((120, 160), dtype=bool), shifted(0))
-        history[0]
+    history, frame = History(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
+
+    def keep():
+        history.add(frame, np.ones((120, 160), dtype=bool), shifted(0))
+        return history[0]  # written by now at the latest
+
+    with pytest.raises(MapError, match=r"No space left.*TMPDIR"):
+        keep()
 
 
 @pytest.fixture(scope="module")

@@ -190,3 +190,14 @@ def test_a_thing_that_stops_becomes_map_after_the_settle_time():
             released = i
     assert released is not None
     assert 0.8 < (released - rest) / 30 < slam.config.dynamics.settle_time + 0.7
+
+
+@pytest.mark.parametrize(("moved", "mismatch", "whole"), [(0.5, 0.27, True), (0.0, 0.27, False), (0.5, 0.1, False)])
+def test_a_thing_does_not_move_by_halves(moved, mismatch, whole):
+    """Half of a piece goes on moving: so does all of it, if the rest fits less well than what rests usually does."""
+    one, many = np.array([0.0, 500.0]), np.array([0.0, 20000.0])
+    verdict = surfaces.Verdict(
+        size=np.append(one, many[1]), known=np.ones(3), moving=np.array([0, 0.5, 0]), rest=np.array([0, 250.0, 20000]),
+        shift=np.array([0, 0.3, 0.1]), mismatch=np.array([0, mismatch, 0.05]), texture=np.array([0, 0.07, 0.07]),
+    )  # fmt: skip
+    assert surfaces.moves_as_a_whole(verdict, np.array([0, moved, 0])).tolist() == [False, whole, False]

@@ -182,7 +182,8 @@ def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np
 
     A piece moves if nearly all of its pixels do by themselves. A piece that is not too large also moves if a part of it
     does and the rest fits badly, by its distances and intensities together and by more than is common in this frame;
-    the larger the part, the less will do, and still less where most of it moved in the last frame.
+    the larger the part, the less will do, and still less where it moved in the last frame: a thing does not move by
+    halves.
 
     Args:
         verdict: Evidence of each piece.
@@ -199,6 +200,7 @@ def moves_as_a_whole(verdict: Verdict, moved: NDArray[np.float64]) -> NDArray[np
     whole = (score >= 1) & (verdict.moving >= 0.1)
     whole |= np.where(telling, (verdict.moving >= 0.2) & (doubt >= 1), verdict.moving >= 0.6)
     whole |= (moved >= 0.7) & (verdict.moving >= 0.2) & (doubt >= 0.4)
+    whole |= (moved >= 0.4) & (verdict.moving >= 0.4) & (doubt >= 0.5)
     whole &= verdict.size <= LARGEST * verdict.size[1:].sum()
     whole |= verdict.moving >= 0.8
     whole &= verdict.size >= SMALLEST
