@@ -104,10 +104,10 @@ def counted(frames, voxel):
     pixels = Counter()
     original = slam.tracker.linearize
 
-    def counting(volume, level, *rest):
+    def counting(volume, level, *rest, **named):
         pixels["linearised"] += level.depth.size
         pixels["iterations"] += 1
-        return original(volume, level, *rest)
+        return original(volume, level, *rest, **named)
 
     slam.tracker.linearize = counting
     rows = []

@@ -306,6 +306,13 @@ def test_blocks_do_not_come_and_go_with_the_noise():
     assert np.mean(given[-10:]) < 0.01 * volume.num_blocks
 
 
+def test_a_frame_without_readings_leaves_an_empty_map_empty():
+    volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
+    volume.integrate(wall(1.5), np.eye(4), np.zeros(CAMERA.shape, dtype=bool))
+    assert volume.is_empty
+    assert volume.num_blocks == 0
+
+
 def test_masked_pixels_change_nothing():
     volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
     static = np.ones(CAMERA.shape, dtype=bool)

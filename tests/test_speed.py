@@ -1,5 +1,8 @@
 """dudmap benchmark speed: the table, its failures, the passage of new space, and a map that outgrows its table."""
 
+import importlib.util
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -107,3 +110,16 @@ def test_a_python_without_open3d_is_refused(tmp_path):
     with pytest.raises(DudmapError, match="cannot import open3d: No module named open3d"):
         find_open3d(program)
     assert find_open3d(None) in (None, sys.executable)
+
+
+def test_the_roofline_counts_what_the_system_does():
+    """The script outside the package wraps the tracker: it must keep step with it."""
+    place = Path(__file__).parent.parent / "benchmarks" / "roofline.py"
+    spec = importlib.util.spec_from_file_location("roofline", place)
+    roofline = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(roofline)
+    measured, slam = roofline.counted(3, 0.04)
+    assert measured["iterations"] >= 3
+    assert measured["linearised"] >= 3 * 80 * 60
+    assert measured["blocks"] > 100
+    assert all(bytes_ > 0 and operations > 0 for _, bytes_, operations, _ in roofline.stages(measured, slam))

@@ -26,11 +26,13 @@ class MotionModel:
             return self._T_world_camera
         return self._T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
 
-    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Take over the pose of a tracked frame."""
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Take over the pose of a tracked frame; returns ``velocity_to`` it."""
+        velocity = self.velocity_to(timestamp, T_world_camera)
         if self._known:
-            self._velocity = self.velocity_to(timestamp, T_world_camera)
+            self._velocity = velocity
         self._timestamp, self._T_world_camera, self._known = timestamp, T_world_camera, True
+        return velocity
 
     def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Twist per second (6,), camera axes, that leads from the last pose to this one; 0 where there is none."""

@@ -202,8 +202,7 @@ class Slam:
 
     def _keep(self, timestamp: float, levels: dict[int, Level], tracked: TrackingResult, labels: Labels | None) -> None:
         """Take over a frame whose pose is believed: what the next one is predicted and judged from."""
-        velocity = self.motion.velocity_to(timestamp, tracked.T_world_camera)
-        self.motion.update(timestamp, tracked.T_world_camera)
+        velocity = self.motion.update(timestamp, tracked.T_world_camera)
         self.health.tracked(tracked)
         self._lost_since = None
         self._moved = None if labels is None else labels.dynamic

@@ -304,6 +304,8 @@ class TsdfVolume:
         T_camera_world: NDArray[np.float32],
         tiles: Sequence[NDArray[np.float32]],
     ) -> None:
+        if len(self._near) == 0:
+            return
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
         slots, repeats = np.empty(len(self._near), dtype=np.int32), np.empty(len(self._near), dtype=np.float32)
