@@ -9,9 +9,11 @@ import pytest
 from dudmap import parallax, se3, synthetic
 from dudmap.camera import Camera
 from dudmap.config import Config
+from dudmap.consensus import NOISE_PX, flow_jacobian, projected, rigid_motion
+from dudmap.corners import rests_as_well
 from dudmap.health import TrackingHealth
-from dudmap.kernels import labeling
-from dudmap.parallax import _flow_jacobian, _projected, _rests_as_well, dominant_motion
+from dudmap.kernels import consensus, labeling
+from dudmap.parallax import dominant_motion
 from dudmap.slam import Slam
 from dudmap.tracker import TrackingResult
 
@@ -37,11 +39,38 @@ def compare(before, after, moved=None):
 def test_the_flow_jacobian_is_the_derivative_of_the_projection():
     rng = np.random.default_rng(3)
     points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (20, 3))
-    J = _flow_jacobian(points, CAMERA)
+    J = flow_jacobian(points, CAMERA)
     for axis in range(6):
         step = 1e-6 * np.eye(6)[axis]
-        numeric = (_projected(se3.exp(step), points, CAMERA) - _projected(se3.exp(-step), points, CAMERA)) / 2e-6
+        numeric = (projected(se3.exp(step), points, CAMERA) - projected(se3.exp(-step), points, CAMERA)) / 2e-6
         np.testing.assert_allclose(J[:, :, axis], numeric, rtol=1e-5, atol=1e-4)
+
+
+def test_the_refining_step_is_that_of_least_squares():
+    rng = np.random.default_rng(5)
+    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (200, 3))
+    T = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
+    targets = projected(T, points, CAMERA) + rng.normal(0, 1, (200, 2))
+    guess = se3.exp(np.array([0.018, -0.01, 0.028, 0.011, 0.019, -0.01]))
+    residual = targets - projected(guess, points, CAMERA)
+    near = np.linalg.norm(residual, axis=1) < 2 * NOISE_PX
+    assert 20 < np.count_nonzero(near) < 180
+    J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
+    H, gradient = np.ones((6, 6)), np.ones(6)
+    count = consensus.refinement(points, targets, guess, CAMERA.intrinsics, 2 * NOISE_PX, H, gradient)
+    assert count == np.count_nonzero(near)
+    expected = np.linalg.lstsq(J, residual[near].reshape(-1), rcond=None)[0]
+    np.testing.assert_allclose(np.linalg.solve(H, gradient), expected, rtol=1e-5, atol=1e-9)
+
+
+def test_the_motion_of_most_surface_is_found_among_what_moves_otherwise():
+    rng = np.random.default_rng(7)
+    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (400, 3))
+    T = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
+    targets = projected(T, points, CAMERA)
+    targets[150:] = projected(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])), points[150:], CAMERA)
+    surface = np.where(np.arange(400) < 150, 4.0, 1.0)
+    np.testing.assert_allclose(rigid_motion(points, targets, surface, CAMERA), T, atol=1e-6)
 
 
 @pytest.mark.parametrize("index", [0, 6, 20])
@@ -87,7 +116,7 @@ def test_a_corner_that_could_as_well_rest_is_told_from_one_that_moved():
     second = first.copy()
     second[30:90, 88:140] = first[30:90, 80:132]  # the right half of the middle moved by eight pixels
     pixels = np.array([[30, 60], [60, 40], [110, 60], [100, 50]])
-    rests = _rests_as_well(first, second, pixels, pixels.astype(float), np.full(4, 1.0), np.full(4, 0.5))
+    rests = rests_as_well(first, second, pixels, pixels.astype(float), np.full(4, 1.0), np.full(4, 0.5))
     assert rests.tolist() == [True, True, False, False]
 
 

@@ -119,5 +119,4 @@ def _asked(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
 
 
 def _intrinsics(level: Level) -> NDArray[np.float32]:
-    camera = level.camera
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32) / np.float32(STRIDE)
+    return level.camera.intrinsics / np.float32(STRIDE)

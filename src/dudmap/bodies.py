@@ -315,9 +315,8 @@ class RigidFusion:
         flat = np.flatnonzero(mask)
         flat = self._rng.choice(flat, min(len(flat), POINTS // 10), replace=False)
         v, u = np.divmod(flat, mask.shape[1])
-        camera, z = level.camera, level.depth.reshape(-1)[flat]
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(z))], axis=1)
-        points = ((rays * z[:, None]) @ T_body_camera[:3, :3].T + T_body_camera[:3, 3]).astype(np.float32)
+        points = level.camera.points(u, v, level.depth.reshape(-1)[flat])
+        points = (points @ T_body_camera[:3, :3].T + T_body_camera[:3, 3]).astype(np.float32)
         kept = track.points
         if len(kept) + len(points) > POINTS:  # a sample of all that was fused
             kept = kept[self._rng.permutation(len(kept))[: POINTS - len(points)]]

@@ -1,11 +1,14 @@
 """Pinhole camera with optional lens distortion."""
 
 from dataclasses import dataclass, replace
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
+
+Scalar = TypeVar("Scalar", bound=np.floating)
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,11 @@ class Camera:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     @property
+    def intrinsics(self) -> NDArray[np.float32]:
+        """(fx, fy, cx, cy) in pixels, as kernels take them."""
+        return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float32)
+
+    @property
     def shape(self) -> tuple[int, int]:
         """Image shape (height, width) as NumPy has it."""
         return self.height, self.width
@@ -85,6 +93,11 @@ class Camera:
         v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
         z = depth.astype(np.float32)
         return np.stack([z * u[None, :], z * v[:, None], z], axis=-1).astype(np.float32, copy=False)
+
+    def points(self, u: NDArray[Any], v: NDArray[Any], z: NDArray[Scalar]) -> NDArray[Scalar]:
+        """Points (n, 3) in metres, camera frame, at pixels u, v (n,) with depths z (n,), in the precision of these."""
+        x, y = (u - self.cx) / self.fx * z, (v - self.cy) / self.fy * z
+        return np.stack([x, y, z], axis=1).astype(z.dtype, copy=False)
 
     def project(self, points: NDArray[np.floating]) -> NDArray[np.float64]:
         """Pixel coordinates (..., 2) of points (..., 3) in the camera frame; points with z <= 0 give NaN (eq. 4.4)."""

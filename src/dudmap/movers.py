@@ -195,9 +195,8 @@ class MoverTracker:
         ranges = [(int(stop - size), int(stop)) for stop, size in zip(stops, sizes[kept], strict=True)]
         camera, z = level.camera, level.depth.reshape(-1)[flat]
         v, u = np.divmod(flat, moving.shape[1])
-        rays = np.stack([(u - camera.cx) / camera.fx, (v - camera.cy) / camera.fy, np.ones(len(z))], axis=1)
         T = T_world_camera.astype(np.float32)
-        points = (rays.astype(np.float32) * z[:, None]) @ T[:3, :3].T + T[:3, 3]
+        points = camera.points(u, v, z) @ T[:3, :3].T + T[:3, 3]
         before = self._carried(timestamp, camera, T_world_camera)[v // 2, u // 2]
         return _Pixels(flat, np.asarray(points, np.float32), np.asarray(area[flat], np.float32), before, ranges)
 

@@ -13,16 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap import se3
-from dudmap.camera import Camera
-from dudmap.kernels import consensus
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.consensus import NOISE_PX, projected, rigid_motion
+from dudmap.corners import followed, rests_as_well
 from dudmap.surfaces import Pieces
 from dudmap.tracker import Level
 
-CELLS = 40
-"""Corners across the image: the strongest of each cell."""
-NOISE_PX = 0.7
-"""A corner fits a motion if it lies within this of where the motion puts it, pixels."""
 MOVES_PX = 1.0
 """A corner farther off than this,"""
 MOVES_SIGMAS = 5.0
@@ -40,11 +35,6 @@ LEAST_SHARE = 0.3
 REACH = 0.1
 """A pixel is judged by the corners within this share of its depth, in space."""
 NEIGHBOURS = 5
-ALIKE, ALIKE_GREY = 1.5, 2.0
-"""A window that differs by less than this times another's difference, and this many of 255 grey values, is as good."""
-WINDOW = 11
-"""Edge of the window a corner is recognised by, pixels."""
-GUESSES = 150
 FEWEST_MOVING = 3
 """Corners of a piece that must move for any of it to."""
 AGREED = 0.7
@@ -198,19 +188,19 @@ def dominant_motion(
         whole: Only pieces most of whose corners move.
     """
     first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
-    pixels, targets, unlike = _followed(before, first, second, T_expected)
+    pixels, targets, unlike = followed(before, first, second, T_expected)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
     z = before.depth[rows, columns].astype(np.float64)
-    points = _points(before.camera, columns, rows, z)
+    points = before.camera.points(columns, rows, z)
     surface, rests = z**2, np.ones(len(z), dtype=bool)
     if moved is not None:
         factor = before.depth.shape[1] // moved.shape[1]
         rests = ~moved[rows // factor, columns // factor]
         surface = np.where(rests, surface, MOVED_SAY * surface)
-    T = _rigid_motion(points, targets, surface, before.camera)
-    error = _reprojection_error(T, points, targets, before.camera)
+    T = rigid_motion(points, targets, surface, before.camera)
+    error = np.linalg.norm(projected(T, points, before.camera) - targets, axis=1)
     if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
         return None
     share = float(surface[error < NOISE_PX].sum() / surface.sum())
@@ -221,15 +211,15 @@ def dominant_motion(
     allowed = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
     moves = error > allowed
     certain = ~moves
-    certain[moves] = ~_rests_as_well(
-        first, second, pixels[moves], _projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
+    certain[moves] = ~rests_as_well(
+        first, second, pixels[moves], projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
     )
     pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
     depth_after = after.depth[
         _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
     ]
     seen = depth_after > 0
-    points_after = _points(after.camera, targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
+    points_after = after.camera.points(targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
     scale = small[0].camera.width / before.camera.width
     limit = np.array(small[0].depth.shape[::-1]) - 1
     places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
@@ -240,156 +230,6 @@ def dominant_motion(
         _rest(surfaces[1], places[1], moves[seen]),
         share,
     )
-
-
-def _followed(
-    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8], T_expected: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (n, 2) int of the first image, their places (n, 2) in the second, found there and back, and what differs.
-
-    The last is the mean difference (n,) of the grey values of their windows.
-    """
-    import cv2
-
-    strength = cv2.cornerMinEigenVal(first, 5)
-    cell = max(6, first.shape[1] // CELLS)
-    height, width = first.shape[0] // cell, first.shape[1] // cell
-    tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
-    tiles = tiles.reshape(height * width, cell * cell)
-    place = tiles.argmax(axis=1)
-    rows = np.arange(height * width) // width * cell + place // cell
-    columns = np.arange(height * width) % width * cell + place % cell
-    # a window that also shows something nearer follows that, not the surface behind
-    z = before.depth[rows, columns]
-    nearest = cv2.erode(
-        np.where(before.depth > 0, before.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8)
-    )
-    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
-    pixels = np.stack([columns, rows], axis=1)[useful]
-    if len(pixels) == 0:
-        return pixels, np.empty((0, 2)), np.empty(0)
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    shift = np.zeros_like(start)
-    if T_expected is not None:
-        points = _points(before.camera, pixels[:, 0], pixels[:, 1], z[useful].astype(np.float64))
-        shift = _projected(T_expected, points, before.camera).astype(np.float32).reshape(-1, 1, 2) - start
-    size, flags = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(
-        first, second, start, start + shift, winSize=size, maxLevel=3, flags=flags
-    )
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, there - shift, winSize=size, maxLevel=3, flags=flags
-    )
-    good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
-    good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
-    return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
-
-
-def _rests_as_well(
-    first: NDArray[np.uint8],
-    second: NDArray[np.uint8],
-    pixels: NDArray[np.int64],
-    expected: NDArray[np.float64],
-    allowed: NDArray[np.float64],
-    unlike: NDArray[np.float64],
-) -> NDArray[np.bool_]:
-    """Corners (n,) that were found elsewhere, but could as well be where a static world would have put them.
-
-    The coarse levels of the search see more than the window and follow what is nearer, and textures repeat. So the
-    search is done once more, from the place of a static point on and at full size alone.
-
-    Args:
-        first, second: (h, w) uint8 images.
-        pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) where they were if the world stood still.
-        allowed: (n,) farthest from there that it still may, pixels.
-        unlike: (n,) mean difference of the grey values of their windows where they were found.
-    """
-    import cv2
-
-    if len(pixels) == 0:
-        return np.zeros(0, dtype=bool)
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    guess = expected.astype(np.float32).reshape(-1, 1, 2)
-    there, found, other = cv2.calcOpticalFlowPyrLK(
-        first, second, start, guess.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    rests = found[:, 0] > 0  # what was not found has arbitrary numbers
-    near = np.linalg.norm((there - guess)[rests, 0], axis=1) < allowed[rests]
-    rests[rests] = near & (other[rests, 0] < ALIKE * unlike[rests] + ALIKE_GREY)
-    return rests
-
-
-def _rigid_motion(
-    points: NDArray[np.float64], targets: NDArray[np.float64], surface: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64]:
-    """Motion (4, 4) that brings most surface to its target pixels.
-
-    Three corners give the six numbers of a small motion, linearly (Longuet-Higgins and Prazdny 1980); of many such
-    guesses the one that explains most surface, counted as in MSAC (Torr and Zisserman 2000), is refined on all
-    corners that follow it, with the exact projection.
-
-    Args:
-        points: (n, 3) metres, first camera's frame.
-        targets: (n, 2) their pixels in the second image.
-        surface: (n,) what each of them counts.
-        camera: Camera of both images.
-    """
-    flow = targets - _projected(np.eye(4), points, camera)
-    J = _flow_jacobian(points, camera)
-    rng = np.random.default_rng(0)
-    n = len(points)
-    draws = np.concatenate([
-        rng.integers(0, n, (GUESSES, 3)),
-        rng.choice(n, (GUESSES, 3), p=surface / surface.sum()),
-    ])  # fmt: skip
-    A = J[draws].reshape(-1, 6, 6)
-    A = A + 1e-9 * np.eye(6)  # corners drawn twice define nothing; such guesses explain nothing either
-    guesses = np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0]
-    guesses = guesses[np.linalg.norm(guesses, axis=1) < 0.5]
-    guesses = np.concatenate([np.zeros((1, 6)), guesses])
-    by_axis, flow_by_axis = np.ascontiguousarray(J.transpose(1, 2, 0)), np.ascontiguousarray(flow.T)
-    explained = np.empty(len(guesses))
-    run_bands(
-        lambda start, stop: consensus.explained(
-            start, stop, guesses, by_axis, flow_by_axis, surface, NOISE_PX, explained
-        ),
-        bands(len(guesses), 64),
-    )
-    T = se3.exp(guesses[int(np.argmax(explained))])
-    for scale in (3.0, 2.0, 1.0, 1.0, 1.0):
-        residual = targets - _projected(T, points, camera)
-        kept = np.linalg.norm(residual, axis=1) < scale * NOISE_PX
-        if np.count_nonzero(kept) < 6:
-            break
-        moved = points[kept] @ T[:3, :3].T + T[:3, 3]
-        Jk = _flow_jacobian(moved, camera).reshape(-1, 6)
-        step = np.linalg.lstsq(Jk, residual[kept].reshape(-1), rcond=None)[0]
-        T = se3.exp(step.astype(np.float64)) @ T
-    return T
-
-
-def _flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Change (n, 2, 6) of the pixels of points (n, 3) by a small twist (v, omega) of theirs."""
-    z = np.maximum(points[:, 2], 1e-6)
-    x, y, one, zero = points[:, 0] / z, points[:, 1] / z, np.ones_like(z), np.zeros_like(z)
-    du = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
-    dv = camera.fy * np.stack([zero, one / z, -y / z, -1 - y * y, x * y, x], axis=1)
-    return np.stack([du, dv], axis=1)
-
-
-def _projected(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
-    """Pixels (n, 2) of moved points (n, 3)."""
-    moved = points @ T[:3, :3].T + T[:3, 3]
-    z = np.maximum(moved[:, 2], 1e-6)
-    return np.stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy], axis=1)
-
-
-def _reprojection_error(
-    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], camera: Camera
-) -> NDArray[np.float64]:
-    """Distance (n,) in pixels of each target from where the motion puts its point."""
-    return np.linalg.norm(_projected(T, points, camera) - targets, axis=1)
 
 
 def _spread(
@@ -432,7 +272,7 @@ def _spread(
     z = level.depth[rows, columns].astype(np.float64)
     apart = 1e3 * piece  # corners of other pieces are far away
     corners = np.column_stack([points, apart])
-    places = np.column_stack([_points(level.camera, columns, rows, z), 1e3 * surface.labels[rows, columns]])
+    places = np.column_stack([level.camera.points(columns, rows, z), 1e3 * surface.labels[rows, columns]])
     distance, index = KDTree(corners).query(places, k=min(NEIGHBOURS, len(points)))
     near = distance < REACH * z[:, None]
     votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
@@ -448,11 +288,6 @@ def _rest(surface: Pieces, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) 
     rest = (resting >= FEWEST_MOVING) & (resting > (1 - AGREED) * total)
     rest[0] = False
     return rest[surface.labels]
-
-
-def _points(camera: Camera, u: NDArray, v: NDArray, z: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Points (n, 3) in the camera's frame, metres."""
-    return np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1)
 
 
 def _inside(coordinate: NDArray[np.float64], size: int) -> NDArray[np.int64]:

@@ -217,7 +217,7 @@ class Keyframes:
         order = order[used[order]][: self.config.max_features]
         u, v = pixels[order].T
         z = depth[order].astype(np.float64)
-        points = np.stack([(u - self.camera.cx) / self.camera.fx * z, (v - self.camera.cy) / self.camera.fy * z, z], -1)
+        points = self.camera.points(u, v, z)
         root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-9))
         return PlacedFeatures(root.astype(np.float32), points)
 

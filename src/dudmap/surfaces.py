@@ -113,7 +113,7 @@ def pieces(level: Level, tolerance: NDArray[np.float32]) -> Pieces:
     edge = np.empty(level.depth.shape, dtype=np.bool_)
     labels = np.empty(level.depth.shape, dtype=np.int32)
     normals = np.empty((*level.depth.shape, 3), dtype=np.float32)
-    intrinsics = _intrinsics(level)
+    intrinsics = level.camera.intrinsics
     segmentation.hollows(level.depth, intrinsics, tolerance, REACH, np.float32(HOLLOW), normals, edge)
     count = segmentation.segments(level.depth, intrinsics, tolerance, normals, edge, labels, REACH + 1)
     du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=1 / 8)
@@ -369,12 +369,7 @@ def _against(
     out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
     T = (se3.inverse(memory.T_world_camera) @ T_world_camera)[:3].astype(np.float32)
     segmentation.against(  # in one piece: it takes no longer than waking a thread
-        0, shape[0], level.depth, level.intensity, _intrinsics(level), T, memory.level.depth,
+        0, shape[0], level.depth, level.intensity, level.camera.intrinsics, T, memory.level.depth,
         memory.level.intensity, memory.marks, *out,
     )  # fmt: skip
     return out
-
-
-def _intrinsics(level: Level) -> NDArray[np.float32]:
-    camera = level.camera
-    return np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)

@@ -185,7 +185,6 @@ class Tracker:
         configuration, unless another is given."""
         camera, config, sensor = level.camera, self.config, self.sensor
         color_weight = config.color_weight if color_weight is None else color_weight
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
         parameters = np.array(
             [
                 volume.voxel_size, volume.sdf_unit, config.huber, config.tukey if config.robust == "tukey" else 0,
@@ -203,7 +202,7 @@ class Tracker:
         T = volume.lattice(T_world_camera)
         run_bands(
             lambda start, stop, out: registration.linearize(
-                start, stop, level.depth, level.intensity, weights, intrinsics, T, window, shape, geometry,
+                start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window, shape, geometry,
                 parameters, residuals, out,
             ),
             ranges, list(sums),

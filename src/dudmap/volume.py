@@ -250,9 +250,6 @@ class TsdfVolume:
         )
         self._near = np.sort(self._window[self._window >= 0])
 
-    def _intrinsics(self) -> NDArray[np.float32]:
-        return np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy], dtype=np.float32)
-
     def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
         """Give voxels to the blocks that the truncation band of this depth image touches."""
         T = self.lattice(T_world_camera) / np.float32(BLOCK)
@@ -262,9 +259,9 @@ class TsdfVolume:
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
-                stride * start, min(stride * stop, depth.shape[0]), stride, depth, self._intrinsics(), T, self._shape,
-                self._window, self.blocks.free_count, self.config.free_after, self._frame_number, self._stamps,
-                self.noise_band(), out,
+                stride * start, min(stride * stop, depth.shape[0]), stride, depth, self.camera.intrinsics, T,
+                self._shape, self._window, self.blocks.free_count, self.config.free_after, self._frame_number,
+                self._stamps, self.noise_band(), out,
             ),
             ranges, found,
         )  # fmt: skip
@@ -314,7 +311,7 @@ class TsdfVolume:
         counts = run_bands(
             lambda start, stop: visibility.visible_slots(
                 start, stop, self._near, self.blocks.slot_coords, self.blocks.fused, turn, T_camera_world,
-                self._intrinsics(), size, np.float32(self.block_size), nearest, farthest, self.noise_band(),
+                self.camera.intrinsics, size, np.float32(self.block_size), nearest, farthest, self.noise_band(),
                 np.float32(0.05), np.float32(self.depth_max), slots, repeats,
             ),
             ranges,
@@ -337,7 +334,7 @@ class TsdfVolume:
         occupied = np.empty(count, dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate(
-                start, stop, visible, repeats, self.blocks.slot_coords, T_camera_world, self._intrinsics(), size,
+                start, stop, visible, repeats, self.blocks.slot_coords, T_camera_world, self.camera.intrinsics, size,
                 pixels, self.blocks.geometry.reshape(-1), self.blocks.colors.reshape(-1), voxel, occupied,
             ),
             bands(count, 256),
@@ -371,7 +368,7 @@ class TsdfVolume:
         if self.config.weighting == "angle":
             run_bands(
                 lambda start, stop: integration.observation_weights(
-                    start, stop, depth, self._intrinsics(), np.float32(self.sensor.sigma_base),
+                    start, stop, depth, self.camera.intrinsics, np.float32(self.sensor.sigma_base),
                     np.float32(self.sensor.sigma_scale), np.float32(4), weights,
                 ),
                 bands(depth.shape[0], 60),
@@ -404,7 +401,7 @@ class TsdfVolume:
         numbers = run_bands(
             lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
-                self._intrinsics(), size, np.float32(self.block_size), nearest, valid, self.noise_band(),
+                self.camera.intrinsics, size, np.float32(self.block_size), nearest, valid, self.noise_band(),
                 np.float32(self.depth_max), self.blocks.free_count, count, self.config.free_after, out,
             ),
             ranges, found,
@@ -428,11 +425,10 @@ class TsdfVolume:
         shape = depth.shape
         out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
         window, cells, geometry = self.window
-        intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
         T = self.lattice(T_world_camera)
         run_bands(
             lambda start, stop: sampling.sample_map(
-                start, stop, depth, intensity, intrinsics, T, window, cells, geometry,
+                start, stop, depth, intensity, camera.intrinsics, T, window, cells, geometry,
                 np.float32(self.sdf_unit), self.blocks.free_count, self.config.free_after, *out,
             ),
             bands(shape[0], max(8, -(-shape[0] // 8))),

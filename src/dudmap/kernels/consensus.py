@@ -1,4 +1,4 @@
-"""Loop over guesses of a rigid motion: how much of what is seen each explains."""
+"""Loops over what is seen: how much of it a rigid motion explains, and the step to a better one."""
 
 from dudmap.kernels.threads import kernel
 
@@ -28,3 +28,41 @@ def explained(start, stop, guesses, jacobian, flow, surface, noise, out):
             dv += jacobian[1, 3, n] * d + jacobian[1, 4, n] * e + jacobian[1, 5, n] * f - flow[1, n]
             total += surface[n] * (1.0 - min((du * du + dv * dv) * by_square, 1.0))
         out[g] = total
+
+
+@kernel
+def refinement(points, targets, T, intrinsics, limit, H, gradient):
+    """Normal equations of the step that makes a motion explain better what it explains already.
+
+    Args:
+        points: (n, 3) float64, metres, first camera's frame.
+        targets: (n, 2) float64, their pixels in the second image.
+        T: (4, 4) float64, the motion.
+        intrinsics: (4,) fx, fy, cx, cy.
+        limit: Distance in pixels from which on a point has no say.
+        H: (6, 6) float64 out, by twists (v, omega) from the left.
+        gradient: (6,) float64 out; the step is ``solve(H, gradient)``.
+
+    Returns:
+        How many points that is.
+    """
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    H[:] = 0.0
+    gradient[:] = 0.0
+    count = 0
+    for n in range(points.shape[0]):
+        a, b, c = points[n, 0], points[n, 1], points[n, 2]
+        z = max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
+        x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) / z
+        y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) / z
+        du, dv = targets[n, 0] - fx * x - cx, targets[n, 1] - fy * y - cy
+        if not du * du + dv * dv < limit * limit:
+            continue
+        count += 1
+        along_u = (fx / z, 0.0, -fx * x / z, -fx * x * y, fx * (1.0 + x * x), -fx * y)
+        along_v = (0.0, fy / z, -fy * y / z, -fy * (1.0 + y * y), fy * x * y, fy * x)
+        for i in range(6):
+            gradient[i] += along_u[i] * du + along_v[i] * dv
+            for j in range(6):
+                H[i, j] += along_u[i] * along_u[j] + along_v[i] * along_v[j]
+    return count

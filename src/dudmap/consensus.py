@@ -1,0 +1,74 @@
+"""The one rigid motion that explains most of what is seen (RANSAC, Fischler and Bolles 1981)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import se3
+from dudmap.camera import Camera
+from dudmap.kernels import consensus
+from dudmap.kernels.threads import bands, run_bands
+
+NOISE_PX = 0.7
+"""A corner fits a motion if it lies within this of where the motion puts it, pixels."""
+GUESSES = 150
+
+
+def rigid_motion(
+    points: NDArray[np.float64], targets: NDArray[np.float64], surface: NDArray[np.float64], camera: Camera
+) -> NDArray[np.float64]:
+    """Motion (4, 4) that brings most surface to its target pixels.
+
+    Three corners give the six numbers of a small motion, linearly (Longuet-Higgins and Prazdny 1980); of many such
+    guesses the one that explains most surface, counted as in MSAC (Torr and Zisserman 2000), is refined on all
+    corners that follow it, with the exact projection.
+
+    Args:
+        points: (n, 3) metres, first camera's frame.
+        targets: (n, 2) their pixels in the second image.
+        surface: (n,) what each of them counts.
+        camera: Camera of both images.
+    """
+    flow = targets - projected(np.eye(4), points, camera)
+    J = flow_jacobian(points, camera)
+    rng = np.random.default_rng(0)
+    n = len(points)
+    draws = np.concatenate([
+        rng.integers(0, n, (GUESSES, 3)),
+        rng.choice(n, (GUESSES, 3), p=surface / surface.sum()),
+    ])  # fmt: skip
+    A = J[draws].reshape(-1, 6, 6)
+    A = A + 1e-9 * np.eye(6)  # corners drawn twice define nothing; such guesses explain nothing either
+    guesses = np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0]
+    guesses = guesses[np.linalg.norm(guesses, axis=1) < 0.5]
+    guesses = np.concatenate([np.zeros((1, 6)), guesses])
+    by_axis, flow_by_axis = np.ascontiguousarray(J.transpose(1, 2, 0)), np.ascontiguousarray(flow.T)
+    explained = np.empty(len(guesses))
+    run_bands(
+        lambda start, stop: consensus.explained(
+            start, stop, guesses, by_axis, flow_by_axis, surface, NOISE_PX, explained
+        ),
+        bands(len(guesses), 64),
+    )
+    T = se3.exp(guesses[int(np.argmax(explained))])
+    for scale in (3.0, 2.0, 1.0, 1.0, 1.0):
+        H, gradient = np.zeros((6, 6)), np.zeros(6)
+        if consensus.refinement(points, targets, T, camera.intrinsics, scale * NOISE_PX, H, gradient) < 6:
+            break
+        T = se3.exp(np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), gradient)) @ T
+    return T
+
+
+def flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Change (n, 2, 6) of the pixels of points (n, 3) by a small twist (v, omega) of theirs."""
+    z = np.maximum(points[:, 2], 1e-6)
+    x, y, one, zero = points[:, 0] / z, points[:, 1] / z, np.ones_like(z), np.zeros_like(z)
+    du = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
+    dv = camera.fy * np.stack([zero, one / z, -y / z, -1 - y * y, x * y, x], axis=1)
+    return np.stack([du, dv], axis=1)
+
+
+def projected(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Pixels (n, 2) of moved points (n, 3)."""
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    z = np.maximum(moved[:, 2], 1e-6)
+    return np.stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy], axis=1)
