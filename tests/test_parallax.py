@@ -26,14 +26,15 @@ def crowd():
     return synthetic.sequence("room", coverage=0.5, start_dynamic=True, frames=22, camera=CAMERA, noise="kinect")
 
 
-def levels(sequence, index):
-    slam = Slam(sequence.camera, Config())
-    level, small = slam._compared(slam._levels(slam.preprocess(sequence[index])))
-    return level, small, slam.detector.pieces(small, slam.volume)
+def image(sequence, index, **changed):
+    """Pyramid of a frame, whose finest level has something changed, and its pieces."""
+    prepared = Slam(sequence.camera, Config()).prepare(sequence[index])
+    *coarser, fine = prepared.pyramid.tracked
+    return replace(prepared.pyramid, tracked=[*coarser, replace(fine, **changed)]), prepared.surface()
 
 
 def compare(before, after, moved=None):
-    return dominant_motion(before[0], after[0], (before[1], after[1]), (before[2], after[2]), moved)
+    return dominant_motion(before[0], after[0], (before[1], after[1]), moved)
 
 
 def test_the_flow_jacobian_is_the_derivative_of_the_projection():
@@ -75,9 +76,9 @@ def test_the_motion_of_most_surface_is_found_among_what_moves_otherwise():
 
 @pytest.mark.parametrize("index", [0, 6, 20])
 def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
-    before = levels(crowd, index)
-    small = before[1]
-    motion = compare(before, levels(crowd, index + 1))
+    before = image(crowd, index)
+    small = before[0].labelled
+    motion = compare(before, image(crowd, index + 1))
     truth = crowd.ground_truth.Ts_world_camera
     off = motion.T_after_before @ se3.inverse(truth[index]) @ truth[index + 1]
     assert np.linalg.norm(off[:3, 3]) < 0.006
@@ -90,7 +91,7 @@ def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
 
 def test_nothing_moves_in_a_still_room():
     room = synthetic.sequence("room", movers=(), frames=8, camera=CAMERA, noise="kinect")
-    motion = compare(levels(room, 4), levels(room, 5))
+    motion = compare(image(room, 4), image(room, 5))
     assert motion.share > 0.9
     assert motion.moving_after.mean() < 0.01
 
@@ -98,15 +99,14 @@ def test_nothing_moves_in_a_still_room():
 def test_a_shaken_image_makes_nothing_move(monkeypatch):
     """Lines of an image that are exposed one after the other bend what stands still (rolling shutter)."""
     room = synthetic.sequence("room", movers=(), frames=8, camera=CAMERA, noise="kinect")
-    before, (after, small, surface) = levels(room, 4), levels(room, 5)
+    before, after = image(room, 4), image(room, 5)[0].fine
     v, u = np.indices(after.depth.shape, dtype=np.float32)
     bend = (1.0 * np.sin(v / 25)).astype(np.float32)
-    shaken = replace(
-        after, intensity=cv2.remap(after.intensity, u + bend, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
-    )
-    assert compare(before, (shaken, small, surface)).moving_after.mean() < 0.01
+    bent = cv2.remap(after.intensity, u + bend, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
+    shaken = image(room, 5, intensity=bent)
+    assert compare(before, shaken).moving_after.mean() < 0.01
     monkeypatch.setattr(parallax, "MOVES_SIGMAS", 0.0)  # without regard to how well the other corners fit
-    assert compare(before, (shaken, small, surface)).moving_after.mean() > 0.1
+    assert compare(before, shaken).moving_after.mean() > 0.1
 
 
 def test_a_corner_that_could_as_well_rest_is_told_from_one_that_moved():
@@ -121,13 +121,12 @@ def test_a_corner_that_could_as_well_rest_is_told_from_one_that_moved():
 
 
 def test_images_without_corners_tell_nothing(crowd):
-    before, small, surface = levels(crowd, 0)
-    blank = replace(before, intensity=np.full_like(before.intensity, 0.5)), small, surface
+    blank = image(crowd, 0, intensity=np.full((240, 320), 0.5, np.float32))
     assert compare(blank, blank) is None
 
 
 def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd):
-    known, before, after = parallax.Parallax(1.0), levels(crowd, 6), levels(crowd, 7)
+    known, before, after = parallax.Parallax(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
     assert known.compare(0.0, *before) is None
     known.remember(0.0, np.eye(4), *before)
@@ -141,16 +140,15 @@ def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd)
 
 
 def test_where_everything_is_known_to_move_nothing_tells_the_world(crowd):
-    before, after = levels(crowd, 6), levels(crowd, 7)
-    assert compare(before, after, np.ones(before[1].depth.shape, bool)) is None
+    before, after = image(crowd, 6), image(crowd, 7)
+    assert compare(before, after, np.ones(before[0].labelled.depth.shape, bool)) is None
 
 
 def test_what_is_known_to_move_has_no_majority(crowd):
     """Of a view that people fill but for its edges the rest still tells the camera's motion."""
-    before, small, surface = levels(crowd, 6)
-    moved = crowd.mask(6)[1::2, 1::2]
-    near = replace(before, depth=np.where(crowd.mask(6), before.depth * 4, before.depth))  # they outweigh the room
-    motion = compare((near, small, surface), levels(crowd, 7), moved)
+    moved, depth = crowd.mask(6)[1::2, 1::2], image(crowd, 6)[0].fine.depth
+    far = image(crowd, 6, depth=np.where(crowd.mask(6), depth * 4, depth))  # they outweigh the room
+    motion = compare(far, image(crowd, 7), moved)
     truth = crowd.ground_truth.Ts_world_camera
     off = motion.T_after_before @ se3.inverse(truth[6]) @ truth[7]
     assert np.linalg.norm(off[:3, 3]) < 0.006
@@ -170,24 +168,24 @@ def test_the_pose_that_explains_the_image_is_kept():
     slam = Slam(room.camera)
     for index in range(5):
         slam.process(room[index])
-    level = slam._tracked(slam._levels(slam.preprocess(room[5])))[0]
+    level, guess = slam.prepare(room[5]).pyramid.coarse, slam.first_guess
     truth = room.ground_truth.Ts_world_camera
     right = se3.inverse(truth[0]) @ truth[5]
     wrong = right @ se3.exp(np.array([0.08, 0, 0, 0, 0, 0]))
-    assert slam._fits_better(right, wrong, level)
-    assert not slam._fits_better(wrong, right, level)
-    assert not slam._fits_better(right, right, level)
+    assert guess.fits_better(slam.volume, right, wrong, level)
+    assert not guess.fits_better(slam.volume, wrong, right, level)
+    assert not guess.fits_better(slam.volume, right, right, level)
 
 
 def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     slam = Slam(crowd.camera)
     results = [slam.process(crowd[index]) for index in range(3)]
     labels, tracked = results[2].labels, results[2].tracking
-    levels_of = slam._levels(slam.preprocess(crowd[2]))
+    level = slam.prepare(crowd[2]).pyramid.labelled
     rows = np.arange(labels.dynamic.shape[0])[:, None] >= 0.2 * labels.dynamic.shape[0]
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
-    assert slam._undecided(levels_of, hidden, replace(tracked, inlier_share=0.9)) == ""
-    assert "rest where the map" in slam._undecided(levels_of, hidden, replace(tracked, inlier_share=0.2))
+    assert slam._undecided(level, hidden, replace(tracked, inlier_share=0.9)) == ""
+    assert "rest where the map" in slam._undecided(level, hidden, replace(tracked, inlier_share=0.2))
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
+from dudmap import se3
 from dudmap.config import SimilarityConfig
-from dudmap.similarity import SimilarityTest
+from dudmap.similarity import RedundantViews, SimilarityTest
 
 cv2 = pytest.importorskip("cv2")
 
@@ -112,3 +113,19 @@ def test_features_are_computed_once(scene, monkeypatch):
     test._detector = Counting()
     test.redundant(view(scene, 9))
     assert len(calls) == 1  # the accepted frame's features were known
+
+
+def test_only_a_camera_that_has_hardly_moved_is_asked(scene):
+    views = RedundantViews(SimilarityConfig(patience=2))
+    here, aside = np.eye(4), se3.exp(np.array([0.02, 0, 0, 0, 0, 0]))
+    image = view(scene, 0, 1, seed=1)
+    assert not views.ask(image, here)(here)  # nothing has been fused
+    views.accept(image, here)
+    assert views.ask(image, here)(here)
+    assert not views.ask(image, aside)(here)
+    assert not views.ask(image, here)(aside)
+    assert [views.ask(image, here)(here) for _ in range(3)] == [False, False, True]  # patience after a no
+    views.moved(aside)
+    assert views.ask(image, aside)(aside)
+    views.forget()
+    assert not views.ask(image, aside)(aside)

@@ -50,7 +50,7 @@ def followed(
         first, second, start, start + shift, winSize=size, maxLevel=3, flags=flags
     )
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, there - shift, winSize=size, maxLevel=3, flags=flags
+        second, first, there, start.copy(), winSize=size, maxLevel=0, flags=flags
     )
     good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
     good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5

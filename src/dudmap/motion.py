@@ -11,34 +11,38 @@ KEPT = 0.15
 
 
 class MotionModel:
-    """Predicts the next pose from the last two; some time after a loss it stays at the last good pose."""
+    """Predicts the next pose from the last two; some time after a loss it stays at the last good pose.
+
+    Attributes:
+        T_world_camera: (4, 4), the last good pose.
+    """
 
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
         self._timestamp = 0.0
-        self._T_world_camera = np.eye(4)
+        self.T_world_camera = np.eye(4)
         self._velocity = np.zeros(6)  # twist per second, camera axes
         self._known = False
 
     def predict(self, timestamp: float) -> NDArray[np.float64]:
         """Pose (4, 4) to start the registration from."""
         if not self.config.constant_velocity:
-            return self._T_world_camera
-        return self._T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
+            return self.T_world_camera
+        return self.T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
 
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Take over the pose of a tracked frame; returns ``velocity_to`` it."""
         velocity = self.velocity_to(timestamp, T_world_camera)
         if self._known:
             self._velocity = velocity
-        self._timestamp, self._T_world_camera, self._known = timestamp, T_world_camera, True
+        self._timestamp, self.T_world_camera, self._known = timestamp, T_world_camera, True
         return velocity
 
     def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Twist per second (6,), camera axes, that leads from the last pose to this one; 0 where there is none."""
         if not self._known:
             return np.zeros(6)
-        return se3.log(se3.inverse(self._T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
+        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
 
     def lost(self, timestamp: float) -> None:
         """Take note of a frame without a pose; after a few, the next are tried from the last good pose."""
@@ -52,11 +56,11 @@ class MotionModel:
 
     def moved(self, T_new_old: NDArray[np.float64]) -> None:
         """Follow a correction of the world; the velocity, in camera axes, stays."""
-        self._T_world_camera = T_new_old @ self._T_world_camera
+        self.T_world_camera = T_new_old @ self.T_world_camera
 
     def implausible(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
         """Sentence on a jump that no camera makes, empty if there is none."""
-        motion = se3.inverse(self._T_world_camera) @ T_world_camera
+        motion = se3.inverse(self.T_world_camera) @ T_world_camera
         elapsed = self._elapsed(timestamp)
         speed = float(np.linalg.norm(motion[:3, 3])) / elapsed
         turn = float(np.degrees(se3.rotation_angle(motion))) / elapsed

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.consensus import NOISE_PX, projected, rigid_motion
 from dudmap.corners import followed, rests_as_well
+from dudmap.pyramid import Pyramid
 from dudmap.surfaces import Pieces
 from dudmap.tracker import Level
 
@@ -83,14 +84,19 @@ class Parallax:
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
-        self._before: tuple[Level, Level, Pieces, NDArray[np.bool_] | None] | None = None
-        self._older: deque[tuple[float, NDArray[np.float64], Level, Level, Pieces]] = deque()
+        self._before: tuple[Pyramid, Pieces, NDArray[np.bool_] | None] | None = None
+        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Pieces]] = deque()
         self._compared: tuple[float, DominantMotion | None] | None = None  # time of the last comparison, and its result
         self.active = False
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
+
+    @property
+    def started(self) -> bool:
+        """Whether there is a map."""
+        return bool(np.isfinite(self._longest))
 
     def young(self, timestamp: float) -> bool:
         """Whether the map cannot know yet what moves."""
@@ -99,30 +105,29 @@ class Parallax:
     def wanted(self, timestamp: float, small: Level, moving: NDArray[np.bool_] | None) -> bool:
         """Whether a tracked frame, in which this (h, w) moves, is to be compared with the next."""
         covered = moving is not None and np.count_nonzero(moving) > COVERED * np.count_nonzero(small.depth)
-        return bool(self.young(timestamp) or (covered and self.seconds > 0 and np.isfinite(self._longest)))
+        return bool(self.young(timestamp) or (covered and self.seconds > 0 and self.started))
 
     def remember(
         self,
         timestamp: float,
         T_world_camera: NDArray[np.float64],
-        level: Level,
-        small: Level,
+        pyramid: Pyramid,
         surface: Pieces,
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
         """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
-        self._before, self._compared = (level, small, surface, moving), None
-        self.active = self.wanted(timestamp, small, moving)
+        self._before, self._compared = (pyramid, surface, moving), None
+        self.active = self.wanted(timestamp, pyramid.labelled, moving)
         if not self.young(timestamp):
             self._older.clear()
         elif not self._older or timestamp - self._older[-1][0] >= APART:
-            self._older.append((timestamp, T_world_camera, level, small, surface))
+            self._older.append((timestamp, T_world_camera, pyramid, surface))
 
     def forget(self) -> None:
         """Compare no more until a frame is remembered again: the last one showed nothing."""
         self._before, self._compared, self.active = None, None, False
 
-    def compare(self, timestamp: float, level: Level, small: Level, surface: Pieces) -> DominantMotion | None:
+    def compare(self, timestamp: float, pyramid: Pyramid, surface: Pieces) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it; None if unknown.
 
         Asked once more for the same time, it answers without looking again.
@@ -130,33 +135,32 @@ class Parallax:
         if self._before is None:
             return None
         if self._compared is None or self._compared[0] != timestamp:
-            before, small_before, surface_before, moved = self._before
-            motion = dominant_motion(before, level, (small_before, small), (surface_before, surface), moved)
+            before, surface_before, moved = self._before
+            motion = dominant_motion(before, pyramid, (surface_before, surface), moved)
             self._compared = timestamp, motion
-            if motion is not None and self.young(timestamp) and several(motion.moving_after, small):
+            if motion is not None and self.young(timestamp) and several(motion.moving_after, pyramid.labelled):
                 self._until = min(timestamp + self.seconds, self._longest)
         return self._compared[1]
 
     def slow(
-        self, timestamp: float, T_world_camera: NDArray[np.float64], level: Level, small: Level, surface: Pieces
+        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, surface: Pieces
     ) -> NDArray[np.bool_]:
         """What has moved (h, w) since a somewhat older frame, as far as is known, while the map is young.
 
         Args:
             timestamp: Seconds, of the new frame.
             T_world_camera: (4, 4) first guess of its pose.
-            level, small: The image in both resolutions.
+            pyramid: The image.
             surface: Its pieces.
         """
         while self._older and timestamp - self._older[0][0] > LONGEST:
             self._older.popleft()
         if not self._older or timestamp - self._older[0][0] < APART or not self.young(timestamp):
-            return np.zeros(small.depth.shape, dtype=bool)
-        _, T_world_before, before, small_before, surface_before = self._older[0]
+            return np.zeros(pyramid.labelled.depth.shape, dtype=bool)
+        _, T_world_before, before, surface_before = self._older[0]
         T_expected = se3.inverse(T_world_camera) @ T_world_before
-        both = (small_before, small), (surface_before, surface)
-        motion = dominant_motion(before, level, *both, T_expected=T_expected, whole=True)
-        return np.zeros(small.depth.shape, dtype=bool) if motion is None else motion.moving_after
+        motion = dominant_motion(before, pyramid, (surface_before, surface), T_expected=T_expected, whole=True)
+        return np.zeros(pyramid.labelled.depth.shape, dtype=bool) if motion is None else motion.moving_after
 
 
 def several(moving: NDArray[np.bool_], level: Level) -> bool:
@@ -165,9 +169,8 @@ def several(moving: NDArray[np.bool_], level: Level) -> bool:
 
 
 def dominant_motion(
-    before: Level,
-    after: Level,
-    small: tuple[Level, Level],
+    before: Pyramid,
+    after: Pyramid,
     surfaces: tuple[Pieces, Pieces],
     moved: NDArray[np.bool_] | None = None,
     T_expected: NDArray[np.float64] | None = None,
@@ -179,28 +182,28 @@ def dominant_motion(
     half of the image, but hardly ever half of the visible square metres.
 
     Args:
-        before, after: Both images at the resolution in which corners are followed.
-        small: Both at the resolution of the result.
-        surfaces: Pieces of surface of both of these.
-        moved: (h, w) bool at that resolution, what is known to move in the first image; it has little say in what the
+        before, after: Both images; corners are followed in the finest levels.
+        surfaces: Pieces of surface of both, at the size of the labels.
+        moved: (h, w) bool at that size, what is known to move in the first image; it has little say in what the
             static world is.
         T_expected: (4, 4) where the motion is looked for first; None: nowhere else than where it was.
         whole: Only pieces most of whose corners move.
     """
-    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (before, after))
-    pixels, targets, unlike = followed(before, first, second, T_expected)
+    fine, fine_after = before.fine, after.fine
+    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (fine, fine_after))
+    pixels, targets, unlike = followed(fine, first, second, T_expected)
     if len(pixels) < FEWEST:
         return None
     columns, rows = pixels.T
-    z = before.depth[rows, columns].astype(np.float64)
-    points = before.camera.points(columns, rows, z)
+    z = fine.depth[rows, columns].astype(np.float64)
+    points = fine.camera.points(columns, rows, z)
     surface, rests = z**2, np.ones(len(z), dtype=bool)
     if moved is not None:
-        factor = before.depth.shape[1] // moved.shape[1]
+        factor = fine.depth.shape[1] // moved.shape[1]
         rests = ~moved[rows // factor, columns // factor]
         surface = np.where(rests, surface, MOVED_SAY * surface)
-    T = rigid_motion(points, targets, surface, before.camera)
-    error = np.linalg.norm(projected(T, points, before.camera) - targets, axis=1)
+    T = rigid_motion(points, targets, surface, fine.camera)
+    error = np.linalg.norm(projected(T, points, fine.camera) - targets, axis=1)
     if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
         return None
     share = float(surface[error < NOISE_PX].sum() / surface.sum())
@@ -212,21 +215,21 @@ def dominant_motion(
     moves = error > allowed
     certain = ~moves
     certain[moves] = ~rests_as_well(
-        first, second, pixels[moves], projected(T, points[moves], before.camera), allowed[moves], unlike[moves]
+        first, second, pixels[moves], projected(T, points[moves], fine.camera), allowed[moves], unlike[moves]
     )
     pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
-    depth_after = after.depth[
-        _inside(targets[:, 1], after.depth.shape[0]), _inside(targets[:, 0], after.depth.shape[1])
+    depth_after = fine_after.depth[
+        _inside(targets[:, 1], fine_after.depth.shape[0]), _inside(targets[:, 0], fine_after.depth.shape[1])
     ]
     seen = depth_after > 0
-    points_after = after.camera.points(targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
-    scale = small[0].camera.width / before.camera.width
-    limit = np.array(small[0].depth.shape[::-1]) - 1
+    points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
+    scale = before.labelled.camera.width / fine.camera.width
+    limit = np.array(before.labelled.depth.shape[::-1]) - 1
     places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
     return DominantMotion(
         T,
-        _spread(small[0], surfaces[0], points, places[0], moves, whole),
-        _spread(small[1], surfaces[1], points_after[seen], places[1], moves[seen], whole),
+        _spread(before.labelled, surfaces[0], points, places[0], moves, whole),
+        _spread(after.labelled, surfaces[1], points_after[seen], places[1], moves[seen], whole),
         _rest(surfaces[1], places[1], moves[seen]),
         share,
     )

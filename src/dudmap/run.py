@@ -375,7 +375,7 @@ def _write(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
-    metrics["depth_delay_ms"] = 1000 * slam.delay.seconds
+    metrics["depth_delay_ms"] = 1000 * slam.registration.delay.seconds
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()

@@ -1,12 +1,15 @@
 """Redundant-view test: SIFT, FLANN and Lowe's ratio test against the last fused frame (thesis section 4.3)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap import se3
 from dudmap.config import SimilarityConfig
+from dudmap.kernels.threads import begun
 
 FEWEST = 20
 """With fewer features than this in a frame nothing can be said; the frame is taken as new."""
@@ -105,3 +108,61 @@ class SimilarityTest:
         matcher = cv2.FlannBasedMatcher({"algorithm": 1, "trees": 4}, {"checks": 32})
         pairs = matcher.knnMatch(last, new, k=2)
         return sum(len(pair) == 2 and pair[0].distance < self.config.ratio * pair[1].distance for pair in pairs)
+
+
+class RedundantViews:
+    """Asks the similarity test where the camera has hardly moved since a frame was fused last, beside other work."""
+
+    def __init__(self, config: SimilarityConfig) -> None:
+        self.config = config
+        self.test = SimilarityTest(config)
+        self._T_world_fused: NDArray[np.float64] | None = None
+        self._untested = 0  # frames that are still fused without a test
+
+    def ask(self, rgb: NDArray[np.uint8], T_expected: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], bool]:
+        """Begin to compare an image (H, W, 3) with that of the last fused frame, if the camera should be near it.
+
+        Returns:
+            Waits for the answer: whether a frame with that image and this pose (4, 4) is redundant. It is to be asked
+            before the next image is.
+        """
+        if not self.config.enabled or not self._near(T_expected):
+            return lambda T_world_camera: False
+        if self._untested > 0:
+            self._untested -= 1
+            return lambda T_world_camera: False
+        test = begun(lambda: self.test.redundant(rgb))
+
+        def answer(T_world_camera: NDArray[np.float64]) -> bool:
+            redundant = test() and self._near(T_world_camera)
+            self._untested = 0 if redundant else self.config.patience
+            return redundant
+
+        return answer
+
+    def accept(self, rgb: NDArray[np.uint8], T_world_camera: NDArray[np.float64]) -> None:
+        """Remember a frame as the last one that was fused."""
+        self._T_world_fused = T_world_camera
+        if self.config.enabled:
+            self.test.accept(rgb)
+
+    def moved(self, T_new_old: NDArray[np.float64]) -> None:
+        """Follow a correction of the world."""
+        if self._T_world_fused is not None:
+            self._T_world_fused = T_new_old @ self._T_world_fused
+
+    def forget(self) -> None:
+        """Another map begins."""
+        self._T_world_fused = None
+
+    def _near(self, T_world_camera: NDArray[np.float64]) -> bool:
+        """Whether the camera has hardly moved since the last fused frame, or that does not matter."""
+        if self._T_world_fused is None:
+            return False
+        if self.config.max_translation == 0:
+            return True
+        moved = se3.inverse(self._T_world_fused) @ T_world_camera
+        turned = np.degrees(se3.rotation_angle(moved))
+        return bool(
+            np.linalg.norm(moved[:3, 3]) <= self.config.max_translation and turned <= self.config.max_rotation_deg
+        )

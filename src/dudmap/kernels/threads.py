@@ -66,5 +66,6 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         work()
     finally:
         for other in others:
-            other.result()
+            if not other.cancel():  # a worker that is still busy elsewhere is not waited for: all is done
+                other.result()
     return results
