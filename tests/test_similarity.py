@@ -125,6 +125,10 @@ def test_only_a_camera_that_has_hardly_moved_is_asked(scene):
     assert not views.ask(image, aside)(here)
     assert not views.ask(image, here)(aside)
     assert [views.ask(image, here)(here) for _ in range(3)] == [False, False, True]  # patience after a no
+    for patience in (2, 4, 8, 16, 16):
+        assert not views.ask(image, here)(aside)
+        assert [views.ask(image, here)(here) for _ in range(patience)] == [False] * patience
+    assert views.ask(image, here)(here)
     views.moved(aside)
     assert views.ask(image, aside)(aside)
     views.forget()

@@ -73,7 +73,8 @@ class SimilarityConfig(Part):
     max_rotation_deg: float = Field(default=0.3, ge=0)
     """A camera that turned more than this since the last fused frame is not tested, degrees."""
     patience: int = Field(default=5, ge=0)
-    """Frames that are fused untested after a test that found nothing redundant: the test costs as much as the rest."""
+    """Frames that are fused untested after a test that found nothing redundant: the test costs as much as the rest.
+    Twice, then four, then eight times as many where the next ones find nothing either."""
 
 
 class VolumeConfig(Part):

@@ -13,6 +13,8 @@ from dudmap.kernels.threads import begun
 
 FEWEST = 20
 """With fewer features than this in a frame nothing can be said; the frame is taken as new."""
+LONGEST = 3
+"""Times that the patience doubles."""
 EXPONENT = ((0.25, 0.5, 1.0), (2.6, 1.6, 1.4))
 """Share on the full image = share on an image reduced by this factor, with 500 features, to the power below it.
 
@@ -118,6 +120,7 @@ class RedundantViews:
         self.test = SimilarityTest(config)
         self._T_world_fused: NDArray[np.float64] | None = None
         self._untested = 0  # frames that are still fused without a test
+        self._in_vain = 0  # tests in a row that found nothing redundant
 
     def ask(self, rgb: NDArray[np.uint8], T_expected: NDArray[np.float64]) -> Callable[[NDArray[np.float64]], bool]:
         """Begin to compare an image (H, W, 3) with that of the last fused frame, if the camera should be near it.
@@ -135,7 +138,8 @@ class RedundantViews:
 
         def answer(T_world_camera: NDArray[np.float64]) -> bool:
             redundant = test() and self._near(T_world_camera)
-            self._untested = 0 if redundant else self.config.patience
+            self._untested = 0 if redundant else self.config.patience << min(self._in_vain, LONGEST)
+            self._in_vain = 0 if redundant else self._in_vain + 1
             return redundant
 
         return answer
