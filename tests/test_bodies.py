@@ -75,11 +75,11 @@ def test_the_window_stays_with_the_body_and_is_small():
     T = np.eye(4)
     T[:3, 3] = 0, 0, -3
     volume.look_at(T)
-    half = volume.window[1] * volume.block_size / 2
-    origin = volume.lattice(np.eye(4))[:, 3] * volume.voxel_size
+    half = volume.window.shape * volume.block_size / 2
+    origin = volume.window.lattice(np.eye(4))[:, 3] * volume.voxel_size
     np.testing.assert_allclose(origin, half, atol=2 * volume.block_size)
     assert (half > 1.0).all()
-    assert volume.window[0].nbytes < 4e6
+    assert volume.window.cells.nbytes < 4e6
     assert volume.depth_max == 6.0
     assert not volume.config.carving
 

@@ -216,27 +216,27 @@ def test_the_index_of_blocks_grows_like_a_dictionary():
     """Entries, coordinates and voxels of every block stay what they were while all arrays and the hash are enlarged."""
     volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.01), depth_max=4.0)
     volume.look_at(np.eye(4))
-    rng, size = np.random.default_rng(5), int(np.prod(volume._shape))
+    rng, size = np.random.default_rng(5), int(np.prod(volume.window.shape))
     expected: dict[int, int] = {}
     marked: dict[int, int] = {}
     for batch in range(12):
         cells = rng.choice(size, 2500, replace=False).astype(np.int32)
-        entries = volume._entries_of(cells)
+        entries = volume.window.entries_of(cells, volume.blocks)
         assert entries.tolist() == [expected.setdefault(int(cell), len(expected)) for cell in cells]
         fresh = np.array([cell for cell in cells[:300].tolist() if cell not in marked], dtype=np.int32)
-        volume._add_voxels(fresh)
-        volume.blocks.geometry[volume._window[fresh]] = fresh[:, None]
+        volume.window.give_voxels(fresh, volume.blocks, 1)
+        volume.blocks.geometry[volume.window.cells[fresh]] = fresh[:, None]
         marked |= {int(cell): batch for cell in fresh}
     assert volume.blocks.num_entries == len(expected) > 4 * (1 << 12)
     assert len(volume.blocks.table) > 1 << 14
     known = np.array(list(expected), dtype=np.int64)
-    coords = np.stack(np.unravel_index(known, tuple(volume._shape)), axis=1) + volume._origin
+    coords = np.stack(np.unravel_index(known, tuple(volume.window.shape)), axis=1) + volume.window.origin
     assert np.array_equal(volume.blocks.coords[: len(known)], coords)
-    entries = volume._entries_of(known[::-1].astype(np.int32))
+    entries = volume.window.entries_of(known[::-1].astype(np.int32), volume.blocks)
     assert entries.tolist() == list(range(len(known)))[::-1]
     slots = volume.blocks.slot_of[[expected[cell] for cell in marked]]
     assert np.all(volume.blocks.geometry[slots] == np.array(list(marked))[:, None])
-    assert np.array_equal(volume._window[list(marked)], slots)
+    assert np.array_equal(volume.window.cells[list(marked)], slots)
 
 
 def test_a_black_image_with_valid_depth_changes_the_surface_like_any_other():
@@ -379,8 +379,8 @@ def test_an_occupied_block_costs_little_more_than_its_voxels():
     known = 0
     for blocks in (4_000, 9_000, 16_000):
         cells = np.arange(known, 3 * blocks, dtype=np.int32)
-        volume._entries_of(cells)
-        volume._add_voxels(cells[: blocks - volume.num_blocks])
+        volume.window.entries_of(cells, volume.blocks)
+        volume.window.give_voxels(cells[: blocks - volume.num_blocks], volume.blocks, 1)
         known = 3 * blocks
         assert volume.num_blocks == blocks
         assert volume.blocks.num_entries == known

@@ -194,16 +194,16 @@ class Tracker:
             ],
             dtype=np.float32,
         )  # fmt: skip
-        window, shape, geometry = volume.window
+        window, geometry = volume.window, volume.blocks.geometry.reshape(-1)
         height, width = level.depth.shape
         ranges = bands(height, -(-PIXELS_PER_BAND // width))
         sums = np.zeros((len(ranges), registration.NUM_SUMS))
         residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
-        T = volume.lattice(T_world_camera)
+        T = window.lattice(T_world_camera)
         run_bands(
             lambda start, stop, out: registration.linearize(
-                start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window, shape, geometry,
-                parameters, residuals, out,
+                start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window.cells, window.shape,
+                geometry, parameters, residuals, out,
             ),
             ranges, list(sums),
         )  # fmt: skip

@@ -14,9 +14,10 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
-from dudmap.kernels import hashing, integration, meshing, raycasting, sampling, visibility
+from dudmap.kernels import integration, meshing, raycasting, sampling, visibility
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
+from dudmap.window import Window
 
 _BIRTHS = itertools.count()
 FORMAT = "dudmap map 1"
@@ -60,9 +61,6 @@ class MapSample:
 class TsdfVolume:
     """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
 
-    The window is a dense array of slots around the view, so that the inner loops find a voxel with one load; the hash
-    table of the blocks stays the authoritative index and fills the window when the view leaves it.
-
     Args:
         camera: Camera of the frames that will be integrated.
         config: Voxel size, truncation, weights.
@@ -72,6 +70,7 @@ class TsdfVolume:
 
     Attributes:
         blocks: What is known of space.
+        window: The part of it around the view.
         born: Number of this map among all of the program; another one after the map was made anew.
 
     Raises:
@@ -109,13 +108,8 @@ class TsdfVolume:
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
-        size = 16 * int(np.ceil(cells / 16))
-        self._shape = np.array([size, size, size], dtype=np.int64)
-        self._window = np.full(size**3, -1, dtype=np.int32)
-        self._stamps = np.zeros(size**3, dtype=np.int32)
-        self._origin: NDArray[np.int64] | None = None
+        self.window = Window(self.block_size, cells)
         self.blocks = VoxelBlocks()
-        self._near = np.empty(0, dtype=np.int32)  # slots inside the window
         self._frame_number = 0
         self.born = next(_BIRTHS)
         self._packed: NDArray[np.int32] | None = None
@@ -167,18 +161,6 @@ class TsdfVolume:
             ],
             dtype=np.float32,
         )
-
-    def lattice(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Camera to window lattice (3, 4): voxel units, origin at the window's first voxel."""
-        assert self._origin is not None
-        T = T_world_camera[:3] / self.voxel_size
-        T[:, 3] -= self._origin * BLOCK
-        return T.astype(np.float32)
-
-    @property
-    def window(self) -> tuple[NDArray[np.int32], NDArray[np.int64], NDArray[np.int32]]:
-        """Flat window of slots, its shape in blocks, and the flat packed voxels, as the kernels take them."""
-        return self._window, self._shape, self.blocks.geometry.reshape(-1)
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -234,25 +216,12 @@ class TsdfVolume:
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
-        middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
-        origin = np.floor(middle / self.block_size).astype(np.int64) - self._shape // 2
-        if self._origin is not None and np.abs(origin - self._origin).max() <= 3:
-            return
-        self._origin = origin
-        self._window.fill(-1)
-        self._stamps.fill(0)
-        hashing.fill_window(
-            self._window.reshape(tuple(self._shape)),
-            origin,
-            self.blocks.coords,
-            self.blocks.slot_of,
-            self.blocks.num_entries,
-        )
-        self._near = np.sort(self._window[self._window >= 0])
+        self.window.look_at(T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach, self.blocks)
 
     def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
         """Give voxels to the blocks that the truncation band of this depth image touches."""
-        T = self.lattice(T_world_camera) / np.float32(BLOCK)
+        window = self.window
+        T = window.lattice(T_world_camera) / np.float32(BLOCK)
         farthest = max(float(depth.max()), 0.05)
         stride = int(np.clip(0.5 * self.block_size * self.camera.fx / farthest, 1, 8))  # half a block apart, or less
         ranges = bands(-(-depth.shape[0] // stride), 15)
@@ -260,32 +229,14 @@ class TsdfVolume:
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
                 stride * start, min(stride * stop, depth.shape[0]), stride, depth, self.camera.intrinsics, T,
-                self._shape, self._window, self.blocks.free_count, self.config.free_after, self._frame_number,
-                self._stamps, self.noise_band(), out,
+                window.shape, window.cells, self.blocks.free_count, self.config.free_after, self._frame_number,
+                window.stamps, self.noise_band(), out,
             ),
             ranges, found,
         )  # fmt: skip
         cells = np.unique(np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)]))
         if len(cells):
-            self._add_voxels(cells)
-
-    def _add_voxels(self, cells: NDArray[np.int32]) -> None:
-        slots = self.blocks.give_voxels(self._entries_of(cells), self._frame_number)
-        self._window[cells] = slots
-        self._near = np.concatenate([self._near, slots])
-
-    def _entries_of(self, cells: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Entries of window cells, made where there is none yet."""
-        assert self._origin is not None
-        coords = np.stack(np.unravel_index(cells, tuple(self._shape)), axis=1) + self._origin
-        if np.abs(coords).max(initial=0) >= 1 << 15:
-            farthest = (1 << 15) * self.block_size
-            raise MapError(
-                f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
-                f"{self.voxel_size} m it cannot be larger: set volume.voxel_size to a larger value"
-            )
-        unknown = int(np.count_nonzero(self._window[cells] == -1))
-        return self.blocks.entries_at(coords.astype(np.int16), unknown)
+            self.window.give_voxels(cells, self.blocks, self._frame_number)
 
     def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
         shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
@@ -301,16 +252,17 @@ class TsdfVolume:
         T_camera_world: NDArray[np.float32],
         tiles: Sequence[NDArray[np.float32]],
     ) -> None:
-        if len(self._near) == 0:
+        near = self.window.near
+        if len(near) == 0:
             return
         nearest, farthest, _ = tiles
         size = np.array(depth.shape, dtype=np.int64)
-        slots, repeats = np.empty(len(self._near), dtype=np.int32), np.empty(len(self._near), dtype=np.float32)
+        slots, repeats = np.empty(len(near), dtype=np.int32), np.empty(len(near), dtype=np.float32)
         turn = self._frame_number if self.config.take_turns else -1
         ranges = bands(len(slots), 2048)
         counts = run_bands(
             lambda start, stop: visibility.visible_slots(
-                start, stop, self._near, self.blocks.slot_coords, self.blocks.fused, turn, T_camera_world,
+                start, stop, near, self.blocks.slot_coords, self.blocks.fused, turn, T_camera_world,
                 self.camera.intrinsics, size, np.float32(self.block_size), nearest, farthest, self.noise_band(),
                 np.float32(0.05), np.float32(self.depth_max), slots, repeats,
             ),
@@ -340,7 +292,7 @@ class TsdfVolume:
             bands(count, 256),
         )  # fmt: skip
         if self.config.carving:
-            self._release(visible[occupied == 0])
+            self.window.take_voxels(visible[occupied == 0], self.blocks, self.config.free_after)
 
     def _pixels(
         self, depth: NDArray[np.float32], color: NDArray[np.uint8], weights: NDArray[np.uint8]
@@ -375,16 +327,6 @@ class TsdfVolume:
             )  # fmt: skip
         return weights
 
-    def _release(self, slots: NDArray[np.int32]) -> None:
-        """Take the voxels from blocks that hold no surface any more; they become known free space."""
-        if len(slots) == 0:
-            return
-        assert self._origin is not None
-        entries = self.blocks.take_voxels(slots, self.config.free_after)
-        cells = np.ravel_multi_index(tuple((self.blocks.coords[entries] - self._origin).T), tuple(self._shape))
-        self._window[cells] = -2 - entries
-        self._near = self._near[self.blocks.entry_of[self._near] >= 0]
-
     def _observe_free(
         self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]], count: int
     ) -> None:
@@ -392,25 +334,23 @@ class TsdfVolume:
 
         Each call visits every second plane of the window, so that the cost is spread over two frames.
         """
-        assert self._origin is not None
+        window = self.window
+        assert window.origin is not None
         nearest, _, valid = tiles
         size = np.array(self.camera.shape, dtype=np.int64)
         parity = self._frame_number % 2
-        ranges = bands(int(self._shape[0]) // 2, 8)
+        ranges = bands(int(window.shape[0]) // 2, 8)
         found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
         numbers = run_bands(
             lambda start, stop, out: visibility.observe_free(
-                2 * start + parity, 2 * stop + parity, 2, self._window, self._shape, self._origin, T_camera_world,
+                2 * start + parity, 2 * stop + parity, 2, window.cells, window.shape, window.origin, T_camera_world,
                 self.camera.intrinsics, size, np.float32(self.block_size), nearest, valid, self.noise_band(),
                 np.float32(self.depth_max), self.blocks.free_count, count, self.config.free_after, out,
             ),
             ranges, found,
         )  # fmt: skip
         cells = np.concatenate([out[:number] for out, number in zip(found, numbers, strict=True)])
-        if len(cells) > 0:
-            entries = self._entries_of(cells)
-            self._window[cells] = -2 - entries
-            self.blocks.free_count[entries] = min(count, 255)
+        self.window.set_free(cells, self.blocks, count)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -424,12 +364,12 @@ class TsdfVolume:
         """What the map says at the points of a depth image (h, w) of ``camera`` at a pose inside the window."""
         shape = depth.shape
         out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-        window, cells, geometry = self.window
-        T = self.lattice(T_world_camera)
+        window, T = self.window, self.window.lattice(T_world_camera)
         run_bands(
             lambda start, stop: sampling.sample_map(
-                start, stop, depth, intensity, camera.intrinsics, T, window, cells, geometry,
-                np.float32(self.sdf_unit), self.blocks.free_count, self.config.free_after, *out,
+                start, stop, depth, intensity, camera.intrinsics, T, window.cells, window.shape,
+                self.blocks.geometry.reshape(-1), np.float32(self.sdf_unit), self.blocks.free_count,
+                self.config.free_after, *out,
             ),
             bands(shape[0], max(8, -(-shape[0] // 8))),
         )  # fmt: skip
@@ -439,9 +379,10 @@ class TsdfVolume:
         """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera
         self.look_at(T_world_camera)
-        assert self._origin is not None
+        window = self.window
+        assert window.origin is not None
         depth, color, normals = raycasting.raycast(
-            self._window.reshape(tuple(self._shape)), self._origin.astype(np.int32), self.blocks.geometry,
+            window.cells.reshape(tuple(window.shape)), window.origin.astype(np.int32), self.blocks.geometry,
             self.blocks.colors, self.voxel_size, self.sdf_unit, T_world_camera, camera, 0.05, self.depth_max,
             self.config.min_weight,
         )  # fmt: skip
