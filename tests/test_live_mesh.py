@@ -98,7 +98,7 @@ def test_slots_that_changed_hands_between_updates(volume):
     slots = volume.active_slots
     volume._frame_number += 1
     volume.blocks.written[slots] = volume._frame_number
-    volume._release(slots)
+    volume.window.take_voxels(slots, volume.blocks, volume.config.free_after)
     volume.integrate(wall(1.5), turned(100))
     assert not set(volume.blocks._unused) & set(volume.active_slots.tolist())
     live.update()

@@ -9,6 +9,7 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
+from dudmap.fusion import reading_weights
 from dudmap.kernels import hashing
 from dudmap.kernels.visibility import SETTLED
 from dudmap.volume import FREE, TsdfVolume
@@ -78,7 +79,7 @@ def test_integrate_with_angle_weights_and_a_band_that_grows_with_the_noise():
     frames, Ts = [wall(distance, seed, bump=0.08) for seed, distance in enumerate((0.8, 0.85, 0.8))], poses(3)
     for frame, T in zip(frames, Ts, strict=True):
         volume.integrate(frame, T)
-    gains = [volume._weights(frame.depth) for frame in frames]
+    gains = [reading_weights(frame.depth, volume.camera, volume.config, volume.sensor) for frame in frames]
     assert len(np.unique(gains)) >= 3
     sigma = lambda z: 3.0 * (0.001 + 0.06 * z**2)  # noqa: E731
     assert sigma(0.8) > 1.1 * volume.truncation
@@ -108,11 +109,11 @@ def test_weights_are_the_cosine_over_the_error(tilt_deg):
         depth = distance * np.cos(tilt) / (rays @ normal)
         cosine = (rays @ normal) / np.linalg.norm(rays, axis=-1)
         exact = np.clip(4 * cosine * 0.003 / (0.001 + 0.002 * depth**2), 1, 16)
-        found = TsdfVolume(camera, VolumeConfig(), sensor)._weights(depth.astype(np.float32))
+        found = reading_weights(depth.astype(np.float32), camera, VolumeConfig(), sensor)
         assert np.abs(found - exact)[1:-1, 1:-1].max() <= 0.52  # rounded to whole numbers
     jump = np.where(u < 32, 0.5, 1.5).astype(np.float32)
     jump[10, 10] = 0
-    found = TsdfVolume(camera, VolumeConfig(), sensor)._weights(jump)
+    found = reading_weights(jump, camera, VolumeConfig(), sensor)
     assert found[24, 31] == round(4 * 0.3 * 0.003 / 0.0015)  # at a depth edge the angle is not known: taken as slanted
     assert found[10, 10] == 0
 

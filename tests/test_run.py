@@ -15,7 +15,8 @@ import pytest
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 from dudmap.mesh import Mesh
-from dudmap.run import read_ahead, run
+from dudmap.reading import read_ahead
+from dudmap.run import run
 from dudmap.sequences import open_sequence
 from dudmap.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH, cut, write_recording

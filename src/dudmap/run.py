@@ -1,93 +1,23 @@
 """A run: frames go in, a run folder comes out. No algorithm in it."""
 
-import json
 import time
-from collections import deque
-from collections.abc import Callable, Generator
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
 from contextlib import closing
-from dataclasses import asdict, dataclass
-from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError, MapError
-from dudmap.frame import Frame
-from dudmap.metrics import RunRecord, accuracy, machine, versions
+from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError
+from dudmap.metrics import RunRecord
 from dudmap.progress import RunProgress
-from dudmap.trajectory import Trajectory
+from dudmap.reading import AHEAD, Reading, Turn, as_they_come, in_order, load_kernels
+from dudmap.run_folder import RunReport, make, save_mask, write
 
 if TYPE_CHECKING:
-    from dudmap.bodies import Body
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
-    from dudmap.slam import Prepared, Slam
-
-AHEAD = 4
-"""Frames of a recording on disk that are read while an earlier one is processed."""
-FILES = (
-    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl",
-)  # fmt: skip
-SCORES = (
-    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
-    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
-)  # fmt: skip
-"""What `dudmap evaluate` writes beside a run; it would not belong to the next one."""
-
-
-@dataclass(frozen=True, eq=False)
-class RunReport:
-    """What a run gave.
-
-    Attributes:
-        out: The run folder.
-        metrics: The content of metrics.json.
-        trajectory: Poses of all tracked frames.
-    """
-
-    out: Path
-    metrics: dict[str, Any]
-    trajectory: Trajectory
-
-
-class Reading(NamedTuple):
-    """What the reader found.
-
-    Attributes:
-        frame: The frame, or why there is none.
-        mask: (H, W) its true dynamic mask, None if not known, or why it cannot be read.
-        ms: Reading time of the frame.
-        known: (H, W) what a mask from outside says moves, None if there is none, or why it cannot be read.
-        prepared: The frame as the system takes it, where it was made ready ahead.
-    """
-
-    frame: Frame | FrameError
-    mask: NDArray[np.bool_] | FrameError | None
-    ms: float
-    known: NDArray[np.bool_] | FrameError | None = None
-    prepared: "Prepared | None" = None
-
-
-class Turn(NamedTuple):
-    """A frame whose turn it is.
-
-    Attributes:
-        number: Its number.
-        reading: What was read.
-        dropped: Frames that were dropped since the one before.
-        arrival: When it arrived, seconds of ``time.perf_counter``; None where frames wait for the system.
-    """
-
-    number: int
-    reading: Reading
-    dropped: int = 0
-    arrival: float | None = None
+    from dudmap.slam import Slam
 
 
 def run(
@@ -156,13 +86,13 @@ def run(
     slam = Slam(sequence.camera, config)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
-    _prepare(out, masks, save_masks=save_masks)
+    make(out, masks, save_masks=save_masks)
     stopped = ""
     with RunProgress(count * passes, bar=progress) as display:
         try:
             if live:
                 display.working("loading kernels")
-                _load_kernels(Slam(sequence.camera, config), sequence, count)
+                load_kernels(Slam(sequence.camera, config), sequence, count)
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
@@ -170,7 +100,7 @@ def run(
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(
-                    _live(sequence, count, known) if live else _waiting(sequence, count, ahead, known, slam)
+                    as_they_come(sequence, count, known) if live else in_order(sequence, count, ahead, known, slam)
                 ) as turns:
                     for turn in turns:
                         _process(
@@ -193,7 +123,7 @@ def run(
             display.working("writing")
             if stopped and finished is not None:  # the first pass is whole, the second is not
                 slam, record = finished
-            report = _write(out, slam, record, sequence, config, stopped, save_map=save_map)
+            report = write(out, slam, record, sequence, config, stopped, save_map=save_map)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -221,65 +151,6 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
     from dudmap.sequences.masks import MaskFolder
 
     return MaskFolder(folder, sequence.timestamps, sequence.camera)
-
-
-def read_ahead(
-    sequence: "Sequence", count: int, ahead: int = AHEAD, known: "MaskFolder | None" = None, slam: "Slam | None" = None
-) -> "Generator[Reading]":
-    """The first ``count`` frames in order, read and made ready for ``slam`` by one thread up to ``ahead`` ahead."""
-    reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
-    pending: deque[Future[Reading]] = deque()
-    try:
-        for index in range(count + ahead):
-            if index < count:
-                pending.append(reader.submit(_read, sequence, index, known, slam))
-            if index >= ahead:
-                yield pending.popleft().result()
-    finally:
-        reader.shutdown(cancel_futures=True)
-
-
-def _waiting(
-    sequence: "Sequence", count: int, ahead: int, known: "MaskFolder | None", slam: "Slam"
-) -> "Generator[Turn]":
-    for index, reading in enumerate(read_ahead(sequence, count, ahead, known, slam if ahead else None)):
-        yield Turn(index, reading)
-
-
-def _live(sequence: "Sequence", count: int, known: "MaskFolder | None") -> "Generator[Turn]":
-    from dudmap.live import live
-
-    last = -1
-    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, known))) as arrivals:
-        for arrival in arrivals:
-            yield Turn(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
-            last = arrival.number
-
-
-def _load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
-    """Run the first frames through a system that is thrown away: a sensor is switched on when all is compiled."""
-    for index in range(min(count, 3)):
-        frame = _read(sequence, index).frame
-        if not isinstance(frame, FrameError):
-            slam.process(frame)
-
-
-def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> Reading:
-    start = time.perf_counter()
-    try:
-        frame: Frame | FrameError = sequence[index]
-    except FrameError as error:
-        return Reading(error, None, 1000 * (time.perf_counter() - start))
-    ms = 1000 * (time.perf_counter() - start)
-    prepared = None if slam is None else slam.prepare(frame)
-    return Reading(frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared)
-
-
-def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:
-    try:
-        return read(index)
-    except FrameError as error:
-        return error
 
 
 def _process(
@@ -314,125 +185,7 @@ def _process(
     delays = {} if turn.arrival is None else {"dropped": turn.dropped, "latency": 1000 * (end - turn.arrival)}
     record.add(result, 1000 * (end - start), reading.ms, truth, **delays)
     if out_of_masks is not None:
-        _save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+        save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, reading, result)
     display.frame(index, result, record.dropped)
-
-
-def _save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    import cv2
-
-    path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
-
-
-def _prepare(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
-    """Make the run folder, prove that it can be written, and remove an earlier run's results and their scores.
-
-    Raises:
-        DudmapError: It cannot be made or written, or what is to be removed is a recording or the masks to be read.
-    """
-    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
-        raise DudmapError(f"{out} holds a recording, whose truth and masks a run would overwrite; name another folder")
-    if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
-        raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".dudmap-probe"
-        probe.write_bytes(b"")
-        probe.unlink()
-        for name in FILES + SCORES:
-            (out / name).unlink(missing_ok=True)
-        for mask in (out / "masks").glob("*.png"):
-            mask.unlink()
-        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt"
-        for part in (path for pattern in parts for path in out.glob(pattern)):
-            part.unlink()
-        if save_masks:
-            (out / "masks").mkdir(exist_ok=True)
-    except OSError as error:
-        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
-
-
-def _write(
-    out: Path,
-    slam: "Slam",
-    record: RunRecord,
-    sequence: "Sequence",
-    config: Config,
-    stopped: str,
-    *,
-    save_map: bool,
-) -> RunReport:
-    """Write all files of the run folder; one that fails does not keep the others from being written.
-
-    Raises:
-        DudmapError: A file could not be written.
-    """
-    (trajectory, volume), *others = slam.maps
-    metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
-    metrics |= record.metrics()
-    sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
-    metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
-    metrics["maps"] = len(others) + 1
-    metrics["depth_delay_ms"] = 1000 * slam.registration.delay.seconds
-
-    def save_mesh() -> None:
-        mesh = volume.extract_mesh()
-        metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
-        mesh.save(out / "mesh.ply")
-
-    def save_metrics() -> None:
-        if sequence.ground_truth is not None:
-            metrics.update(accuracy(trajectory, sequence.ground_truth))
-        metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
-        metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
-        (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
-
-    steps: list[Callable[[], None]] = [
-        lambda: trajectory.save(out / "trajectory.txt"),
-        lambda: config.save(out / "config.toml"),
-        lambda: record.save_timings(out / "timings.csv"),
-        lambda: record.save_residuals(out / "residuals.npz"),
-        lambda: record.save_movers(out / "movers.jsonl"),
-    ]
-    if sequence.ground_truth is not None:
-        truth = sequence.ground_truth
-        steps.append(lambda: truth.save(out / "groundtruth.txt"))
-    if not volume.is_empty:
-        steps.append(save_mesh)
-        if save_map:
-            steps.append(lambda: volume.save(out / "map.npz"))
-    for number, (path, part) in enumerate(others, start=2):
-        steps += [
-            partial(path.save, out / f"trajectory-{number}.txt"),
-            lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
-        ]
-    if config.movers.meshes:
-        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.bodies)))
-    problems = []
-    try:
-        for step in steps:
-            try:
-                step()
-            except (OSError, MapError) as error:
-                problems.append(str(error))
-    finally:
-        save_metrics()
-    if problems:
-        raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
-    return RunReport(out, metrics, trajectory)
-
-
-def _save_bodies(folder: Path, bodies: "list[Body]") -> list[dict[str, Any]]:
-    """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
-    out = []
-    for body in bodies:
-        row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
-        if body.mesh is not None and body.trajectory is not None:
-            folder.mkdir(exist_ok=True)
-            body.mesh.save(folder / f"{body.id}.ply")
-            body.trajectory.save(folder / f"{body.id}.txt")
-            row["mesh_triangles"] = len(body.mesh.faces)
-        out.append(row)
-    return out

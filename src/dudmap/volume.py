@@ -1,20 +1,19 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
 from dudmap.blocks import BLOCK, VoxelBlocks
 from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frame import Frame
-from dudmap.kernels import integration, meshing, raycasting, sampling, visibility
+from dudmap.fusion import Fusion, reading_weights
+from dudmap.kernels import meshing, raycasting, sampling
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mesh import Mesh
 from dudmap.window import Window
@@ -71,6 +70,8 @@ class TsdfVolume:
     Attributes:
         blocks: What is known of space.
         window: The part of it around the view.
+        sdf_unit, largest: What a voxel's distance is stored in, and the largest it holds, metres.
+        depth_unit: What a reading is held in on its way into the voxels, metres.
         born: Number of this map among all of the program; another one after the map was made anew.
 
     Raises:
@@ -93,15 +94,15 @@ class TsdfVolume:
         self.block_size = BLOCK * self.voxel_size
         self.truncation = self.config.truncation_voxels * self.voxel_size
         self.truncation_behind = self.config.truncation_behind_voxels * self.voxel_size
-        self._limit = max(0.3, self.truncation, self.truncation_behind)
-        self.sdf_unit = self._limit / 32767
-        self._depth_unit = depth_max / 65534  # of readings on their way into the voxels
+        self.largest = max(0.3, self.truncation, self.truncation_behind)
+        self.sdf_unit = self.largest / 32767
+        self.depth_unit = depth_max / 65534
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
                          max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
         extent = depth_max if extent is None else extent
         self._extent = extent
         self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
-        cells = int(np.ceil(2 * (self._reach + self._limit) / self.block_size)) + 8
+        cells = int(np.ceil(2 * (self._reach + self.largest) / self.block_size)) + 8
         if cells > 288:
             longest = extent * 280 / cells
             raise MapError(
@@ -112,7 +113,7 @@ class TsdfVolume:
         self.blocks = VoxelBlocks()
         self._frame_number = 0
         self.born = next(_BIRTHS)
-        self._packed: NDArray[np.int32] | None = None
+        self._pixels: NDArray[np.int32] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -148,20 +149,6 @@ class TsdfVolume:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
         return self.blocks.active_slots
 
-    def noise_band(self) -> NDArray[np.float32]:
-        """Band parameters (6,) of the kernels: truncation in front, behind, noise factor, sigma(z), block edge."""
-        return np.array(
-            [
-                self.truncation,
-                self.truncation_behind,
-                self.config.truncation_noise,
-                self.sensor.sigma_base,
-                self.sensor.sigma_scale,
-                self.block_size,
-            ],
-            dtype=np.float32,
-        )
-
     # -- writing -----------------------------------------------------------------------------------------------------
 
     def integrate(
@@ -196,15 +183,20 @@ class TsdfVolume:
             depth[~static_mask] = 0
         self._frame_number += 1
         self.look_at(T_world_camera)
-        self._allocate(depth, T_world_camera)
-        T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
-        tiles = self._tiles(depth)
+        fusion = Fusion(self, depth, T_world_camera, self._frame_number)
+        fusion.allocate()
+        weights = reading_weights(depth, self.camera, self.config, self.sensor) if weights is None else weights
         if count > 1:
-            weights = self._weights(depth) if weights is None else weights
             weights = np.minimum(weights.astype(np.int32) * count, 255).astype(np.uint8)
-        self._fuse(depth, frame.color, weights, T_camera_world, tiles)
+        fusion.average(frame.color, weights)
         if self.config.carving:
-            self._observe_free(T_camera_world, tiles, count)
+            fusion.observe_free(count)
+
+    def pixel_buffer(self, size: int) -> NDArray[np.int32]:
+        """Array (size, 2) for readings on their way into the voxels, the same for every frame; its last row is 0."""
+        if self._pixels is None or len(self._pixels) != size:
+            self._pixels = np.zeros((size, 2), dtype=np.int32)
+        return self._pixels
 
     def clear(self) -> None:
         """Forget everything."""
@@ -217,140 +209,6 @@ class TsdfVolume:
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         self.window.look_at(T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach, self.blocks)
-
-    def _allocate(self, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]) -> None:
-        """Give voxels to the blocks that the truncation band of this depth image touches."""
-        window = self.window
-        T = window.lattice(T_world_camera) / np.float32(BLOCK)
-        farthest = max(float(depth.max()), 0.05)
-        stride = int(np.clip(0.5 * self.block_size * self.camera.fx / farthest, 1, 8))  # half a block apart, or less
-        ranges = bands(-(-depth.shape[0] // stride), 15)
-        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
-        counts = run_bands(
-            lambda start, stop, out: visibility.mark_blocks(
-                stride * start, min(stride * stop, depth.shape[0]), stride, depth, self.camera.intrinsics, T,
-                window.shape, window.cells, self.blocks.free_count, self.config.free_after, self._frame_number,
-                window.stamps, self.noise_band(), out,
-            ),
-            ranges, found,
-        )  # fmt: skip
-        cells = np.unique(np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)]))
-        if len(cells):
-            self.window.give_voxels(cells, self.blocks, self._frame_number)
-
-    def _tiles(self, depth: NDArray[np.float32]) -> tuple[NDArray[np.float32], ...]:
-        shape = tuple(-(-n // visibility.TILE) for n in depth.shape)
-        tiles = tuple(np.empty(shape, dtype=np.float32) for _ in range(3))
-        run_bands(lambda start, stop: visibility.tile_ranges(start, stop, depth, *tiles), bands(shape[0], 15))
-        return tiles
-
-    def _fuse(
-        self,
-        depth: NDArray[np.float32],
-        color: NDArray[np.uint8],
-        weights: NDArray[np.uint8] | None,
-        T_camera_world: NDArray[np.float32],
-        tiles: Sequence[NDArray[np.float32]],
-    ) -> None:
-        near = self.window.near
-        if len(near) == 0:
-            return
-        nearest, farthest, _ = tiles
-        size = np.array(depth.shape, dtype=np.int64)
-        slots, repeats = np.empty(len(near), dtype=np.int32), np.empty(len(near), dtype=np.float32)
-        turn = self._frame_number if self.config.take_turns else -1
-        ranges = bands(len(slots), 2048)
-        counts = run_bands(
-            lambda start, stop: visibility.visible_slots(
-                start, stop, near, self.blocks.slot_coords, self.blocks.fused, turn, T_camera_world,
-                self.camera.intrinsics, size, np.float32(self.block_size), nearest, farthest, self.noise_band(),
-                np.float32(0.05), np.float32(self.depth_max), slots, repeats,
-            ),
-            ranges,
-        )  # fmt: skip
-        taken = [np.s_[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)]
-        visible = np.concatenate([slots[part] for part in taken])
-        repeats = np.concatenate([repeats[part] for part in taken])
-        count = len(visible)
-        self.blocks.written[visible] = self._frame_number
-        self.blocks.fused[visible] = np.minimum(self.blocks.fused[visible], 254) + 1
-        voxel = np.array(
-            [
-                self.voxel_size, self.sdf_unit, self.truncation, self.truncation_behind, self.config.truncation_noise,
-                self.sensor.sigma_base, self.sensor.sigma_scale, self.config.max_weight,
-                self.config.carve_rate if self.config.carving else 1, self._limit, self._depth_unit,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
-        pixels = self._pixels(depth, color, self._weights(depth) if weights is None else weights)
-        occupied = np.empty(count, dtype=np.int32)
-        run_bands(
-            lambda start, stop: integration.integrate(
-                start, stop, visible, repeats, self.blocks.slot_coords, T_camera_world, self.camera.intrinsics, size,
-                pixels, self.blocks.geometry.reshape(-1), self.blocks.colors.reshape(-1), voxel, occupied,
-            ),
-            bands(count, 256),
-        )  # fmt: skip
-        if self.config.carving:
-            self.window.take_voxels(visible[occupied == 0], self.blocks, self.config.free_after)
-
-    def _pixels(
-        self, depth: NDArray[np.float32], color: NDArray[np.uint8], weights: NDArray[np.uint8]
-    ) -> NDArray[np.int64]:
-        """Readings and colours (H * W + 1,) as the fusion takes them; the last pixel has no reading."""
-        if self._packed is None or len(self._packed) != depth.size + 1:
-            self._packed = np.zeros((depth.size + 1, 2), dtype=np.int32)
-        pixels, rgb = self._packed, np.ascontiguousarray(color)
-        limits = np.array(
-            [
-                self.truncation, self.config.truncation_noise, self.sensor.sigma_base, self.sensor.sigma_scale,
-                self._limit, self._depth_unit,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
-        run_bands(
-            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, limits, pixels),
-            bands(depth.shape[0], 60),
-        )
-        return pixels.view(np.int64).reshape(-1)
-
-    def _weights(self, depth: NDArray[np.float32]) -> NDArray[np.uint8]:
-        """Weights (H, W) of the readings: all alike, or by the angle of sight and the sensor's noise (eq. 4.20)."""
-        weights = np.ones(depth.shape, dtype=np.uint8)
-        if self.config.weighting == "angle":
-            run_bands(
-                lambda start, stop: integration.observation_weights(
-                    start, stop, depth, self.camera.intrinsics, np.float32(self.sensor.sigma_base),
-                    np.float32(self.sensor.sigma_scale), np.float32(4), weights,
-                ),
-                bands(depth.shape[0], 60),
-            )  # fmt: skip
-        return weights
-
-    def _observe_free(
-        self, T_camera_world: NDArray[np.float32], tiles: Sequence[NDArray[np.float32]], count: int
-    ) -> None:
-        """Count ``count`` more observations of emptiness for blocks without voxels in front of the depth image.
-
-        Each call visits every second plane of the window, so that the cost is spread over two frames.
-        """
-        window = self.window
-        assert window.origin is not None
-        nearest, _, valid = tiles
-        size = np.array(self.camera.shape, dtype=np.int64)
-        parity = self._frame_number % 2
-        ranges = bands(int(window.shape[0]) // 2, 8)
-        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
-        numbers = run_bands(
-            lambda start, stop, out: visibility.observe_free(
-                2 * start + parity, 2 * stop + parity, 2, window.cells, window.shape, window.origin, T_camera_world,
-                self.camera.intrinsics, size, np.float32(self.block_size), nearest, valid, self.noise_band(),
-                np.float32(self.depth_max), self.blocks.free_count, count, self.config.free_after, out,
-            ),
-            ranges, found,
-        )  # fmt: skip
-        cells = np.concatenate([out[:number] for out, number in zip(found, numbers, strict=True)])
-        self.window.set_free(cells, self.blocks, count)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 

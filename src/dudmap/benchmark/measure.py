@@ -79,7 +79,8 @@ def measure_sequence(
         DudmapError: The recording cannot be used, or nothing could be tracked.
     """
     from dudmap.mesh import Mesh
-    from dudmap.run import AHEAD, run
+    from dudmap.reading import AHEAD
+    from dudmap.run import run
     from dudmap.synthetic.recording import SyntheticSequence
 
     ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would take the cores from the system

@@ -14,8 +14,8 @@ if TYPE_CHECKING:
 
     from dudmap.camera import Camera
     from dudmap.frame import Frame
+    from dudmap.reading import Reading
     from dudmap.result import FrameResult
-    from dudmap.run import Reading
 
 app = typer.Typer(add_completion=False)
 
