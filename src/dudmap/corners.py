@@ -3,7 +3,6 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.consensus import projected
 from dudmap.tracker import Level
 
 CELLS = 40
@@ -14,41 +13,53 @@ WINDOW = 11
 """Edge of the window a corner is recognised by, pixels."""
 
 
-def followed(
-    before: Level, first: NDArray[np.uint8], second: NDArray[np.uint8], T_expected: NDArray[np.float64] | None = None
-) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (n, 2) int of the first image, their places (n, 2) in the second, found there and back, and what differs.
+def grey(level: Level) -> NDArray[np.uint8]:
+    """Intensities (h, w) as the search takes them."""
+    return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
 
-    The last is the mean difference (n,) of the grey values of their windows.
-    """
+
+def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """The strongest corner (n, 2) int of each cell of an image, where there is one, on a surface of some extent."""
     import cv2
 
-    strength = cv2.cornerMinEigenVal(first, 5)
-    cell = max(6, first.shape[1] // CELLS)
-    height, width = first.shape[0] // cell, first.shape[1] // cell
+    strength = cv2.cornerMinEigenVal(image, 5)
+    cell = max(6, image.shape[1] // CELLS)
+    height, width = image.shape[0] // cell, image.shape[1] // cell
     tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
     tiles = tiles.reshape(height * width, cell * cell)
     place = tiles.argmax(axis=1)
     rows = np.arange(height * width) // width * cell + place // cell
     columns = np.arange(height * width) % width * cell + place % cell
     # a window that also shows something nearer follows that, not the surface behind
-    z = before.depth[rows, columns]
-    nearest = cv2.erode(
-        np.where(before.depth > 0, before.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8)
-    )
+    z = level.depth[rows, columns]
+    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8))
     useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
-    pixels = np.stack([columns, rows], axis=1)[useful]
+    return np.stack([columns, rows], axis=1)[useful]
+
+
+def followed(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    expected: NDArray[np.float64] | None = None,
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Corners (m, 2) int, their places (m, 2) in a second image, found there and back, and what differs.
+
+    The last is the mean difference (m,) of the grey values of their windows.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) int, corners in the first.
+        expected: (n, 2) where they are looked for first; None: nowhere else than where they were.
+    """
+    import cv2
+
     if len(pixels) == 0:
         return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    shift = np.zeros_like(start)
-    if T_expected is not None:
-        points = before.camera.points(pixels[:, 0], pixels[:, 1], z[useful].astype(np.float64))
-        shift = projected(T_expected, points, before.camera).astype(np.float32).reshape(-1, 1, 2) - start
+    guess = start.copy() if expected is None else expected.astype(np.float32).reshape(-1, 1, 2)
     size, flags = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(
-        first, second, start, start + shift, winSize=size, maxLevel=3, flags=flags
-    )
+    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, guess, winSize=size, maxLevel=3, flags=flags)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(
         second, first, there, start.copy(), winSize=size, maxLevel=0, flags=flags
     )

@@ -7,7 +7,9 @@ counts no more than a far wall.
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -58,16 +60,22 @@ class DominantMotion:
 
     Attributes:
         T_after_before: (4, 4) the static world's motion from the first camera's frame to the second's.
-        moving_before, moving_after: (h, w) bool, pixels with a reading that do not follow it, in either image.
+        moving_after: (h, w) bool, pixels of the second image with a reading that do not follow it.
         resting_after: (h, w) bool, pieces of surface that do, by their corners; what has no corners is neither.
         share: Share of the corners, each counted by the surface it stands for, that follow it.
+        look_back: Finds ``moving_before``, which few ask for.
     """
 
     T_after_before: NDArray[np.float64]
-    moving_before: NDArray[np.bool_]
     moving_after: NDArray[np.bool_]
     resting_after: NDArray[np.bool_]
     share: float
+    look_back: Callable[[], NDArray[np.bool_]]
+
+    @cached_property
+    def moving_before(self) -> NDArray[np.bool_]:
+        """(h, w) pixels of the first image with a reading that do not follow it."""
+        return self.look_back()
 
 
 class Parallax:
@@ -189,14 +197,15 @@ def dominant_motion(
         T_expected: (4, 4) where the motion is looked for first; None: nowhere else than where it was.
         whole: Only pieces most of whose corners move.
     """
-    fine, fine_after = before.fine, after.fine
-    first, second = (np.clip(255 * level.intensity, 0, 255).astype(np.uint8) for level in (fine, fine_after))
-    pixels, targets, unlike = followed(fine, first, second, T_expected)
+    fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
+    pixels, expected = before.corners, None
+    if T_expected is not None:
+        expected = projected(T_expected, _points(fine, pixels), fine.camera)
+    pixels, targets, unlike = followed(first, second, pixels, expected)
     if len(pixels) < FEWEST:
         return None
-    columns, rows = pixels.T
-    z = fine.depth[rows, columns].astype(np.float64)
-    points = fine.camera.points(columns, rows, z)
+    points = _points(fine, pixels)
+    z, (columns, rows) = points[:, 2], pixels.T
     surface, rests = z**2, np.ones(len(z), dtype=bool)
     if moved is not None:
         factor = fine.depth.shape[1] // moved.shape[1]
@@ -228,10 +237,10 @@ def dominant_motion(
     places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
     return DominantMotion(
         T,
-        _spread(before.labelled, surfaces[0], points, places[0], moves, whole),
         _spread(after.labelled, surfaces[1], points_after[seen], places[1], moves[seen], whole),
         _rest(surfaces[1], places[1], moves[seen]),
         share,
+        lambda: _spread(before.labelled, surfaces[0], points, places[0], moves, whole),
     )
 
 
@@ -291,6 +300,12 @@ def _rest(surface: Pieces, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) 
     rest = (resting >= FEWEST_MOVING) & (resting > (1 - AGREED) * total)
     rest[0] = False
     return rest[surface.labels]
+
+
+def _points(level: Level, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Points (n, 3) in the camera's frame, metres, at pixels (n, 2) u, v of an image."""
+    u, v = pixels.T
+    return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
 
 
 def _inside(coordinate: NDArray[np.float64], size: int) -> NDArray[np.int64]:

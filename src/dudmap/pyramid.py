@@ -1,12 +1,14 @@
 """An image in the sizes that the work on its frame asks for."""
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.camera import Camera
 from dudmap.config import Config
+from dudmap.corners import corners, grey
 from dudmap.preprocess import Observation, pyramid
 from dudmap.tracker import Level
 
@@ -41,6 +43,16 @@ class Pyramid:
     def fine(self) -> Level:
         """The last level that is registered."""
         return self.tracked[-1]
+
+    @cached_property
+    def grey(self) -> NDArray[np.uint8]:
+        """Intensities (h, w) of the finest level, of 255."""
+        return grey(self.fine)
+
+    @cached_property
+    def corners(self) -> NDArray[np.int64]:
+        """Corners (n, 2) int of the finest level, pixels u, v."""
+        return corners(self.fine, self.grey)
 
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:

@@ -135,6 +135,8 @@ class Slam:
         start = time.perf_counter()
         observation = self.preprocess(frame)
         pyramid = Pyramid.of(observation, self.camera, self.config)
+        if self.first_guess.parallax.active:
+            _ = pyramid.corners  # kept there for the comparison with other images
         surface = None
         if self.config.dynamics.method == "em":
             surface = self.detector.cut(pyramid.labelled, self.config.volume.voxel_size)
