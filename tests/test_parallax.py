@@ -56,22 +56,36 @@ def test_the_refining_step_is_that_of_least_squares():
     residual = targets - projected(guess, points, CAMERA)
     near = np.linalg.norm(residual, axis=1) < 2 * NOISE_PX
     assert 20 < np.count_nonzero(near) < 180
+    say = rng.uniform(0.1, 1, 200)
     J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
     H, gradient = np.ones((6, 6)), np.ones(6)
-    count = consensus.refinement(points, targets, guess, CAMERA.intrinsics, 2 * NOISE_PX, H, gradient)
+    count = consensus.refinement(points, targets, say, guess, CAMERA.intrinsics, 2 * NOISE_PX, H, gradient)
     assert count == np.count_nonzero(near)
-    expected = np.linalg.lstsq(J, residual[near].reshape(-1), rcond=None)[0]
+    root = np.sqrt(np.repeat(say[near], 2))
+    expected = np.linalg.lstsq(root[:, None] * J, root * residual[near].reshape(-1), rcond=None)[0]
     np.testing.assert_allclose(np.linalg.solve(H, gradient), expected, rtol=1e-5, atol=1e-9)
 
 
-def test_the_motion_of_most_surface_is_found_among_what_moves_otherwise():
+SLOW = se3.exp(np.array([0.002, -0.001, 0.003, 0.001, 0.002, -0.001]))
+FAST = se3.exp(np.array([0.1, 0, 0, 0, 0, 0]))
+
+
+@pytest.mark.parametrize(
+    ("share", "expected", "found"),
+    [
+        (0.3, np.eye(4), FAST),  # what shows much more surface is the world, however fast
+        (0.45, np.eye(4), SLOW),  # of two that show nearly as much it is what is expected
+        (0.45, FAST, FAST),
+        (0.7, FAST, SLOW),
+    ],
+)
+def test_the_motion_of_most_surface_is_found_or_the_expected_one_of_two(share, expected, found):
     rng = np.random.default_rng(7)
-    points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (400, 3))
-    T = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
-    targets = projected(T, points, CAMERA)
-    targets[150:] = projected(se3.exp(np.array([0.1, 0, 0, 0, 0, 0])), points[150:], CAMERA)
-    surface = np.where(np.arange(400) < 150, 4.0, 1.0)
-    np.testing.assert_allclose(rigid_motion(points, targets, surface, CAMERA), T, atol=1e-6)
+    points = rng.uniform([-1, -1, 1], [1, 1, 5], (400, 3))
+    slow = int(share * 400)
+    targets = np.concatenate([projected(SLOW, points[:slow], CAMERA), projected(FAST, points[slow:], CAMERA)])
+    say = 1 / points[:, 2] ** 2  # so that all count alike
+    np.testing.assert_allclose(rigid_motion(points, targets, say, CAMERA, expected), found, atol=1e-6)
 
 
 @pytest.mark.parametrize("index", [0, 6, 20])

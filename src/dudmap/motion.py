@@ -44,10 +44,16 @@ class MotionModel:
             return np.zeros(6)
         return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
 
-    def lost(self, timestamp: float) -> None:
-        """Take note of a frame without a pose; after a few, the next are tried from the last good pose."""
-        if timestamp - self._timestamp > KEPT:
-            self._velocity = np.zeros(6)
+    def lost(self, timestamp: float) -> bool:
+        """Take note of a frame without a pose; after a few, the next are tried from the last good pose.
+
+        Returns:
+            Whether what was known of the last good frame says nothing any more.
+        """
+        if timestamp - self._timestamp <= KEPT:
+            return False
+        self._velocity = np.zeros(6)
+        return True
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Take over the pose of a frame whose place was recognised; what lies before it says nothing of its motion."""

@@ -31,7 +31,7 @@ FAR_PX = 3.0
 """Corners farther off than this say nothing of that deviation."""
 RAYLEIGH = 1.1774
 """Median length of a vector of two normally distributed coordinates of deviation 1."""
-FEWEST = 30
+FEWEST = 15
 """With fewer corners no motion is believed."""
 LEAST_SHARE = 0.3
 """Nor with a smaller share of the surface that follows it."""
@@ -135,7 +135,9 @@ class Parallax:
         """Compare no more until a frame is remembered again: the last one showed nothing."""
         self._before, self._compared, self.active = None, None, False
 
-    def compare(self, timestamp: float, pyramid: Pyramid, surface: Pieces) -> DominantMotion | None:
+    def compare(
+        self, timestamp: float, pyramid: Pyramid, surface: Pieces, T_expected: NDArray[np.float64] | None = None
+    ) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it; None if unknown.
 
         Asked once more for the same time, it answers without looking again.
@@ -144,7 +146,7 @@ class Parallax:
             return None
         if self._compared is None or self._compared[0] != timestamp:
             before, surface_before, moved = self._before
-            motion = dominant_motion(before, pyramid, (surface_before, surface), moved)
+            motion = dominant_motion(before, pyramid, (surface_before, surface), moved, T_expected)
             self._compared = timestamp, motion
             if motion is not None and self.young(timestamp) and several(motion.moving_after, pyramid.labelled):
                 self._until = min(timestamp + self.seconds, self._longest)
@@ -194,24 +196,24 @@ def dominant_motion(
         surfaces: Pieces of surface of both, at the size of the labels.
         moved: (h, w) bool at that size, what is known to move in the first image; it has little say in what the
             static world is.
-        T_expected: (4, 4) where the motion is looked for first; None: nowhere else than where it was.
+        T_expected: (4, 4) what the motion should be: where corners are looked for first, and what decides between
+            two motions that explain much. None: no motion.
         whole: Only pieces most of whose corners move.
     """
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
-    pixels, expected = before.corners, None
-    if T_expected is not None:
-        expected = projected(T_expected, _points(fine, pixels), fine.camera)
-    pixels, targets, unlike = followed(first, second, pixels, expected)
+    T_expected = np.eye(4) if T_expected is None else T_expected
+    expected = projected(T_expected, _points(fine, before.corners), fine.camera)
+    pixels, targets, unlike = followed(first, second, before.corners, expected)
     if len(pixels) < FEWEST:
         return None
     points = _points(fine, pixels)
     z, (columns, rows) = points[:, 2], pixels.T
-    surface, rests = z**2, np.ones(len(z), dtype=bool)
+    say, rests = np.ones(len(z)), np.ones(len(z), dtype=bool)
     if moved is not None:
         factor = fine.depth.shape[1] // moved.shape[1]
         rests = ~moved[rows // factor, columns // factor]
-        surface = np.where(rests, surface, MOVED_SAY * surface)
-    T = rigid_motion(points, targets, surface, fine.camera)
+        say[~rests] = MOVED_SAY
+    T, surface = rigid_motion(points, targets, say, fine.camera, T_expected), say * z**2
     error = np.linalg.norm(projected(T, points, fine.camera) - targets, axis=1)
     if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
         return None

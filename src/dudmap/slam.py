@@ -326,9 +326,9 @@ class Slam:
         return None
 
     def _lose(self, timestamp: float) -> None:
-        self.motion.lost(timestamp)
         self.health.lost()
-        self.registration.forget()
+        if self.motion.lost(timestamp):
+            self.registration.forget()
         self._lost_since = timestamp if self._lost_since is None else self._lost_since
 
     def _start_submap(self, observation: Observation) -> bool:

@@ -1,42 +1,52 @@
 """Loops over what is seen: how much of it a rigid motion explains, and the step to a better one."""
 
+import numpy as np
+
 from dudmap.kernels.threads import kernel
 
 
 @kernel
-def explained(start, stop, guesses, jacobian, flow, surface, noise, out):
-    """Surface that guesses ``start`` to ``stop`` explain, counted as in MSAC (Torr and Zisserman 2000).
+def explained(start, stop, guesses, jacobian, flow, usual, surface, noise, near, out):
+    """Surface that guesses ``start`` to ``stop`` explain, counted as in MSAC (Torr and Zisserman 2000), by how likely.
 
     Args:
         start, stop: Range of guesses.
         guesses: (g, 6) float64 twists.
         jacobian: (2, 6, n) float64, change of the pixels of n points by a twist, along u and v.
-        flow: (2, n) float64, what it should be, pixels.
+        flow: (2, n) float64, what it was, pixels.
+        usual: (2, n) float64, what was expected of it, pixels.
         surface: (n,) float64, what each point counts.
         noise: Distance in pixels from which on a point counts nothing.
+        near: Mean distance in pixels from what was expected at which a guess is less likely by a quarter; by a half
+            at most.
         out: (g,) float64 out.
     """
     by_square = 1.0 / (noise * noise)
     for g in range(start, stop):
         a, b, c = guesses[g, 0], guesses[g, 1], guesses[g, 2]
         d, e, f = guesses[g, 3], guesses[g, 4], guesses[g, 5]
-        total = 0.0
+        total, away = 0.0, 0.0
         for n in range(surface.size):
-            du = jacobian[0, 0, n] * a + jacobian[0, 1, n] * b + jacobian[0, 2, n] * c
-            du += jacobian[0, 3, n] * d + jacobian[0, 4, n] * e + jacobian[0, 5, n] * f - flow[0, n]
-            dv = jacobian[1, 0, n] * a + jacobian[1, 1, n] * b + jacobian[1, 2, n] * c
-            dv += jacobian[1, 3, n] * d + jacobian[1, 4, n] * e + jacobian[1, 5, n] * f - flow[1, n]
+            u = jacobian[0, 0, n] * a + jacobian[0, 1, n] * b + jacobian[0, 2, n] * c
+            u += jacobian[0, 3, n] * d + jacobian[0, 4, n] * e + jacobian[0, 5, n] * f
+            v = jacobian[1, 0, n] * a + jacobian[1, 1, n] * b + jacobian[1, 2, n] * c
+            v += jacobian[1, 3, n] * d + jacobian[1, 4, n] * e + jacobian[1, 5, n] * f
+            du, dv = u - flow[0, n], v - flow[1, n]
             total += surface[n] * (1.0 - min((du * du + dv * dv) * by_square, 1.0))
-        out[g] = total
+            du, dv = u - usual[0, n], v - usual[1, n]
+            away += np.sqrt(du * du + dv * dv)
+        away /= near * surface.size
+        out[g] = total * (0.5 + 0.5 / (1.0 + away * away))
 
 
 @kernel
-def refinement(points, targets, T, intrinsics, limit, H, gradient):
+def refinement(points, targets, say, T, intrinsics, limit, H, gradient):
     """Normal equations of the step that makes a motion explain better what it explains already.
 
     Args:
         points: (n, 3) float64, metres, first camera's frame.
         targets: (n, 2) float64, their pixels in the second image.
+        say: (n,) float64, what each of them counts.
         T: (4, 4) float64, the motion.
         intrinsics: (4,) fx, fy, cx, cy.
         limit: Distance in pixels from which on a point has no say.
@@ -62,7 +72,7 @@ def refinement(points, targets, T, intrinsics, limit, H, gradient):
         along_u = (fx / z, 0.0, -fx * x / z, -fx * x * y, fx * (1.0 + x * x), -fx * y)
         along_v = (0.0, fy / z, -fy * y / z, -fy * (1.0 + y * y), fy * x * y, fy * x)
         for i in range(6):
-            gradient[i] += along_u[i] * du + along_v[i] * dv
+            gradient[i] += say[n] * (along_u[i] * du + along_v[i] * dv)
             for j in range(6):
-                H[i, j] += along_u[i] * along_u[j] + along_v[i] * along_v[j]
+                H[i, j] += say[n] * (along_u[i] * along_u[j] + along_v[i] * along_v[j])
     return count
