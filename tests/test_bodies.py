@@ -8,7 +8,8 @@ from scipy.optimize import least_squares
 
 import dudmap.synthetic
 from dudmap import se3
-from dudmap.bodies import Body, BodyVolume, RigidFusion
+from dudmap.bodies import RigidFusion
+from dudmap.body_track import Body, BodyVolume
 from dudmap.camera import Camera
 from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.mesh import Mesh

@@ -16,7 +16,7 @@ from dudmap.metrics import RunRecord, accuracy, machine, versions
 from dudmap.trajectory import Trajectory
 
 if TYPE_CHECKING:
-    from dudmap.bodies import Body
+    from dudmap.body_track import Body
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
 

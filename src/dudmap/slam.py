@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atlas import Atlas
-from dudmap.bodies import Body, RigidFusion
+from dudmap.bodies import RigidFusion
+from dudmap.body_track import Body
 from dudmap.camera import Camera
 from dudmap.config import Config
 from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
