@@ -52,9 +52,8 @@ def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():
     volume.look_at(np.eye(4))
     cells = np.arange(70_000, dtype=np.int32)
     assert np.array_equal(volume.window.entries_of(cells, volume.blocks), cells)
-    assert np.array_equal(volume.window.entries_of(cells[::-1].copy(), volume.blocks), cells[::-1]), (
-        "found again, not made again"
-    )
+    again = volume.window.entries_of(cells[::-1].copy(), volume.blocks)
+    assert np.array_equal(again, cells[::-1]), "found again, not made again"
 
 
 def test_a_figure_without_a_target_is_only_shown():

@@ -97,10 +97,10 @@ class FirstGuess:
     ) -> tuple[DominantMotion, NDArray[np.float64]] | None:
         """The static world's motion from the last image to this one, and the pose (4, 4) it leads to, if known."""
         surface = self.registration.detector.pieces(pyramid.labelled, volume)
-        camera = self.registration.motion
-        T_expected = se3.inverse(camera.predict(timestamp)) @ camera.T_world_camera
+        model = self.registration.motion
+        T_expected = se3.inverse(model.predict(timestamp)) @ model.T_world_camera
         motion = self.parallax.compare(timestamp, pyramid, surface, T_expected)
-        return None if motion is None else (motion, camera.T_world_camera @ se3.inverse(motion.T_after_before))
+        return None if motion is None else (motion, model.T_world_camera @ se3.inverse(motion.T_after_before))
 
     def keep(self, timestamp: float, pyramid: Pyramid, T_world_camera: NDArray[np.float64], volume: TsdfVolume) -> None:
         """Take over a tracked frame as the one to compare the next with."""
