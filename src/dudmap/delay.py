@@ -3,6 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.median import median
 from dudmap.tracker import Level, Tracker, moved
 from dudmap.volume import TsdfVolume
 
@@ -90,4 +91,4 @@ def _seen_motion(
     readings = level.depth[level.depth > 0]
     if len(readings) == 0:
         return twist, 0.0
-    return twist, float(np.linalg.norm(twist[:3]) + float(np.median(readings)) * np.linalg.norm(twist[3:]))
+    return twist, float(np.linalg.norm(twist[:3]) + float(median(readings)) * np.linalg.norm(twist[3:]))

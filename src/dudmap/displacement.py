@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.median import median
+
 PAIRED_PIXELS = 60
 """Pixels of a body that are looked for in the last frame."""
 FEWEST_PIXELS = 15
@@ -102,8 +104,3 @@ def _between(points: NDArray[np.float32], ids: NDArray[np.int32], pixels: NDArra
     between = (1 - dv) * ((1 - du) * corners[0] + du * corners[1]) + dv * ((1 - du) * corners[2] + du * corners[3])
     between[(owners[0] != owners[1]) | (owners[0] != owners[2]) | (owners[0] != owners[3])] = np.nan
     return between
-
-
-def median(rows: NDArray) -> NDArray:
-    """Median of each column of (n, m), the upper one of an even number; np.median takes ten times as long."""
-    return np.sort(rows, axis=0)[len(rows) // 2]

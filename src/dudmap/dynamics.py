@@ -289,7 +289,9 @@ def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
     """Mask (H, W) widened by some pixels."""
     import cv2
 
-    return cv2.dilate(mask.astype(np.uint8), _ellipse(pixels)) > 0 if pixels else mask
+    if pixels == 0 or not mask.any():
+        return mask
+    return cv2.dilate(mask.astype(np.uint8), _ellipse(pixels)) > 0
 
 
 def _ellipse(radius: float) -> NDArray[np.uint8]:

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from dudmap import se3
 from dudmap.camera import Camera
 from dudmap.config import MoversConfig
-from dudmap.displacement import Seen, displacements, median
+from dudmap.displacement import Seen, displacements
 from dudmap.kernels import labeling
+from dudmap.median import median
 from dudmap.tracker import Level
 
 SAMPLES = 60

@@ -57,7 +57,7 @@ class Registration:
         self.detector = detector
         self.motion = motion
         self.delay = DepthDelay()
-        self.moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame
+        self.moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame, if anything moved
 
     def register(
         self, volume: TsdfVolume, task: Task, T_init: NDArray[np.float64]
@@ -92,7 +92,7 @@ class Registration:
     def keep(self, volume: TsdfVolume, task: Task, tracked: TrackingResult, labels: Labels | None) -> None:
         """Take over a frame whose pose is believed: what the next one is judged from."""
         velocity = self.motion.update(task.timestamp, tracked.T_world_camera)
-        self.moved = None if labels is None else labels.dynamic
+        self.moved = labels.dynamic if labels is not None and labels.dynamic.any() else None
         if labels is None or task.blind:
             return
         coarse = task.pyramid.coarse

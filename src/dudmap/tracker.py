@@ -10,6 +10,7 @@ from dudmap.camera import Camera
 from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.kernels import registration
 from dudmap.kernels.threads import bands, run_bands
+from dudmap.median import median
 from dudmap.volume import TsdfVolume
 
 PIXELS_PER_BAND = 4800
@@ -240,7 +241,7 @@ class Tracker:
             reason = ""
         difference = system.residuals[1, ::4, ::4][weights[::4, ::4] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
-        color_residual = float(np.median(difference)) if len(difference) else 0.0
+        color_residual = float(median(difference)) if len(difference) else 0.0
         return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
 
 
@@ -283,10 +284,10 @@ def fit_exposure(
     used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
     x = intensity.reshape(-1)[used].astype(np.float64)
     y = x + difference.reshape(-1)[used]
-    gain, offset = 1.0, float(np.median(y - x))
+    gain, offset = 1.0, float(median(y - x))
     for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
         error = y - gain * x - offset
-        scale = max(1.5 * float(np.median(np.abs(error))), 0.01)
+        scale = max(1.5 * float(median(np.abs(error))), 0.01)
         w = 1 / (1 + (error / scale) ** 2)
         total = w.sum()
         # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
