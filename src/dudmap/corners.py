@@ -41,7 +41,7 @@ def followed(
     first: NDArray[np.uint8],
     second: NDArray[np.uint8],
     pixels: NDArray[np.int64],
-    expected: NDArray[np.float64] | None = None,
+    expected: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Corners (m, 2) int, their places (m, 2) in a second image, found there and back, and what differs.
 
@@ -50,14 +50,14 @@ def followed(
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) where they are looked for first; None: nowhere else than where they were.
+        expected: (n, 2) where they are looked for first.
     """
     import cv2
 
     if len(pixels) == 0:
         return pixels, np.empty((0, 2)), np.empty(0)
     start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    guess = start.copy() if expected is None else expected.astype(np.float32).reshape(-1, 1, 2)
+    guess = expected.astype(np.float32).reshape(-1, 1, 2)
     size, flags = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
     there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, guess, winSize=size, maxLevel=3, flags=flags)
     back, found_back, _ = cv2.calcOpticalFlowPyrLK(

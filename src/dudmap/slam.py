@@ -92,9 +92,8 @@ class Slam:
         self.movers = MoverTracker(self.config.movers)
         self.fusion = RigidFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
         self.first_guess = FirstGuess(self.config, self.registration, seen)
-        self._first: tuple[Observation, Pyramid, NDArray[np.bool_]] | None = (
-            None  # until a second frame shows what moves in it
-        )
+        # the first frame and what is known to move in it, until a second one shows what moves besides
+        self._first: tuple[Observation, Pyramid, NDArray[np.bool_]] | None = None
         self._lost_since: float | None = None
         self._map_blind = False  # the image of the map's first frame is flat
 
