@@ -1,4 +1,4 @@
-"""Telling the processor what will be loaded soon."""
+"""Loads that NumPy has no word for."""
 
 from llvmlite import ir
 from numba.core import types
@@ -22,3 +22,15 @@ def prefetch(typing_context, array, index):
         return context.get_dummy_value()
 
     return types.void(array, index), generate
+
+
+@intrinsic
+def pair(typing_context, array, index):
+    """Elements ``index`` and ``index + 1`` of a flat int32 array, as they lie in memory, in one int64."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(64).as_pointer())
+        return builder.load(pointer, align=4)
+
+    return types.int64(array, index), generate

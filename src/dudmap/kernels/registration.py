@@ -7,7 +7,7 @@ and the last on every CPU.
 
 import numpy as np
 
-from dudmap.kernels.memory import prefetch
+from dudmap.kernels.neighbors import load_row
 from dudmap.kernels.threads import kernel
 
 NUM_SUMS = 32
@@ -16,60 +16,6 @@ NUM_SUMS = 32
 SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
 """Where the sums hold each element of H, its upper triangle row by row."""
 SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
-
-AHEAD = 16
-"""Pixels between asking for voxels and loading them."""
-
-
-@kernel
-def load_corners(window, geometry, ix, iy, iz, corners, u, size_y, size_z):
-    """Words of the eight voxels around lattice point (ix, iy, iz) of the window into ``corners[:, u]``; 0 = unknown.
-
-    Always eight look-ups: asking first whether all eight lie in one block is a branch that the processor guesses
-    wrong for every third point.
-    """
-    x0, y0, z0 = ix & 7, iy & 7, iz & 7
-    x1, y1, z1 = (ix + 1) & 7, (iy + 1) & 7, (iz + 1) & 7
-    bx0, by0, bz0 = (ix >> 3) * size_y, iy >> 3, iz >> 3
-    bx1, by1, bz1 = ((ix + 1) >> 3) * size_y, (iy + 1) >> 3, (iz + 1) >> 3
-    row = (bx0 + by0) * size_z
-    slot0, slot1 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx0 + by1) * size_z
-    slot2, slot3 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx1 + by0) * size_z
-    slot4, slot5 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    row = (bx1 + by1) * size_z
-    slot6, slot7 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
-    voxel = (x0 * 8 + y0) * 8
-    corners[0, u] = _word(geometry, slot0, voxel + z0)
-    corners[1, u] = _word(geometry, slot1, voxel + z1)
-    voxel = (x0 * 8 + y1) * 8
-    corners[2, u] = _word(geometry, slot2, voxel + z0)
-    corners[3, u] = _word(geometry, slot3, voxel + z1)
-    voxel = (x1 * 8 + y0) * 8
-    corners[4, u] = _word(geometry, slot4, voxel + z0)
-    corners[5, u] = _word(geometry, slot5, voxel + z1)
-    voxel = (x1 * 8 + y1) * 8
-    corners[6, u] = _word(geometry, slot6, voxel + z0)
-    corners[7, u] = _word(geometry, slot7, voxel + z1)
-
-
-@kernel
-def _word(geometry, slot, voxel):
-    """Word of a voxel; the load does not wait for the answer whether there is one."""
-    word = geometry[np.uintp(np.int64(max(slot, 0)) * 512 + voxel)]
-    return word if slot >= 0 else np.int32(0)
-
-
-@kernel
-def _request(window, geometry, ix, iy, iz, size_y, size_z):
-    """Ask for the voxels of ``load_corners``: those that lie in the point's own block."""
-    slot = window[np.uintp(((ix >> 3) * size_y + (iy >> 3)) * size_z + (iz >> 3))]
-    voxel = np.int64(max(slot, 0)) * 512 + (((ix & 7) * 8 + (iy & 7)) * 8 + (iz & 7))
-    prefetch(geometry, np.uintp(voxel))
-    prefetch(geometry, np.uintp(voxel + 8))
-    prefetch(geometry, np.uintp(voxel + 64))
-    prefetch(geometry, np.uintp(voxel + 72))
 
 
 @kernel
@@ -94,10 +40,15 @@ def linearize(
         sums: (NUM_SUMS,) float64, see there. Twist (v, omega) about the camera's centre, world axes.
     """
     w = depth.shape[1]
-    corners = np.empty((8, w), np.int32)
-    ix = np.empty(w, np.int32)
-    iy = np.empty(w, np.int32)
-    iz = np.empty(w, np.int32)
+    cells = np.empty(w, np.int32)
+    voxels = np.empty(w, np.int32)
+    crossing = np.empty(w, np.int32)
+    lists = np.empty((2, w + 1), np.int32)
+    places = np.empty(w, np.int64)
+    corners = np.empty((w, 8), np.int64)
+    pairs = np.empty((4, w), np.int64)
+    words = pairs.view(np.int32)
+    near_low, near_high, far_low, far_high = words[0], words[1], words[2], words[3]
     fx = np.empty(w, np.float32)
     fy = np.empty(w, np.float32)
     fz = np.empty(w, np.float32)
@@ -142,15 +93,14 @@ def linearize(
             ky = min(max(jy, np.int32(0)), last_y)
             kz = min(max(jz, np.int32(0)), last_z)
             ok = (z > zero) & (jx == kx) & (jy == ky) & (jz == kz)
-            ix[u], iy[u], iz[u] = kx, ky, kz
+            cells[u] = np.int32(((kx >> 3) * size_y + (ky >> 3)) * size_z + (kz >> 3))
+            voxels[u] = np.int32(((kx & 7) * 8 + (ky & 7)) * 8 + (kz & 7))
+            crossing[u] = np.int32((((kx & 7) + 1) | ((ky & 7) + 1) | ((kz & 7) + 1)) >> 3)
             fx[u], fy[u], fz[u] = gx - lx, gy - ly, gz - lz
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
             inside[u] = one if ok else zero
 
-        for u in range(w):
-            soon = min(u + AHEAD, w - 1)
-            _request(window, geometry, ix[soon], iy[soon], iz[soon], size_y, size_z)
-            load_corners(window, geometry, ix[u], iy[u], iz[u], corners, u, size_y, size_z)
+        load_row(window, shape, geometry, cells, voxels, crossing, lists, places, corners, pairs)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
@@ -158,8 +108,8 @@ def linearize(
         b0 = b1 = b2 = b3 = b4 = b5 = zero
         cost = on_map = readings = total_weight = chi = zero
         for u in range(w):
-            c0, c1, c2, c3 = corners[0, u], corners[1, u], corners[2, u], corners[3, u]
-            c4, c5, c6, c7 = corners[4, u], corners[5, u], corners[6, u], corners[7, u]
+            c0, c1, c2, c3 = near_low[2 * u], near_low[2 * u + 1], near_high[2 * u], near_high[2 * u + 1]
+            c4, c5, c6, c7 = far_low[2 * u], far_low[2 * u + 1], far_high[2 * u], far_high[2 * u + 1]
             ax, ay, az = fx[u], fy[u], fz[u]
             z = depth[v, u]
             low = min(
