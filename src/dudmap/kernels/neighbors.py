@@ -12,12 +12,42 @@ from dudmap.kernels.threads import kernel
 
 
 @kernel
-def load_corners(window, geometry, ix, iy, iz, corners, size_y, size_z):
-    """Words of the eight voxels around lattice point (ix, iy, iz) into ``corners`` (8,) int64; 0 = unknown."""
-    cell = ((ix >> 3) * size_y + (iy >> 3)) * size_z + (iz >> 3)
-    _find(window, cell, ((ix & 7) * 8 + (iy & 7)) * 8 + (iz & 7), size_y, size_z, corners)
-    for i in range(8):
-        corners[i] = _word(geometry, corners[i])
+def load_corners(window, geometry, ix, iy, iz, corners, u, size_y, size_z):
+    """Words of the eight voxels around lattice point (ix, iy, iz) into ``corners[:, u]``, int32; 0 = unknown.
+
+    Two axes, since the eight words of one would be read back by one vector load, which waits for all of the stores.
+    """
+    x0, y0, z0 = ix & 7, iy & 7, iz & 7
+    x1, y1, z1 = (ix + 1) & 7, (iy + 1) & 7, (iz + 1) & 7
+    bx0, by0, bz0 = (ix >> 3) * size_y, iy >> 3, iz >> 3
+    bx1, by1, bz1 = ((ix + 1) >> 3) * size_y, (iy + 1) >> 3, (iz + 1) >> 3
+    row = (bx0 + by0) * size_z
+    slot0, slot1 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
+    row = (bx0 + by1) * size_z
+    slot2, slot3 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
+    row = (bx1 + by0) * size_z
+    slot4, slot5 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
+    row = (bx1 + by1) * size_z
+    slot6, slot7 = window[np.uintp(row + bz0)], window[np.uintp(row + bz1)]
+    voxel = (x0 * 8 + y0) * 8
+    corners[0, u] = _voxel(geometry, slot0, voxel + z0)
+    corners[1, u] = _voxel(geometry, slot1, voxel + z1)
+    voxel = (x0 * 8 + y1) * 8
+    corners[2, u] = _voxel(geometry, slot2, voxel + z0)
+    corners[3, u] = _voxel(geometry, slot3, voxel + z1)
+    voxel = (x1 * 8 + y0) * 8
+    corners[4, u] = _voxel(geometry, slot4, voxel + z0)
+    corners[5, u] = _voxel(geometry, slot5, voxel + z1)
+    voxel = (x1 * 8 + y1) * 8
+    corners[6, u] = _voxel(geometry, slot6, voxel + z0)
+    corners[7, u] = _voxel(geometry, slot7, voxel + z1)
+
+
+@kernel
+def _voxel(geometry, slot, voxel):
+    """Word of a voxel; the load does not wait for the answer whether there is one."""
+    word = geometry[np.uintp(np.int64(max(slot, 0)) * 512 + voxel)]
+    return word if slot >= 0 else np.int32(0)
 
 
 @kernel

@@ -85,10 +85,10 @@ def _blend(values, fx, fy, fz):
 def _sample(window, geometry, shape, x, y, z, least, corners, values):
     """Signed distance in stored steps at lattice point (x, y, z) inside the window; NaN where it is not known."""
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
-    load_corners(window, geometry, np.int64(lx), np.int64(ly), np.int64(lz), corners, shape[1], shape[2])
+    load_corners(window, geometry, np.int64(lx), np.int64(ly), np.int64(lz), corners, 0, shape[1], shape[2])
     known = True
     for k in range(8):
-        word = corners[k]
+        word = corners[k, 0]
         known &= ((word >> 8) & 0xFF) >= least
         values[k] = np.float32(word >> 16)
     if not known:
@@ -117,7 +117,7 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
         t, end: Depths, metres.
         unit: Voxels per step of the stored distance.
         least: Smallest trusted weight.
-        corners, values: (8,) int64 and (8,) float32 work space.
+        corners, values: (8, 1) int32 and (8,) float32 work space.
     """
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
     ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], d[0], d[1], d[2]
@@ -200,11 +200,11 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     ix, iy, iz = np.int64(lx), np.int64(ly), np.int64(lz)
     fx, fy, fz = x - lx, y - ly, z - lz
     one = np.float32(1)
-    load_corners(window, geometry, ix, iy, iz, corners, shape[1], shape[2])
-    s0, s1 = np.float32(corners[0] >> 16), np.float32(corners[1] >> 16)
-    s2, s3 = np.float32(corners[2] >> 16), np.float32(corners[3] >> 16)
-    s4, s5 = np.float32(corners[4] >> 16), np.float32(corners[5] >> 16)
-    s6, s7 = np.float32(corners[6] >> 16), np.float32(corners[7] >> 16)
+    load_corners(window, geometry, ix, iy, iz, corners, 0, shape[1], shape[2])
+    s0, s1 = np.float32(corners[0, 0] >> 16), np.float32(corners[1, 0] >> 16)
+    s2, s3 = np.float32(corners[2, 0] >> 16), np.float32(corners[3, 0] >> 16)
+    s4, s5 = np.float32(corners[4, 0] >> 16), np.float32(corners[5, 0] >> 16)
+    s6, s7 = np.float32(corners[6, 0] >> 16), np.float32(corners[7, 0] >> 16)
     wy, wz = one - fy, one - fz
     wx = one - fx
     gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
@@ -213,10 +213,10 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     scale = one / length if length > np.float32(0) else np.float32(0)
     normal[0], normal[1], normal[2] = gx * scale, gy * scale, gz * scale
-    load_corners(window, colors, ix, iy, iz, corners, shape[1], shape[2])
+    load_corners(window, colors, ix, iy, iz, corners, 0, shape[1], shape[2])
     for channel in range(3):
         for k in range(8):
-            values[k] = np.float32((corners[k] >> (20 - 10 * channel)) & 1023)
+            values[k] = np.float32((corners[k, 0] >> (20 - 10 * channel)) & 1023)
         value = _blend(values, fx, fy, fz) * np.float32(0.25) + np.float32(0.5)
         color[channel] = np.uint8(min(value, np.float32(255)))
 
@@ -230,7 +230,7 @@ def _trace(
 
     ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the window.
     """
-    corners = np.empty(8, np.int64)
+    corners = np.empty((8, 1), np.int32)
     values = np.empty(8, np.float32)
     o = T[:, 3].copy()
     d = np.empty(3, np.float32)
