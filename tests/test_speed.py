@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dudmap.benchmark import speed
-from dudmap.benchmark.passage import passage
+from dudmap.benchmark.passage import LAP, passage
 from dudmap.errors import DudmapError
 from dudmap.synthetic.recording import DEFAULT_CAMERA
 
@@ -42,6 +42,15 @@ def test_the_passage_is_new_space_all_along():
         assert (depth > 0.3).mean() > 0.99
         assert np.median(depth) < 4.0
         assert depth.std() > 0.2, "there must be something to see"
+
+
+def test_the_first_and_the_last_tenth_of_the_passage_see_the_same():
+    walk = passage(2000)
+    walk.camera = DEFAULT_CAMERA.resized(80, 60)
+    for index in (60, 150, 253):
+        early, late = walk.exact_depth(index), walk.exact_depth(index + 9 * LAP)
+        seen = (early < 6.0) | (late < 6.0)
+        assert (np.abs(early - late)[seen] < 1e-3).mean() > 0.99
 
 
 def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():

@@ -7,7 +7,13 @@ from dudmap.synthetic.scene import Light, Material, Scene, box, cylinder, look_a
 from dudmap.trajectory import Trajectory
 
 SPEED, FPS = 0.3, 30.0  # m/s, frames per second
-BEYOND = 4.0  # metres of passage beyond the last camera position
+LAP = 194
+"""Frames after which the camera has swayed once, and the walls come again but for their pattern of three.
+
+60 frames to warm up and ten laps are 2000 frames: the first and the last tenth see the same, nine laps apart.
+"""
+SPACING = SPEED * LAP / FPS
+BEYOND = 8.0  # metres of passage beyond the last camera position: the end is never seen
 
 
 def passage(frames: int) -> SyntheticSequence:
@@ -24,8 +30,9 @@ def passage(frames: int) -> SyntheticSequence:
 
 
 def _pose(t: float) -> np.ndarray:
-    x, y, z = 0.1 * np.sin(1.3 * t), SPEED * t, 1.4 + 0.05 * np.sin(0.9 * t)
-    aside = 0.9 * np.sin(0.35 * t)
+    sway = np.sin(2 * np.pi * FPS / LAP * t)
+    x, y, z = 0.1 * sway, SPEED * t, 1.4 + 0.05 * sway
+    aside = 0.9 * sway
     return look_at((x, y, z), (x + aside, y + 1.6, 1.0))
 
 
@@ -38,11 +45,11 @@ def _scene(length: float) -> Scene:
     ]
     for side, texture in ((-1, "wallpaper"), (1, "brick")):
         solids.append(box((side * 1.6, middle, 1.25), (0.2, length + 2, 2.5), Material(texture, (0.5, 0.5))))
-        for number, y in enumerate(np.arange(0.8 + 0.4 * side, length, 2.6)):
-            height = 0.4 + 0.25 * (number % 4)
+        for number, y in enumerate(np.arange(0.8 + 0.4 * side, length, SPACING)):
+            height = 0.4 + 0.25 * (number % 3)
             solids.append(box((side * 1.25, y, height / 2), (0.5, 0.6, height), Material("wood", (0.6, 0.6))))
-            solids.append(box((side * 1.45, y + 1.3, 1.25), (0.2, 0.3, 2.5), Material("plaster", (0.8, 0.8))))
-            if number % 2:
+            solids.append(box((side * 1.45, y + 1.2, 1.25), (0.2, 0.3, 2.5), Material("plaster", (0.8, 0.8))))
+            if number % 3:
                 top, bottom = (side * 1.1, y + 0.7, 0.9), (side * 1.1, y + 0.7, 0.0)
                 solids.append(cylinder(bottom, top, 0.12, Material("stripes", (3, 3))))
     return Scene(
