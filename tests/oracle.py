@@ -7,7 +7,7 @@ from dudmap.camera import Camera
 
 def fuse(
     frames, T_camera_world_of, camera: Camera, points, truncation, behind, max_weight,
-    sigma=lambda z: 0.0, weights_of=None,
+    sigma=lambda z: 0.0, weights_of=None, max_readings=np.inf,
 ):  # fmt: skip
     """Running average (eq. 4.18-4.23) of projective distances at world points (N, 3), no faster carving.
 
@@ -18,6 +18,7 @@ def fuse(
         truncation, behind, max_weight: Band in front of and behind the surface, metres, and cap of the weight.
         sigma: Least width of the band around a reading of depth z, metres.
         weights_of: Weight (H, W) of the readings of each frame; 1 if None.
+        max_readings: A reading lifts no weight above this many times its own.
 
     Returns:
         Distance (N,) with NaN where never seen, weight (N,), colour (N, 3) float.
@@ -47,7 +48,8 @@ def fuse(
             else:
                 color[n] += (frame.color[v, u] - color[n]) * share
             distance[n] += (s - distance[n]) * share
-            weight[n] = min(weight[n] + gains[v, u], max_weight)
+            most = max(weight[n], min(max_weight, max_readings * gains[v, u]))
+            weight[n] = min(weight[n] + gains[v, u], most)
     return np.where(weight > 0, distance, np.nan), weight, color
 
 

@@ -175,6 +175,30 @@ def test_weights_stop_at_the_cap():
     assert voxels_of(volume)[2].max() == 3
 
 
+def test_poor_readings_give_way_to_better_ones():
+    """Twenty poor readings, five good ones a little nearer, and poor ones again, which a good average withstands."""
+    config = CONSTANT.model_copy(update={"max_readings": 4})
+    volume = TsdfVolume(CAMERA, config, depth_max=4.0)
+    (T,), poor, good = poses(1), wall(1.5), wall(1.5)
+    good.depth[:] -= 0.02
+    frames, gains = [poor] * 20 + [good] * 5 + [poor] * 3, [1] * 20 + [5] * 5 + [1] * 3
+    weights_of = [np.full(CAMERA.shape, gain, dtype=np.uint8) for gain in gains]
+    for frame, weights in zip(frames, weights_of, strict=True):
+        volume.integrate(frame, T, weights=weights)
+    points, distance, weight, _ = voxels_of(volume)
+    chosen = np.random.default_rng(2).choice(np.flatnonzero(weight > 0), 1000, replace=False)
+    expected, weights, _ = fuse(
+        frames, [se3.inverse(T)] * len(frames), CAMERA, points[chosen], volume.truncation, volume.truncation_behind,
+        255, weights_of=weights_of, max_readings=4,
+    )  # fmt: skip
+    seen = weights == weight[chosen]
+    assert seen.mean() > 0.98
+    assert set(np.unique(weights[seen])) == {4, 20}, "behind the better wall's band only poor readings count"
+    assert (
+        np.mean(np.abs(distance[chosen] - expected)[seen] < 4 * allowed(volume)) > 0.98
+    )  # 28 roundings instead of three
+
+
 def test_sample_is_trilinear_interpolation():
     volume = TsdfVolume(CAMERA, CONSTANT, depth_max=4.0)
     volume.integrate(wall(1.5), np.eye(4))

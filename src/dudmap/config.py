@@ -92,6 +92,8 @@ class VolumeConfig(Part):
     """Fuse into a block only in every second frame, with double weight, where the noise is coarser than the voxels."""
     max_weight: int = Field(default=255, ge=1, le=255)
     """Cap of the running average (eq. 4.19)."""
+    max_readings: int = Field(default=48, ge=1, le=255)
+    """A reading adds to the average up to the weight of so many like it: poor ones give way soon to better ones."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of one observation: 1, or cos(theta) / err(z) (eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
@@ -357,7 +359,13 @@ class Config(Part):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
-        "volume": {"voxel_size": 0.01, "truncation_noise": 0.0, "weighting": "constant", "take_turns": False},
+        "volume": {
+            "voxel_size": 0.01,
+            "truncation_noise": 0.0,
+            "max_readings": 255,
+            "weighting": "constant",
+            "take_turns": False,
+        },
         "tracker": {
             "huber": 0.01,
             "damping": 0.02,

@@ -73,12 +73,16 @@ class Fusion:
         if len(cells):
             window.give_voxels(cells, blocks, self.number)
 
-    def average(self, color: NDArray[np.uint8], weights: NDArray[np.uint8]) -> None:
-        """Average distances and colours (H, W, 3), by weights (H, W), into the voxels in view; free what is empty."""
+    def average(self, color: NDArray[np.uint8], weights: NDArray[np.uint8], count: int) -> None:
+        """Average distances and colours (H, W, 3) into the voxels in view; free what is empty.
+
+        Each reading counts by its weight (H, W), as though ``count`` frames had shown it.
+        """
         volume, window, blocks, config = self.volume, self.volume.window, self.volume.blocks, self.volume.config
         if len(window.near) == 0:
             return
         visible, repeats = self._visible()
+        repeats *= count
         blocks.written[visible] = self.number
         blocks.fused[visible] = np.minimum(blocks.fused[visible], 254) + 1
         voxel = np.array(
@@ -86,6 +90,7 @@ class Fusion:
                 volume.voxel_size, volume.sdf_unit, volume.truncation, volume.truncation_behind,
                 config.truncation_noise, volume.sensor.sigma_base, volume.sensor.sigma_scale, config.max_weight,
                 config.carve_rate if config.carving else 1, volume.largest, volume.depth_unit,
+                config.max_readings,
             ],
             dtype=np.float32,
         )  # fmt: skip

@@ -186,9 +186,7 @@ class TsdfVolume:
         fusion = Fusion(self, depth, T_world_camera, self._frame_number)
         fusion.allocate()
         weights = reading_weights(depth, self.camera, self.config, self.sensor) if weights is None else weights
-        if count > 1:
-            weights = np.minimum(weights.astype(np.int32) * count, 255).astype(np.uint8)
-        fusion.average(frame.color, weights)
+        fusion.average(frame.color, weights, count)
         if self.config.carving:
             fusion.observe_free(count)
 

@@ -62,13 +62,14 @@ def integrate(
         size: (2,) int64 image height and width.
         pixels: (H * W + 1,) int64, the two words of ``pack_pixels`` as one.
         map_geometry, map_colors: (num_slots * 512,) int32.
-        voxel: (11,) float32: voxel_size, sdf_unit, truncation, truncation_behind, truncation_noise, sigma_base,
-            sigma_scale, max_weight, carve_rate, largest storable distance, unit of depth.
+        voxel: (12,) float32: voxel_size, sdf_unit, truncation, truncation_behind, truncation_noise, sigma_base,
+            sigma_scale, max_weight, carve_rate, largest storable distance, unit of depth, max_readings.
         occupied: (n,) int32 out: voxels that hold a surface or were never seen.
     """
     voxel_size, unit, front, behind = voxel[0], voxel[1], voxel[2], voxel[3]
     noise, base, scale = voxel[4], voxel[5], voxel[6]
     max_weight, carve_rate, limit, depth_unit = voxel[7], voxel[8], voxel[9], voxel[10]
+    max_readings = voxel[11]
     by_unit = np.float32(1) / unit
     zero, half, one, young = np.float32(0), np.float32(0.5), np.float32(1), np.float32(8)
     height, width = size[0], size[1]
@@ -134,6 +135,7 @@ def integrate(
             gain = gain if banded | empty else zero
             total = old_weight + gain
             share = gain / max(total, one)
+            most = max(old_weight, min(max_weight, max_readings * bits(c, 0, 0xFF)))
             new_sdf = old_sdf + (min(s, tau) - old_sdf) * share
             # intensity and colour belong to the surface: emptiness does not repaint it
             share = share if banded else zero
@@ -143,7 +145,7 @@ def integrate(
             new_shade = old_shade + (shade - old_shade) * share
             new_word = (
                 (np.int32(np.floor(new_sdf * by_unit + half)) << np.int32(16))
-                | (np.int32(min(total, max_weight)) << np.int32(8))
+                | (np.int32(min(total, most)) << np.int32(8))
                 | np.int32(new_shade + half)
             )
             new_word = np.int32(new_word) if gain > zero else word
