@@ -40,6 +40,7 @@ def test_the_thesis_preset_has_the_thesis_values():
         ("volume.voxel_size=nan", "finite"),
         ("dynamics.method=magic", "'em'"),
         ("preprocess.depth_min=9", "depth_min"),
+        ("volume.max_readings=2", "no voxel would ever be trusted"),
         ("tracker.iterations=[1]", "one entry per level"),
         ("tracker.huber", "key=value"),
         ("preset=best", "thesis"),

@@ -105,6 +105,15 @@ class VolumeConfig(Part):
     free_after: int = Field(default=4, ge=1, le=200)
     """Frames a block must be seen empty before it counts as free space."""
 
+    @model_validator(mode="after")
+    def _reachable(self) -> "VolumeConfig":
+        if self.min_weight > min(self.max_weight, self.max_readings):
+            raise ValueError(
+                f"min_weight {self.min_weight} must not exceed max_weight {self.max_weight} and max_readings "
+                f"{self.max_readings}: no voxel would ever be trusted"
+            )
+        return self
+
 
 class TrackerConfig(Part):
     """Direct SDF and intensity registration (thesis section 4.4)."""
