@@ -113,9 +113,9 @@ def there_and_back(sequence, results):
 
 @pytest.fixture(scope="module")
 def round_trip():
-    """Once round and on, seen through a lens whose focal length is believed 1.5 % too long: the angles drift."""
+    """Once round and on, seen through a lens whose focal length is believed 2.2 % too long: the angles drift."""
     sequence = turned(np.concatenate([np.linspace(0, 360, 170), np.linspace(361.5, 385, 16), np.full(34, 385.0)]))
-    camera = replace(SMALL, fx=SMALL.fx * 1.015, fy=SMALL.fy * 1.015)
+    camera = replace(SMALL, fx=SMALL.fx * 1.022, fy=SMALL.fy * 1.022)
     return sequence, camera, [sequence[i] for i in range(len(sequence))]
 
 
@@ -135,7 +135,7 @@ def test_a_loop_takes_the_drift_out(round_trip):
         print(f"loops {enabled}: end off by {gaps[enabled][0]:.3f} m, {gaps[enabled][1]:.2f} deg; map off by "
               f"{maps[enabled].accuracy.mean:.3f} m, ghosts {maps[enabled].ghost_share:.1%}")  # fmt: skip
         np.testing.assert_allclose(results[-1].T_world_camera, slam.trajectory.Ts_world_camera[-1])
-    assert gaps[False][1] > 1.5, "there must be a drift to take out"
+    assert gaps[False][1] > 3
     assert gaps[True][1] < 0.3 * gaps[False][1]
     assert gaps[True][0] < 0.5 * gaps[False][0]
     assert maps[True].accuracy.mean < 0.8 * maps[False].accuracy.mean
