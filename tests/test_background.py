@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
-from dudmap.background import Background
-from dudmap.camera import Camera
 from dudmap.config import DynamicsConfig
-from dudmap.tracker import Level
+from dudmap.dynamics.background_model import Background
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 V, U = np.indices(CAMERA.shape)

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap import se3
 from dudmap.benchmark import limits, measure, report
 from dudmap.benchmark.entries import Entry
 from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
@@ -17,7 +16,8 @@ from dudmap.benchmark.systems import systems
 from dudmap.benchmark.table import markdown
 from dudmap.cli import app
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.trajectory import Trajectory
+from dudmap.geometry import se3
+from dudmap.geometry.trajectory import Trajectory
 from recordings import write_recording
 
 PUBLIC = ("thesis", "tum-dynamic", "bonn", "icl-nuim")

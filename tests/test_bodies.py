@@ -7,18 +7,18 @@ import pytest
 from scipy.optimize import least_squares
 
 import dudmap.synthetic
-from dudmap import se3
-from dudmap.bodies import RigidFusion
-from dudmap.body_track import Body, BodyVolume
-from dudmap.camera import Camera
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.mesh import Mesh
-from dudmap.movers import Mover
-from dudmap.preprocess import Preprocessor, pyramid
-from dudmap.run import run
+from dudmap.frames.preprocess import Preprocessor, pyramid
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.objects.object_fusion import RigidFusion
+from dudmap.objects.object_map import Body, BodyVolume
+from dudmap.objects.object_tracker import Mover
+from dudmap.pipeline.run import run
 from dudmap.slam import Slam
-from dudmap.tracker import Level
-from dudmap.trajectory import Trajectory
+from dudmap.tracking.tracker import Level
 
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 ON = Config().override(["movers.meshes=true"])

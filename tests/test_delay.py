@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
 from dudmap.config import TrackerConfig
-from dudmap.delay import LONGEST, DepthDelay
-from dudmap.tracker import Level, Tracker
-from dudmap.volume import TsdfVolume
+from dudmap.geometry import se3
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.time_offset import LONGEST, DepthDelay
+from dudmap.tracking.tracker import Level, Tracker
 from test_registration_oracle import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 FPS = 30.0

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import se3, synthetic
+from dudmap import synthetic
 from dudmap.benchmark.systems import systems
-from dudmap.camera import Camera
 from dudmap.config import Config
-from dudmap.dynamics import BINS, LARGEST, Mixture, fit_mixture
+from dudmap.dynamics.detector import BINS, LARGEST, Mixture, fit_mixture
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling
 from dudmap.slam import Slam
 from oracle import half_normal_mixture_em

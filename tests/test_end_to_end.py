@@ -10,11 +10,11 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.mesh import Mesh
-from dudmap.run import run
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
-from dudmap.trajectory import Trajectory
-from dudmap.volume import TsdfVolume
 
 EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
 

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap import se3
 from dudmap.cli import app
-from dudmap.mesh import Mesh
-from dudmap.trajectory import Trajectory
+from dudmap.geometry import se3
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
 
 
 def evaluate(*arguments):

@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from dudmap import se3
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.evaluation.trajectory import ate, pair_poses, rpe
-from dudmap.trajectory import Trajectory
+from dudmap.geometry import se3
+from dudmap.geometry.trajectory import Trajectory
 
 RNG_SEED = 7
 

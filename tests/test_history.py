@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap import se3
-from dudmap.camera import Camera
 from dudmap.errors import MapError
-from dudmap.frame import Frame
-from dudmap.history import DEPTH_UNIT, History
-from dudmap.volume import TsdfVolume
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.frame_store import DEPTH_UNIT, History
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 
@@ -63,7 +63,7 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dudmap.history.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("dudmap.places.frame_store.tempfile.TemporaryFile", full)
     history, frame = History(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
 
     def keep():

@@ -10,8 +10,8 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.live import Arrival, Newest, live, replay
-from dudmap.run import run
+from dudmap.pipeline.replay import Arrival, Newest, live, replay
+from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from recordings import cut, write_recording
 from test_run import StandIn, slam  # noqa: F401

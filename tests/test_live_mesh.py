@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
-from dudmap.live_mesh import EDGE, LiveMesh
-from dudmap.volume import TsdfVolume
+from dudmap.geometry import se3
+from dudmap.mapping.incremental_mesh import EDGE, LiveMesh
+from dudmap.mapping.volume import TsdfVolume
 from test_map_oracle import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1})

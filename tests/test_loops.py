@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap import se3
-from dudmap.atlas import Atlas, at_time
-from dudmap.camera import Camera
 from dudmap.config import Config, RelocalizationConfig
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import moved
-from dudmap.frame import Frame
-from dudmap.history import History
-from dudmap.relocalization import Keyframe, Keyframes, PlacedFeatures
-from dudmap.run import run
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.pipeline.run import run
+from dudmap.places.atlas import Atlas, at_time
+from dudmap.places.frame_store import History
+from dudmap.places.place_recognition import Keyframe, Keyframes, PlacedFeatures
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
-from dudmap.trajectory import Trajectory
-from dudmap.volume import TsdfVolume
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=29.5, width=80, height=60)

@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
-from dudmap.blocks import FULLEST
-from dudmap.camera import Camera
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
-from dudmap.frame import Frame
-from dudmap.fusion import reading_weights
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.kernels import hashing
 from dudmap.kernels.visibility import SETTLED
-from dudmap.volume import FREE, TsdfVolume
+from dudmap.mapping.integrator import reading_weights
+from dudmap.mapping.volume import FREE, TsdfVolume
+from dudmap.mapping.voxel_blocks import FULLEST
 from oracle import fuse, trilinear
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.camera import Camera
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import DatasetError, FrameError
-from dudmap.frame import Frame
+from dudmap.frames.frame import Frame
+from dudmap.geometry.camera import Camera
 from dudmap.sequences import open_sequence
 from dudmap.sequences.masks import MaskFolder
 from dudmap.slam import Slam

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import MapError
-from dudmap.mesh import Mesh
+from dudmap.geometry.mesh import Mesh
 
 
 def tetrahedron() -> Mesh:

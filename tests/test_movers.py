@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap import se3
-from dudmap.camera import Camera
 from dudmap.config import Config, MoversConfig
-from dudmap.metrics import RunRecord
-from dudmap.movers import MoverTracker
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.objects.object_tracker import MoverTracker
+from dudmap.pipeline.metrics import RunRecord
 from dudmap.slam import Slam
-from dudmap.tracker import Level
+from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(fx=131, fy=131, cx=79.5, cy=59.5, width=160, height=120)
 RNG = np.random.default_rng(3)

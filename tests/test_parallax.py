@@ -6,16 +6,18 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap import parallax, se3, synthetic
-from dudmap.camera import Camera
+from dudmap import synthetic
 from dudmap.config import Config
-from dudmap.consensus import NOISE_PX, flow_jacobian, projected, rigid_motion
-from dudmap.corners import rests_as_well
-from dudmap.health import TrackingHealth
+from dudmap.dynamics import ego_motion as parallax
+from dudmap.dynamics.ego_motion import dominant_motion
+from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, projected, rigid_motion
+from dudmap.frames.optical_flow import rests_as_well
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
-from dudmap.parallax import dominant_motion
 from dudmap.slam import Slam
-from dudmap.tracker import TrackingResult
+from dudmap.tracking.quality_monitor import TrackingHealth
+from dudmap.tracking.tracker import TrackingResult
 
 CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 

@@ -3,8 +3,8 @@
 import numpy as np
 from scipy.linalg import expm
 
-from dudmap import se3
-from dudmap.posegraph import Edge, adjoint, optimize, small_adjoint
+from dudmap.geometry import se3
+from dudmap.places.pose_graph import Edge, adjoint, optimize, small_adjoint
 
 
 def random_pose(rng, reach=1.0):

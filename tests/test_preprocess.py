@@ -5,11 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from dudmap.camera import Camera
 from dudmap.config import PreprocessConfig
 from dudmap.errors import DatasetError
-from dudmap.frame import Frame
-from dudmap.preprocess import Preprocessor, pyramid
+from dudmap.frames.frame import Frame
+from dudmap.frames.preprocess import Preprocessor, pyramid
+from dudmap.geometry.camera import Camera
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 

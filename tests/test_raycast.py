@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
-from dudmap.camera import Camera
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.kernels.raycasting import raycast
 
 VOXEL = 0.01

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
-from dudmap.camera import Camera
 from dudmap.config import SensorConfig, TrackerConfig, VolumeConfig
-from dudmap.frame import Frame
-from dudmap.health import TrackingHealth
-from dudmap.motion import MotionModel
-from dudmap.tracker import Level, Tracker, TrackingResult, chained, exposed, fit_exposure, moved
-from dudmap.volume import TsdfVolume
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.quality_monitor import TrackingHealth
+from dudmap.tracking.tracker import Level, Tracker, TrackingResult, chained, exposed, fit_exposure, moved
 
 CAMERA = Camera(80.0, 80.0, 39.5, 29.5, 80, 60)
 SENSOR = SensorConfig()

@@ -4,15 +4,15 @@ import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap import se3
-from dudmap.camera import Camera
 from dudmap.config import RelocalizationConfig
-from dudmap.frame import Frame
-from dudmap.preprocess import Preprocessor
-from dudmap.relocalization import Keyframes, agree, kabsch, matches, rigid_ransac
+from dudmap.frames.frame import Frame
+from dudmap.frames.preprocess import Preprocessor
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.places.place_recognition import Keyframes, agree, kabsch, matches, rigid_ransac
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
-from dudmap.trajectory import Trajectory
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 

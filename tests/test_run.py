@@ -14,11 +14,11 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError, DudmapError
-from dudmap.mesh import Mesh
-from dudmap.reading import read_ahead
-from dudmap.run import run
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.pipeline.frame_source import read_ahead
+from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
-from dudmap.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH, cut, write_recording
 
 TRIANGLE = Mesh(

@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.camera import Camera
 from dudmap.errors import DatasetError, FrameError
+from dudmap.geometry.association import associate
+from dudmap.geometry.camera import Camera
 from dudmap.sequences import Sequence, open_sequence
-from dudmap.sequences.association import associate
 from dudmap.sequences.tum import TumSequence
 from recordings import HEIGHT, WIDTH, color_image, cut, depth_image, write_recording
 

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
 from dudmap.config import SimilarityConfig
-from dudmap.similarity import RedundantViews, SimilarityTest
+from dudmap.geometry import se3
+from dudmap.places.redundancy import RedundantViews, SimilarityTest
 
 cv2 = pytest.importorskip("cv2")
 

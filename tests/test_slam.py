@@ -9,11 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import se3, synthetic
-from dudmap.camera import Camera
+from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.frame import Frame
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
@@ -174,7 +175,7 @@ def test_frames_that_do_not_fit_the_camera_are_refused():
 SCRIPT = """
 import hashlib
 from dudmap import Slam, synthetic
-from dudmap.camera import Camera
+from dudmap.geometry.camera import Camera
 camera = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 sequence = synthetic.sequence("room", movers=("person",), frames=10, camera=camera, start_dynamic=True)
 slam = Slam(camera)

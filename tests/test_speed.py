@@ -55,7 +55,7 @@ def test_the_first_and_the_last_tenth_of_the_passage_see_the_same():
 
 def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():
     from dudmap.config import SensorConfig, VolumeConfig
-    from dudmap.volume import TsdfVolume
+    from dudmap.mapping.volume import TsdfVolume
 
     volume = TsdfVolume(DEFAULT_CAMERA, VolumeConfig(voxel_size=0.005), SensorConfig(), 4.0)
     volume.look_at(np.eye(4))

@@ -3,11 +3,12 @@
 import numpy as np
 import pytest
 
-from dudmap import surfaces, synthetic
-from dudmap.camera import Camera
+from dudmap import synthetic
 from dudmap.config import DynamicsConfig
+from dudmap.dynamics import segments as surfaces
+from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
-from dudmap.tracker import Level
+from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)

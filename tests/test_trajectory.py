@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dudmap import se3
 from dudmap.errors import DatasetError
-from dudmap.trajectory import Trajectory
+from dudmap.geometry import se3
+from dudmap.geometry.trajectory import Trajectory
 
 
 def path(count: int = 5) -> Trajectory:

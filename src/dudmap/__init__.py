@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Camera": "camera",
+    "Camera": "geometry.camera",
     "Config": "config",
     "DudmapError": "errors",
-    "Frame": "frame",
+    "Frame": "frames.frame",
     "FrameResult": "result",
-    "Mesh": "mesh",
+    "Mesh": "geometry.mesh",
     "Slam": "slam",
-    "Trajectory": "trajectory",
-    "TsdfVolume": "volume",
+    "Trajectory": "geometry.trajectory",
+    "TsdfVolume": "mapping.volume",
     "open_sequence": "sequences",
 }
 
@@ -33,16 +33,16 @@ __all__ = [
 ]
 
 if TYPE_CHECKING:
-    from dudmap.camera import Camera
     from dudmap.config import Config
     from dudmap.errors import DudmapError
-    from dudmap.frame import Frame
-    from dudmap.mesh import Mesh
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.geometry.mesh import Mesh
+    from dudmap.geometry.trajectory import Trajectory
+    from dudmap.mapping.volume import TsdfVolume
     from dudmap.result import FrameResult
     from dudmap.sequences import open_sequence
     from dudmap.slam import Slam
-    from dudmap.trajectory import Trajectory
-    from dudmap.volume import TsdfVolume
 
 
 def __getattr__(name: str) -> object:

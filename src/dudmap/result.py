@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics import Labels
-from dudmap.movers import Mover
-from dudmap.tracker import TrackingResult
+from dudmap.dynamics.detector import Labels
+from dudmap.objects.object_tracker import Mover
+from dudmap.tracking.tracker import TrackingResult
 
 
 @dataclass(frozen=True, eq=False)

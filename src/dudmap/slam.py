@@ -7,29 +7,29 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atlas import Atlas
-from dudmap.bodies import RigidFusion
-from dudmap.body_track import Body
-from dudmap.camera import Camera
 from dudmap.config import Config
-from dudmap.dynamics import DynamicDetector, Labels, full_mask, full_size, grown_mask
-from dudmap.first_guess import CLEARLY, FirstGuess
-from dudmap.frame import Frame
-from dudmap.health import TrackingHealth
-from dudmap.history import History
-from dudmap.loops import LoopCloser, View
-from dudmap.motion import MotionModel
-from dudmap.movers import Mover, MoverTracker
-from dudmap.preprocess import Observation, Preprocessor, exposed_color
-from dudmap.pyramid import Pyramid, mostly
-from dudmap.registration import Registration, Task, static_weights
-from dudmap.relocalization import Keyframes, agree
+from dudmap.dynamics.detector import DynamicDetector, Labels, full_mask, full_size, grown_mask
+from dudmap.dynamics.segments import Pieces
+from dudmap.frames.frame import Frame
+from dudmap.frames.preprocess import Observation, Preprocessor, exposed_color
+from dudmap.frames.pyramid import Pyramid, mostly
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.objects.object_fusion import RigidFusion
+from dudmap.objects.object_map import Body
+from dudmap.objects.object_tracker import Mover, MoverTracker
+from dudmap.places.atlas import Atlas
+from dudmap.places.frame_store import History
+from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.place_recognition import Keyframes, agree
+from dudmap.places.redundancy import RedundantViews
 from dudmap.result import Clock, FrameResult
-from dudmap.similarity import RedundantViews
-from dudmap.surfaces import Pieces
-from dudmap.tracker import Level, Tracker, TrackingResult
-from dudmap.trajectory import Trajectory
-from dudmap.volume import TsdfVolume
+from dudmap.tracking.front_end import Registration, Task, static_weights
+from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.pose_prediction import CLEARLY, FirstGuess
+from dudmap.tracking.quality_monitor import TrackingHealth
+from dudmap.tracking.tracker import Level, Tracker, TrackingResult
 
 FLAT = 0.01
 """An image whose intensities (0..1) have a smaller standard deviation shows nothing: black, or blinded."""

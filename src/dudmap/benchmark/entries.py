@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 from dudmap.errors import DatasetError
 
 if TYPE_CHECKING:
-    from dudmap.mesh import Mesh
+    from dudmap.geometry.mesh import Mesh
     from dudmap.sequences import Sequence
 
 
@@ -39,9 +39,9 @@ class Entry:
             DatasetError: The folder is missing or not a recording.
         """
         if self.path is not None:
+            from dudmap.geometry.trajectory import Trajectory
             from dudmap.sequences import open_sequence
             from dudmap.sequences.tum import TumSequence
-            from dudmap.trajectory import Trajectory
 
             recording = open_sequence(self.path, self.camera)
             beside = sorted(self.path.glob("*.gt.freiburg"))  # the name that ICL-NUIM gives its ground truth
@@ -56,7 +56,7 @@ class Entry:
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
         """True static surface in the frame of the ground truth, whole and as far as the camera saw it, if known."""
-        from dudmap.mesh import Mesh
+        from dudmap.geometry.mesh import Mesh
         from dudmap.synthetic.recording import SyntheticSequence
 
         if isinstance(sequence, SyntheticSequence):

@@ -16,7 +16,7 @@ from dudmap.benchmark.entries import Entry
 from dudmap.benchmark.measure import Row, in_own_process
 from dudmap.config import Config
 from dudmap.errors import DatasetError, DudmapError
-from dudmap.trajectory import Trajectory
+from dudmap.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from dudmap.sequences import Sequence
@@ -112,8 +112,8 @@ def _save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Traje
 
 
 def _run_ours(folder: Path) -> Row:
-    from dudmap.camera import Camera
-    from dudmap.frame import Frame
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
     from dudmap.slam import Slam
 
     camera = Camera(**json.loads((folder / "camera.json").read_text(encoding="utf-8")))

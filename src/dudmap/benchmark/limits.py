@@ -19,13 +19,13 @@ from numpy.typing import NDArray
 from dudmap.benchmark.measure import Row, in_own_process, measure_sequence
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.metrics import SCORED_COVERAGE
+from dudmap.pipeline.metrics import SCORED_COVERAGE
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
-    from dudmap.frame import Frame
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.trajectory import Trajectory
     from dudmap.synthetic.recording import SyntheticSequence
-    from dudmap.trajectory import Trajectory
 
 SIZE = (320, 240)
 FPS = 30.0

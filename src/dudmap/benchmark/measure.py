@@ -17,7 +17,7 @@ from dudmap.errors import DatasetError, DudmapError
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
-    from dudmap.mesh import Mesh
+    from dudmap.geometry.mesh import Mesh
     from dudmap.sequences import Sequence
 
 Row = dict[str, Any]
@@ -78,9 +78,9 @@ def measure_sequence(
     Raises:
         DudmapError: The recording cannot be used, or nothing could be tracked.
     """
-    from dudmap.mesh import Mesh
-    from dudmap.reading import AHEAD
-    from dudmap.run import run
+    from dudmap.geometry.mesh import Mesh
+    from dudmap.pipeline.frame_source import AHEAD
+    from dudmap.pipeline.run import run
     from dudmap.synthetic.recording import SyntheticSequence
 
     ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would take the cores from the system

@@ -2,9 +2,9 @@
 
 import numpy as np
 
+from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.synthetic.scene import Light, Material, Scene, box, cylinder, look_at, pose
-from dudmap.trajectory import Trajectory
 
 SPEED, FPS = 0.3, 30.0  # m/s, frames per second
 LAP = 194

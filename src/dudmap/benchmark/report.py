@@ -11,7 +11,7 @@ from dudmap.benchmark.suites import Suite
 from dudmap.benchmark.table import COLUMNS, grid, markdown, save, shown
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.metrics import machine, versions
+from dudmap.pipeline.metrics import machine, versions
 
 
 def run_suite(
@@ -82,8 +82,8 @@ def named_folders(assignments: list[str]) -> dict[str, Path]:
 
 def _scored(entry: Entry, folder: Path) -> Row:
     """Figures of the trajectory and mesh that another system left in a folder."""
-    from dudmap.mesh import Mesh
-    from dudmap.trajectory import Trajectory
+    from dudmap.geometry.mesh import Mesh
+    from dudmap.geometry.trajectory import Trajectory
 
     path = folder / "trajectory.txt"
     if not path.is_file():

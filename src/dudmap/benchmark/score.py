@@ -3,12 +3,12 @@
 from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import DatasetError
-from dudmap.metrics import accuracy
-from dudmap.trajectory import Trajectory
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.pipeline.metrics import accuracy
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
-    from dudmap.mesh import Mesh
+    from dudmap.geometry.mesh import Mesh
 
 COMPLETE_WITHIN = 0.02
 """A point of the true surface counts as mapped if the mesh is this near, metres."""

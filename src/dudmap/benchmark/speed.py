@@ -21,7 +21,7 @@ from dudmap.config import Config
 from dudmap.errors import DudmapError
 
 if TYPE_CHECKING:
-    from dudmap.frame import Frame
+    from dudmap.frames.frame import Frame
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
 
@@ -196,7 +196,7 @@ def _time_frames(job: tuple[float, int]) -> Row:
 
 def _time_again(slam: "Slam", frame: "Frame") -> Row:
     """Extraction of what one more frame changed in the mesh, and how many chunks that are."""
-    from dudmap.live_mesh import LiveMesh
+    from dudmap.mapping.incremental_mesh import LiveMesh
 
     live = LiveMesh(slam.volume)
     live.update()
@@ -218,8 +218,8 @@ def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
 
 def _time_iteration(frames: int) -> Row:
     """One linearisation of the level that is 320 pixels wide, against the map of a few frames."""
-    from dudmap.preprocess import pyramid
-    from dudmap.tracker import Level
+    from dudmap.frames.preprocess import pyramid
+    from dudmap.tracking.tracker import Level
 
     sequence = _room(frames)
     slam = None
@@ -267,7 +267,7 @@ FIRST_POSE = """
 import os, sys
 from pathlib import Path
 from dudmap.config import Config
-from dudmap.run import run
+from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 
 def first(index, reading, result):

@@ -12,9 +12,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from dudmap.camera import Camera
-    from dudmap.frame import Frame
-    from dudmap.reading import Reading
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.pipeline.frame_source import Reading
     from dudmap.result import FrameResult
 
 app = typer.Typer(add_completion=False)
@@ -33,7 +33,7 @@ def demo(
     The room is analytic, the depth has a Kinect's noise, and poses and masks are known exactly. The run folder also
     gets demo.png: colour, depth, mask, residuals and the map without the person, seen from the same pose.
     """
-    from dudmap.run import run
+    from dudmap.pipeline.run import run
     from dudmap.synthetic import sequence
 
     config = read_config(None, None, assignments or [])
@@ -62,8 +62,8 @@ class FullestMoment:
 
     def save_picture(self, out: Path, camera: "Camera") -> None:
         """Write demo.png beside the map that the run left in ``out``."""
-        from dudmap.picture import save_sheet
-        from dudmap.volume import TsdfVolume
+        from dudmap.mapping.volume import TsdfVolume
+        from dudmap.pipeline.contact_sheet import save_sheet
 
         if self._moment is None:
             return

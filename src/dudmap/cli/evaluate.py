@@ -13,8 +13,8 @@ from dudmap.errors import ConfigError, DatasetError, DudmapError
 if TYPE_CHECKING:
     import numpy as np
 
-    from dudmap.mesh import Mesh
-    from dudmap.trajectory import Trajectory
+    from dudmap.geometry.mesh import Mesh
+    from dudmap.geometry.trajectory import Trajectory
 
 Figures = dict[str, Any]
 """Numbers by name and unit; None where there is none."""
@@ -74,7 +74,7 @@ def trajectory(
     Without a reference, groundtruth.txt in the run folder is taken; where there is none, only length and duration
     are told.
     """
-    from dudmap.trajectory import Trajectory
+    from dudmap.geometry.trajectory import Trajectory
 
     file, folder = _trajectory_of(estimate)
     found = Trajectory.load(file)
@@ -251,7 +251,7 @@ def tracked_share(poses: int, folder: Path | None, truth: Path | None) -> float 
 
     It is known from a run's metrics.json, or else from the lists of images beside the true trajectory.
     """
-    from dudmap.sequences.association import read_list, read_pairs
+    from dudmap.geometry.association import read_list, read_pairs
 
     if folder is not None and (folder / "metrics.json").is_file():
         try:
@@ -289,7 +289,7 @@ def _reference_of(reference: Path | None, folder: Path | None) -> Path | None:
 
 def _mesh(file: Path) -> "Mesh":
     from dudmap.errors import MapError
-    from dudmap.mesh import Mesh
+    from dudmap.geometry.mesh import Mesh
 
     if not file.is_file():
         raise MapError(f"there is no mesh {file}; name a mesh file, or a folder that holds {file.name}")
@@ -303,7 +303,7 @@ def _start(estimate: Path, reference: Path) -> "np.ndarray | None":
     determine the rotation.
     """
     from dudmap.evaluation.trajectory import ate
-    from dudmap.trajectory import Trajectory
+    from dudmap.geometry.trajectory import Trajectory
 
     found, true = estimate / "trajectory.txt", reference / "groundtruth.txt"
     if not (found.is_file() and true.is_file()):

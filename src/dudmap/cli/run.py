@@ -56,7 +56,7 @@ def run(
     Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
     --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid thing that moved.
     """
-    from dudmap.run import run as run_sequence
+    from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
     parameters = read_config(config, preset, assignments or [])
@@ -97,7 +97,7 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
     elif not quiet:
         from rich.console import Console
 
-        from dudmap.progress import summary
+        from dudmap.pipeline.progress import summary
 
         console = Console()
         console.print(summary(metrics))

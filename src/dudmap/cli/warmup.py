@@ -35,10 +35,10 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
     from pathlib import Path
 
     from dudmap.config import Config
+    from dudmap.mapping.volume import TsdfVolume
     from dudmap.slam import Slam
     from dudmap.synthetic import sequence
     from dudmap.synthetic.recording import DEFAULT_CAMERA
-    from dudmap.volume import TsdfVolume
 
     camera = DEFAULT_CAMERA.resized(160, 120)
     recording = sequence(frames=4, camera=camera, start_dynamic=True)

@@ -10,7 +10,7 @@ from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
 from dudmap.evaluation.trajectory import AteResult, RpeResult
-from dudmap.trajectory import Trajectory
+from dudmap.geometry.trajectory import Trajectory
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
 from dudmap.evaluation.surface import Surface
-from dudmap.mesh import Mesh
+from dudmap.geometry.mesh import Mesh
 
 Distances = NDArray[np.float32]
 

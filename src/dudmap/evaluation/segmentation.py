@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
-from dudmap.metrics import SCORED_COVERAGE
+from dudmap.pipeline.metrics import SCORED_COVERAGE
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -125,7 +125,7 @@ class MaskFolders:
     """
 
     def __init__(self, estimate: Path, reference: Path) -> None:
-        from dudmap.sequences.association import associate
+        from dudmap.geometry.association import associate
 
         found, true = _named_masks(estimate), _true_masks(reference)
         pairs = associate(np.array([stamp for stamp, _ in found]), np.array([stamp for stamp, _ in true]))
@@ -146,7 +146,7 @@ class MaskFolders:
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:
     """Times and files of the true masks, by the depth images' times where associations.txt tells them."""
-    from dudmap.sequences.association import associate, read_list, read_pairs
+    from dudmap.geometry.association import associate, read_list, read_pairs
 
     if not (folder / "mask.txt").is_file():
         return _named_masks(folder)

@@ -6,10 +6,10 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.sequences.association import LARGEST_GAP, associate
-from dudmap.trajectory import Trajectory
+from dudmap.geometry import se3
+from dudmap.geometry.association import LARGEST_GAP, associate
+from dudmap.geometry.trajectory import Trajectory
 
 Numbers = NDArray[np.float64]
 Align = Literal["se3", "origin", "none"]

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 
 if TYPE_CHECKING:
-    from dudmap.camera import Camera
-    from dudmap.frame import Frame
-    from dudmap.trajectory import Trajectory
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.geometry.trajectory import Trajectory
 
 __all__ = ["Sequence", "open_sequence"]
 

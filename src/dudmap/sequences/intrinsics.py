@@ -4,8 +4,8 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from dudmap.camera import Camera
 from dudmap.errors import DatasetError
+from dudmap.geometry.camera import Camera
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)

@@ -5,9 +5,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.camera import Camera
 from dudmap.errors import DatasetError
-from dudmap.sequences.association import LARGEST_GAP, associate
+from dudmap.geometry.association import LARGEST_GAP, associate
+from dudmap.geometry.camera import Camera
 from dudmap.sequences.images import read_mask
 
 

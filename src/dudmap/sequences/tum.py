@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.frame import Frame
+from dudmap.frames.frame import Frame
+from dudmap.geometry.association import TimedFile, associate, read_list, read_pairs
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import images, intrinsics
-from dudmap.sequences.association import TimedFile, associate, read_list, read_pairs
-from dudmap.trajectory import Trajectory
 
 PROBES = 30
 """Frames, spread evenly, one of which must be usable for a recording to be opened."""

@@ -3,8 +3,8 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.camera import Camera
 from dudmap.errors import ConfigError
+from dudmap.geometry.camera import Camera
 from dudmap.synthetic.movers import Mover, Staging
 from dudmap.synthetic.person import Figure
 from dudmap.synthetic.render import Renderer

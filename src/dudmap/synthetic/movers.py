@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
 from dudmap.errors import ConfigError
+from dudmap.geometry import se3
 from dudmap.synthetic.motion import Track, crossing, smooth_step
 from dudmap.synthetic.person import Figure
 from dudmap.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose

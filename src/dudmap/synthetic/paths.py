@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
 from dudmap.errors import ConfigError, DatasetError
+from dudmap.geometry import se3
+from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.movers import Mover
 from dudmap.synthetic.scene import Scene, look_at
-from dudmap.trajectory import Trajectory
 
 Array = NDArray[np.float64]
 

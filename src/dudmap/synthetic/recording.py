@@ -9,11 +9,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
-from dudmap.camera import Camera
 from dudmap.errors import ConfigError, FrameError
-from dudmap.frame import Frame
-from dudmap.mesh import Mesh
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.crowd import crowd_of
 from dudmap.synthetic.movers import MOVING_SPEED, Mover, Staging, build_movers
 from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
@@ -23,7 +24,6 @@ from dudmap.synthetic.scene import Scene
 from dudmap.synthetic.sensors import Sensor, SensorModel
 from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
-from dudmap.trajectory import Trajectory
 
 NEAREST, FARTHEST = 0.3, 6.0  # metres; what counts as seen by an ideal sensor
 DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)

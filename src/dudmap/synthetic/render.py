@@ -7,10 +7,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
-from dudmap.camera import Camera
-from dudmap.kernels import scenes as kernels
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.kernels.threads import bands, run_bands
+from dudmap.synthetic.kernels import raytracing as kernels
 from dudmap.synthetic.scene import Primitive, Scene
 from dudmap.synthetic.textures import TEXTURES, build_atlas
 

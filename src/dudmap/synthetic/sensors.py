@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
-from dudmap.kernels import sensors as kernels
+from dudmap.synthetic.kernels import depth_noise as kernels
 from dudmap.synthetic.render import Rendering, over_rows
 
 NOISE_SIZE = 1024

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
 from dudmap.errors import ConfigError
+from dudmap.geometry import se3
 from dudmap.synthetic.motion import smooth_step
 from dudmap.synthetic.movers import Mover, rigid
 from dudmap.synthetic.scene import Material, Scene, box, pose

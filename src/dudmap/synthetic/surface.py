@@ -5,10 +5,10 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import se3
-from dudmap.camera import Camera
-from dudmap.kernels import scenes as kernels
-from dudmap.mesh import Mesh
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.mesh import Mesh
+from dudmap.synthetic.kernels import raytracing as kernels
 from dudmap.synthetic.render import over_rows
 from dudmap.synthetic.scene import BOX, CAPSULE, CYLINDER, ELLIPSOID, TORUS, Primitive
 from dudmap.synthetic.textures import LEVELS, SIZE, TEXTURES

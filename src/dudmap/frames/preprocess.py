@@ -1,0 +1,227 @@
+"""From a camera's frame to what the algorithm works on: undistorted, limited, filled, smoothed (thesis section 4.3)."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import PreprocessConfig
+from dudmap.errors import DatasetError
+from dudmap.frames.frame import Frame
+from dudmap.geometry.camera import Camera
+from dudmap.kernels import filtering
+from dudmap.kernels.threads import bands, run_bands
+
+BAND = 120
+"""Image rows of one piece of work."""
+NOISE_FLOOR = 0.01
+"""Readings of a small hole's neighbourhood may always differ by this much, metres."""
+HALVING_BAND = 0.02
+"""Readings this far (m, and share of the depth) behind the nearest of a 2x2 block belong to the same surface."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A frame made ready.
+
+    Attributes:
+        timestamp: Seconds, of the depth image.
+        camera: Camera of all images here; without distortion.
+        depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
+        raw_depth: (H, W) float32, metres, limited and undistorted only, 0 = none.
+        intensity: (H, W) float32, 0..1.
+        rgb: (H, W, 3) uint8.
+    """
+
+    timestamp: float
+    camera: Camera
+    depth: NDArray[np.float32]
+    raw_depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
+
+
+class Preprocessor:
+    """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing. Not for concurrent calls.
+
+    The bilateral filter is separable (columns, then rows), which the exact one is not. Measured on 640x480 readings of
+    two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm
+    on a desk at 1 m; error against the temporal mean of a fixed camera's static pixels, over squared depth: median
+    1.52 against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
+
+    Args:
+        camera: Camera of the frames that will come.
+        config: Limits and filter parameters.
+    """
+
+    def __init__(self, camera: Camera, config: PreprocessConfig | None = None) -> None:
+        self.config = config or PreprocessConfig()
+        self.camera = replace(camera, distortion=())
+        self._maps = _undistortion(camera) if any(camera.distortion) else None
+        self._inverse_map = _distortion(camera) if any(camera.distortion) else None
+        radius = self.config.filter_radius
+        distance = np.arange(radius + 1)
+        self._spatial = np.exp(-(distance**2) / (2 * self.config.filter_sigma_px**2)).astype(np.float32)
+        padded = (camera.height + 2 * radius, camera.width + 2 * radius)
+        self._padded = np.full(padded, filtering.ABSENT, dtype=np.float32)
+
+    def __call__(self, frame: Frame) -> Observation:
+        """Images ready for tracking and fusion.
+
+        Raises:
+            DatasetError: Depth or colour do not have the camera's size, or a type that is none of theirs.
+        """
+        self._check(frame)
+        depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
+        rgb = np.ascontiguousarray(frame.color)
+        if self._maps is not None:
+            depth, rgb = self._undistorted(depth, rgb)
+        # One allocation: above 4 MB NumPy asks for huge pages, and faulting five single images in costs 2 ms.
+        smooth, raw_depth, intensity = np.empty((3, *self.camera.shape), dtype=np.float32)
+        low, high = np.float32(max(self.config.depth_min, 1e-3)), np.float32(self.config.depth_max)
+        filtering.limit_depth(depth, low, high, raw_depth)
+        self._fill(raw_depth, smooth)
+        self._smooth(smooth)
+        filtering.intensities(0, self.camera.height, rgb, intensity)
+        return Observation(frame.timestamp, self.camera, smooth, raw_depth, intensity, rgb)
+
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (H, W) bool of a frame as a lens without distortion sees it.
+
+        Raises:
+            DatasetError: It does not have the camera's size, or is not boolean.
+        """
+        if mask.shape != self.camera.shape or mask.dtype != np.bool_:
+            h, w = self.camera.shape
+            raise DatasetError(
+                f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
+                "the size of the camera's image"
+            )
+        if self._maps is None:
+            return mask
+        import cv2
+
+        return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
+
+    def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (H, W) bool of an observation as it lies in the recorded image: the reverse of ``mask``.
+
+        Pixels of the recorded image that no observation shows are False.
+        """
+        if self._inverse_map is None:
+            return mask
+        import cv2
+
+        recorded = cv2.remap(
+            mask.astype(np.uint8), *self._inverse_map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+        return np.asarray(recorded) > 0
+
+    def _check(self, frame: Frame) -> None:
+        h, w = self.camera.shape
+        if frame.depth.shape != (h, w) or frame.color.shape != (h, w, 3):
+            raise DatasetError(
+                f"the camera is {w}x{h}, but the depth image has the shape {frame.depth.shape} and the colour image "
+                f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand"
+            )
+        if frame.depth.dtype.kind != "f" or frame.color.dtype != np.uint8:
+            raise DatasetError(
+                f"depth is {frame.depth.dtype} and colour {frame.color.dtype}; expected depth in metres as float32 "
+                "and colour as uint8"
+            )
+
+    def _undistorted(
+        self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Both images as a lens without distortion sees them (eq. 3.88): colour interpolated, depth nearest."""
+        import cv2
+
+        assert self._maps is not None
+        nearest, between = self._maps
+        straight = cv2.remap(depth, *nearest, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        color = cv2.remap(rgb, *between, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
+
+    def _fill(self, depth: NDArray[np.float32], out: NDArray[np.float32]) -> None:
+        if not self.config.fill_holes:
+            out[:] = depth
+            return
+        slope = np.float32(self.config.filter_alpha)
+        run_bands(
+            lambda start, stop: filtering.fill_holes(start, stop, depth, slope, np.float32(NOISE_FLOOR), out),
+            bands(depth.shape[0], BAND),
+        )
+
+    def _smooth(self, depth: NDArray[np.float32]) -> None:
+        """Filter ``depth`` in place."""
+        if self.config.filter == "none":
+            return
+        ranges = bands(depth.shape[0], BAND)
+        padded, spatial = self._padded, self._spatial
+        margin, alpha = self.config.filter_radius, np.float32(self.config.filter_alpha)
+        filtering.pad(0, depth.shape[0], depth, margin, padded)
+        run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, spatial, depth), ranges)
+
+
+def pyramid(observation: Observation, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth and intensity (H >> level, W >> level) of ``camera.scaled(level)``: ``level`` halvings by 2x2 blocks.
+
+    Intensity is the mean of a block; depth the mean of its readings on the nearest surface. Each halving is computed
+    once per observation.
+    """
+    halvings = observation._halvings
+    while len(halvings) < level:
+        depth, intensity = halvings[-1] if halvings else (observation.depth, observation.intensity)
+        halvings.append(_halved(depth, intensity))
+    return halvings[level - 1] if level else (observation.depth, observation.intensity)
+
+
+def _halved(
+    depth: NDArray[np.float32], intensity: NDArray[np.float32]
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    shape = (depth.shape[0] // 2, depth.shape[1] // 2)
+    small = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
+    filtering.halve_depth(0, shape[0], depth, np.float32(HALVING_BAND), small[0])
+    filtering.halve_intensity(0, shape[0], intensity, small[1])
+    return small
+
+
+def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
+    import cv2
+
+    gain, offset = exposure
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+
+
+def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
+    """Map pairs of cv2.remap from the undistorted image into the distorted one: to the nearest pixel, between pixels.
+
+    The fixed-point map of the interpolation cannot serve both: without its fractions it rounds down, half a pixel off.
+    """
+    import cv2
+
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    size = (camera.width, camera.height)
+    u, v = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_32FC1)
+    nearest, _ = cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=True)
+    whole, fraction = cv2.convertMaps(u, v, cv2.CV_16SC2)
+    return (np.asarray(nearest), np.empty(0, np.uint16)), (np.asarray(whole), np.asarray(fraction))
+
+
+def _distortion(camera: Camera) -> tuple[NDArray, NDArray]:
+    """Map pair of cv2.remap from the distorted image into the undistorted one, to the nearest pixel."""
+    import cv2
+
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    straight = cv2.undistortPoints(pixels, camera.K, coefficients, P=camera.K).reshape(*camera.shape, 2)
+    within = np.clip(straight, -2, max(camera.shape) + 2).astype(np.float32)  # the fixed-point map holds 16 bits
+    nearest, _ = cv2.convertMaps(within[..., 0], within[..., 1], cv2.CV_16SC2, nninterpolation=True)
+    return np.asarray(nearest), np.empty(0, np.uint16)

@@ -1,0 +1,1 @@
+"""The voxel-hashed signed distance field: allocation, integration, sampling, ray casting and meshing."""

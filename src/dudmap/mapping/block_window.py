@@ -1,0 +1,96 @@
+"""The blocks around the view as a dense array, so that the inner loops find a voxel with one load."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import MapError
+from dudmap.kernels import hashing
+from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+
+MARGIN = 3
+"""Blocks that the view may move before the window follows it; its edge has room for them."""
+
+
+class Window:
+    """What the hash table of the blocks, which stays the authoritative index, holds around the view.
+
+    Args:
+        block_size: Edge of a block, metres.
+        cells: Least number of blocks along each edge.
+
+    Attributes:
+        shape: (3,) int64, blocks along each axis.
+        cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 where nothing is known; -2 - entry where there are none.
+        stamps: Like ``cells``, number of the frame that asked for a block last.
+        near: (n,) int32, the slots inside.
+        origin: (3,) int64 coordinates of the first block; None until something has been looked at.
+    """
+
+    def __init__(self, block_size: float, cells: int) -> None:
+        size = 16 * int(np.ceil(cells / 16))
+        self.block_size = block_size
+        self.shape = np.array([size, size, size], dtype=np.int64)
+        self.cells = np.full(size**3, -1, dtype=np.int32)
+        self.stamps = np.zeros(size**3, dtype=np.int32)
+        self.near = np.empty(0, dtype=np.int32)
+        self.origin: NDArray[np.int64] | None = None
+
+    def look_at(self, middle: NDArray[np.float64], blocks: VoxelBlocks) -> None:
+        """Move to a point (3,) in metres, if the middle has moved too far away from it."""
+        origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
+        if self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN:
+            return
+        self.origin = origin
+        self.cells.fill(-1)
+        self.stamps.fill(0)
+        cells = self.cells.reshape(tuple(self.shape))
+        hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries)
+        self.near = np.sort(self.cells[self.cells >= 0])
+
+    def lattice(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to lattice (3, 4): in voxels, from the first voxel of the window on."""
+        assert self.origin is not None
+        T = T_world_camera[:3] / (self.block_size / BLOCK)
+        T[:, 3] -= self.origin * BLOCK
+        return T.astype(np.float32)
+
+    def give_voxels(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
+        """Give voxels to cells (n,) that have none."""
+        slots = blocks.give_voxels(self.entries_of(cells, blocks), frame_number)
+        self.cells[cells] = slots
+        self.near = np.concatenate([self.near, slots])
+
+    def take_voxels(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
+        """Take the voxels of these slots (n,); their blocks have been seen empty so many times."""
+        if len(slots) == 0:
+            return
+        assert self.origin is not None
+        entries = blocks.take_voxels(slots, free_count)
+        cells = np.ravel_multi_index(tuple((blocks.coords[entries] - self.origin).T), tuple(self.shape))
+        self.cells[cells] = -2 - entries
+        self.near = self.near[blocks.entry_of[self.near] >= 0]
+
+    def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
+        """Take note of cells (n,), of which nothing was known, that were seen empty so many times."""
+        if len(cells) == 0:
+            return
+        entries = self.entries_of(cells, blocks)
+        self.cells[cells] = -2 - entries
+        blocks.free_count[entries] = min(free_count, 255)
+
+    def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
+        """Entries of cells (n,), made where there is none yet.
+
+        Raises:
+            MapError: A cell lies too far from where the map began.
+        """
+        assert self.origin is not None
+        coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
+        if np.abs(coords).max(initial=0) >= 1 << 15:
+            farthest = (1 << 15) * self.block_size
+            raise MapError(
+                f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
+                f"{self.block_size / BLOCK} m it cannot be larger: set volume.voxel_size to a larger value"
+            )
+        unknown = int(np.count_nonzero(self.cells[cells] == -1))
+        return blocks.entries_at(coords.astype(np.int16), unknown)

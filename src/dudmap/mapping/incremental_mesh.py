@@ -1,0 +1,116 @@
+"""The mesh of a map that grows: only what changed is extracted again."""
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.geometry.mesh import Mesh
+
+if TYPE_CHECKING:
+    from dudmap.mapping.volume import TsdfVolume
+
+EDGE = 4
+"""Blocks along the edge of a chunk."""
+Chunk = tuple[int, int, int]
+
+
+class LiveMesh:
+    """Keeps the mesh of a volume up to date, for a view of the map while it is made.
+
+    The map is cut into chunks of 4x4x4 blocks. An update extracts those chunks again that a frame wrote to since the
+    last one, or that touch a block which was written; its time goes with what the camera sees, not with the map. All
+    chunks together are the surface that ``TsdfVolume.extract_mesh`` gives, with vertices doubled where chunks meet.
+    Updates and ``integrate`` must not run at the same time.
+
+    Args:
+        volume: The map.
+
+    Attributes:
+        chunks: Mesh of every chunk that has a surface, by its coordinates: chunk (i, j, k) begins at ``4 i``, ``4 j``,
+            ``4 k`` blocks.
+    """
+
+    def __init__(self, volume: "TsdfVolume") -> None:
+        self.chunks: dict[Chunk, Mesh] = {}
+        self._volume = volume
+        self._born = volume.born
+        self._seen = -1
+        self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
+
+    def update(self) -> list[Chunk]:
+        """Extract again what changed since the last update, and return which chunks may have changed.
+
+        A chunk that is returned and is not in ``chunks`` has no surface any more.
+        """
+        forgotten: list[Chunk] = []
+        if self._volume.born != self._born:  # the map was cleared: its frames count from zero again
+            forgotten = list(self.chunks)
+            self.chunks.clear()
+            self._born, self._seen, self._coords_of = self._volume.born, -1, self._coords_of[:0]
+        slots, coords = self._volume.written_since(self._seen)
+        self._seen = self._volume.num_integrated
+        known = slots[slots < len(self._coords_of)]
+        changed = np.concatenate([coords, self._coords_of[known]])  # a slot may have changed hands
+        if len(slots) and slots[-1] >= len(self._coords_of):
+            more = np.zeros((2 * (int(slots[-1]) + 1), 3), dtype=np.int32)
+            more[: len(self._coords_of)] = self._coords_of
+            self._coords_of = more
+        self._coords_of[slots] = coords
+        stale = _touched(changed)
+        if len(stale) == 0:
+            return forgotten
+        meshes = self._extract(stale)
+        keys: list[Chunk] = [(int(i), int(j), int(k)) for i, j, k in stale]
+        for key, mesh in zip(keys, meshes, strict=True):
+            if len(mesh.faces):
+                self.chunks[key] = mesh
+            else:
+                self.chunks.pop(key, None)
+        return keys + [key for key in forgotten if key not in self.chunks]
+
+    def mesh(self) -> Mesh:
+        """All chunks as one mesh."""
+        parts = list(self.chunks.values())
+        if not parts:
+            return _nothing()
+        counts = np.array([len(part.vertices) for part in parts])
+        first = (np.cumsum(counts) - counts).astype(np.int32)
+        return Mesh(
+            np.concatenate([part.vertices for part in parts]),
+            np.concatenate([part.faces + start for part, start in zip(parts, first, strict=True)]),
+            np.concatenate([part.colors for part in parts]),
+            np.concatenate([part.normals for part in parts]),
+        )
+
+    def _extract(self, stale: NDArray[np.int32]) -> list[Mesh]:
+        """Mesh of each of these chunks (n, 3)."""
+        reach = np.arange(-1, EDGE + 1, dtype=np.int32)
+        offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+        inner = np.all((offsets >= 0) & (offsets < EDGE), axis=1)
+        slots = self._volume.slots_at((stale[:, None] * EDGE + offsets).reshape(-1, 3)).reshape(len(stale), -1)
+        chunk_of = np.where(inner, np.arange(len(stale))[:, None], -1)
+        exists = slots >= 0
+        chosen, groups = slots[exists], chunk_of[exists]
+        # a block beside two chunks is named by both, and by its own: once is enough, and its own chunk wins
+        order = np.lexsort((-groups, chosen))
+        chosen, groups = chosen[order], groups[order]
+        once = np.ones(len(chosen), dtype=bool)
+        once[1:] = chosen[1:] != chosen[:-1]
+        meshes = self._volume.extract_chunks(chosen[once], groups[once])
+        return meshes + [_nothing()] * (len(stale) - len(meshes))
+
+
+def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Chunks (m, 3) that hold a voxel within one block of these blocks (n, 3), each once."""
+    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.int32)
+    chunks = ((blocks[:, None] + corners) // EDGE).reshape(-1, 3).astype(np.int64)
+    packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
+    unique = np.unique(packed)
+    axes = [(unique >> shift) & ((1 << 21) - 1) for shift in (42, 21, 0)]
+    return (np.stack(axes, axis=1) - (1 << 20)).astype(np.int32)
+
+
+def _nothing() -> Mesh:
+    empty = np.zeros((0, 3), dtype=np.float32)
+    return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)

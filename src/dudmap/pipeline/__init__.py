@@ -1,0 +1,1 @@
+"""Runs over a recording: frames in, run folder out."""

@@ -1,0 +1,234 @@
+"""The figures of a run: counted frame by frame, summed up once."""
+
+import csv
+import json
+import os
+import platform
+import sys
+import time
+from dataclasses import dataclass, field
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import __version__
+from dudmap.errors import DatasetError
+from dudmap.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from dudmap.objects.object_tracker import Mover
+    from dudmap.result import FrameResult
+
+SCORED_COVERAGE = 0.05
+"""Masks are scored in frames where more than this share of the image truly moves."""
+
+
+@dataclass
+class RunRecord:
+    """What is counted while the frames pass.
+
+    Attributes:
+        rows: Per processed frame: timestamp, state, total and reading time and every stage's time, ms.
+        lost: Timestamp and reason of every frame that was not tracked.
+        unreadable: One sentence per frame that could not be read.
+        mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
+        masked: Frames that had a mask from outside, None if none were given.
+        dropped: Frames of a live run that there was no time for, None if the frames waited.
+        movers: One object per frame with moving bodies, as written to movers.jsonl.
+        residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    lost: list[dict[str, Any]] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    mask_ious: list[float] = field(default_factory=list)
+    movers: list[dict[str, Any]] = field(default_factory=list)
+    residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
+    fused: int = 0
+    skipped_similar: int = 0
+    relocalized: int = 0
+    corrected: int = 0
+    blind: int = 0
+    masked: int | None = None
+    dropped: int | None = None
+    _wall_start: float = field(default_factory=time.perf_counter)
+    _cpu_start: float = field(default_factory=time.process_time)
+
+    def add(
+        self,
+        result: "FrameResult",
+        total_ms: float,
+        reading_ms: float,
+        mask: NDArray[np.bool_] | None,
+        **delays: float,
+    ) -> None:
+        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known.
+
+        ``delays`` of a live run: frames ``dropped`` before this one, ``latency`` from its arrival to the result, ms.
+        """
+        self.rows.append(
+            {
+                "timestamp": f"{result.timestamp:.6f}",
+                "state": result.state,
+                "fused": int(result.fused),
+                "dynamic_share": round(result.dynamic_share, 4),
+                "reading": round(reading_ms, 3),
+                "total": round(total_ms, 3),
+            }
+            | {key: round(value, 3) for key, value in delays.items()}
+            | {stage: round(ms, 3) for stage, ms in result.timings.items()}
+        )
+        self.fused += result.fused
+        self.skipped_similar += result.skipped_similar
+        self.relocalized += result.relocalized
+        self.corrected += result.corrected
+        self.blind += result.blind
+        if result.state == "lost":
+            self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
+        if result.movers:
+            self.movers.append({"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]})
+        if result.labels is not None:
+            self.residuals = self.residuals + result.labels.histogram
+        if mask is not None and mask.mean() > SCORED_COVERAGE:
+            union = np.count_nonzero(mask | result.dynamic_mask)
+            self.mask_ious.append(np.count_nonzero(mask & result.dynamic_mask) / union)
+
+    def save_timings(self, path: Path) -> None:
+        """CSV with one row per processed frame and one column per stage, milliseconds."""
+        columns = list(dict.fromkeys(key for row in self.rows for key in row))
+        with path.open("w", newline="", encoding="utf-8") as file:
+            writer = csv.DictWriter(file, columns, restval=0)
+            writer.writeheader()
+            writer.writerows(self.rows)
+
+    def save_movers(self, path: Path) -> None:
+        """JSON lines, one per frame with moving bodies."""
+        path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
+
+    def save_residuals(self, path: Path) -> None:
+        """NPZ with the histogram of all residuals and the mixture fitted to it; nothing if there are none.
+
+        ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
+        (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
+        """
+        from dudmap.dynamics.detector import BINS, LARGEST, fit_mixture
+
+        if not self.residuals.any():
+            return
+        edges = np.linspace(0, LARGEST, BINS + 1)
+        mixture = fit_mixture(self.residuals, edges)
+        np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
+
+    def metrics(self) -> dict[str, Any]:
+        """Counts and times of the whole run."""
+        totals = np.array([row["total"] for row in self.rows] or [np.nan])
+        readings = np.array([row["reading"] for row in self.rows] or [np.nan])
+        return {
+            "frames": len(self.rows) + len(self.unreadable),
+            "tracked": len(self.rows) - len(self.lost),
+            "fused": self.fused,
+            "skipped_similar": self.skipped_similar,
+            "lost": len(self.lost),
+            "relocalized": self.relocalized,
+            "corrected": self.corrected,
+            "blind": self.blind,
+            "unreadable": len(self.unreadable),
+            "ms_per_frame_median": _number(np.median(totals)),
+            "ms_per_frame_p95": _number(np.percentile(totals, 95)),
+            "ms_reading_median": _number(np.median(readings)),
+            "wall_s": round(time.perf_counter() - self._wall_start, 3),
+            "cpu_s": round(time.process_time() - self._cpu_start, 3),
+            "peak_rss_mb": peak_rss_mb(),
+            "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
+            "lost_frames": self.lost,
+            "unreadable_frames": self.unreadable,
+        } | self._occasional()
+
+    def _occasional(self) -> dict[str, Any]:
+        """What only runs with masks and live runs have."""
+        out: dict[str, Any] = {}
+        if self.masked is not None:
+            out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
+        if self.mask_ious:
+            out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
+        if self.dropped is not None:
+            latencies = np.array([row["latency"] for row in self.rows] or [np.nan])
+            out |= {
+                "dropped": self.dropped,
+                "latency_ms_median": _number(np.median(latencies)),
+                "latency_ms_p95": _number(np.percentile(latencies, 95)),
+            }
+        return out
+
+
+def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
+    """Absolute and relative trajectory error against the ground truth; the reason where they cannot be computed."""
+    from dudmap.evaluation.trajectory import ate, rpe
+
+    keys = ("ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s")
+    out: dict[str, Any] = dict.fromkeys(keys)
+    try:
+        absolute = ate(estimate, reference)
+        out["ate_rmse_m"] = _number(absolute.rmse, 6)
+        out["ate_rot_rmse_deg"] = _number(absolute.rot_rmse_deg, 6)
+        relative = rpe(estimate, reference, delta=1.0)
+        out["rpe_trans_rmse_m_per_s"] = _number(relative.trans_rmse, 6)
+        out["rpe_rot_rmse_deg_per_s"] = _number(relative.rot_rmse_deg, 6)
+    except DatasetError as error:
+        out["accuracy_missing"] = str(error)
+    return out
+
+
+def peak_rss_mb() -> float | None:
+    """Largest resident memory of this process so far, MB; None where the system does not tell."""
+    if sys.platform == "win32":
+        return None
+    import resource
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
+
+
+def versions() -> dict[str, str]:
+    """Versions of dudmap and of what its figures depend on."""
+    import cv2
+
+    return {
+        "dudmap": __version__,
+        "python": platform.python_version(),
+        "numpy": np.__version__,
+        "numba": version("numba"),
+        "opencv": cv2.__version__,
+    }
+
+
+def machine() -> dict[str, Any]:
+    """Processor, cores and operating system."""
+    cpu = platform.processor() or platform.machine()
+    info = Path("/proc/cpuinfo")
+    if info.is_file():
+        names = [line for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")]
+        cpu = names[0].partition(":")[2].strip() if names else cpu
+    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    return {"cpu": cpu, "cores": os.cpu_count(), "cores_usable": usable, "os": platform.platform()}
+
+
+def _row(mover: "Mover") -> dict[str, Any]:
+    """A moving body as JSON can hold it: metres, m/s, world frame."""
+    return {
+        "id": mover.id,
+        "centroid": mover.centroid.round(4).tolist(),
+        "box": mover.box.round(4).tolist(),
+        "velocity": mover.velocity.round(4).tolist(),
+        "speed": round(mover.speed, 4),
+        "age": round(mover.age, 4),
+        "pixels": int(np.count_nonzero(mover.mask)),
+    }
+
+
+def _number(value: float | np.floating, digits: int = 3) -> float | None:
+    """A number JSON can hold; None for NaN."""
+    return round(float(value), digits) if np.isfinite(value) else None

@@ -1,0 +1,165 @@
+"""The run folder: what a run leaves behind."""
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.errors import DudmapError, MapError
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.pipeline.metrics import RunRecord, accuracy, machine, versions
+
+if TYPE_CHECKING:
+    from dudmap.objects.object_map import Body
+    from dudmap.sequences import Sequence
+    from dudmap.slam import Slam
+
+FILES = (
+    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
+    "residuals.npz", "movers.jsonl",
+)  # fmt: skip
+SCORES = (
+    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
+    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+)  # fmt: skip
+"""What `dudmap evaluate` writes beside a run; it would not belong to the next one."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunReport:
+    """What a run gave.
+
+    Attributes:
+        out: The run folder.
+        metrics: The content of metrics.json.
+        trajectory: Poses of all tracked frames.
+    """
+
+    out: Path
+    metrics: dict[str, Any]
+    trajectory: Trajectory
+
+
+def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Write a mask (H, W) as an image, 255 = dynamic."""
+    import cv2
+
+    path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+
+
+def make(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
+    """Make the run folder, prove that it can be written, and remove an earlier run's results and their scores.
+
+    Raises:
+        DudmapError: It cannot be made or written, or what is to be removed is a recording or the masks to be read.
+    """
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+        raise DudmapError(f"{out} holds a recording, whose truth and masks a run would overwrite; name another folder")
+    if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
+        raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        probe = out / ".dudmap-probe"
+        probe.write_bytes(b"")
+        probe.unlink()
+        for name in FILES + SCORES:
+            (out / name).unlink(missing_ok=True)
+        for mask in (out / "masks").glob("*.png"):
+            mask.unlink()
+        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt"
+        for part in (path for pattern in parts for path in out.glob(pattern)):
+            part.unlink()
+        if save_masks:
+            (out / "masks").mkdir(exist_ok=True)
+    except OSError as error:
+        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+
+
+def write(
+    out: Path,
+    slam: "Slam",
+    record: RunRecord,
+    sequence: "Sequence",
+    config: Config,
+    stopped: str,
+    *,
+    save_map: bool,
+) -> RunReport:
+    """Write all files of the run folder; one that fails does not keep the others from being written.
+
+    Raises:
+        DudmapError: A file could not be written.
+    """
+    (trajectory, volume), *others = slam.maps
+    metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
+    metrics |= record.metrics()
+    sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
+    metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
+    metrics["maps"] = len(others) + 1
+    metrics["depth_delay_ms"] = 1000 * slam.registration.delay.seconds
+
+    def save_mesh() -> None:
+        mesh = volume.extract_mesh()
+        metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
+        mesh.save(out / "mesh.ply")
+
+    def save_metrics() -> None:
+        if sequence.ground_truth is not None:
+            metrics.update(accuracy(trajectory, sequence.ground_truth))
+        metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
+        metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
+        (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+
+    steps: list[Callable[[], None]] = [
+        lambda: trajectory.save(out / "trajectory.txt"),
+        lambda: config.save(out / "config.toml"),
+        lambda: record.save_timings(out / "timings.csv"),
+        lambda: record.save_residuals(out / "residuals.npz"),
+        lambda: record.save_movers(out / "movers.jsonl"),
+    ]
+    if sequence.ground_truth is not None:
+        truth = sequence.ground_truth
+        steps.append(lambda: truth.save(out / "groundtruth.txt"))
+    if not volume.is_empty:
+        steps.append(save_mesh)
+        if save_map:
+            steps.append(lambda: volume.save(out / "map.npz"))
+    for number, (path, part) in enumerate(others, start=2):
+        steps += [
+            partial(path.save, out / f"trajectory-{number}.txt"),
+            lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
+        ]
+    if config.movers.meshes:
+        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.bodies)))
+    problems = []
+    try:
+        for step in steps:
+            try:
+                step()
+            except (OSError, MapError) as error:
+                problems.append(str(error))
+    finally:
+        save_metrics()
+    if problems:
+        raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
+    return RunReport(out, metrics, trajectory)
+
+
+def _save_bodies(folder: Path, bodies: "list[Body]") -> list[dict[str, Any]]:
+    """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
+    out = []
+    for body in bodies:
+        row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
+        if body.mesh is not None and body.trajectory is not None:
+            folder.mkdir(exist_ok=True)
+            body.mesh.save(folder / f"{body.id}.ply")
+            body.trajectory.save(folder / f"{body.id}.txt")
+            row["mesh_triangles"] = len(body.mesh.faces)
+        out.append(row)
+    return out

@@ -1,0 +1,1 @@
+"""Place recognition, redundant views, loop closing and the atlas of submaps."""

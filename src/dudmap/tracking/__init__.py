@@ -1,0 +1,1 @@
+"""The camera pose of a frame: prediction, registration and acceptance."""

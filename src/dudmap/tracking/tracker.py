@@ -1,0 +1,300 @@
+"""Camera pose from the signed distances and intensities of the map (thesis section 4.4, algorithm 2)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.kernels import registration
+from dudmap.kernels.median import median
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.mapping.volume import TsdfVolume
+
+PIXELS_PER_BAND = 4800
+"""What a thread is woken for; the coarsest level is one band."""
+COARSE = 2
+"""The coarser levels end with a step below this many times ``stop``: they only lead to the next."""
+SHORT = 4
+"""Only steps shorter than this many times that end a level by how little they gain."""
+EXPOSURE_NOISE = 0.01
+"""Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class LinearSystem:
+    """Normal equations of one linearisation: ``H step = -b``.
+
+    Attributes:
+        H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
+        b: (6,) float64, gradient of the cost.
+        cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
+        num_inliers: Readings on the map.
+        readings: Sum of the static weights of all readings.
+        weight: Sum of the static weights of the readings on the map.
+        chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
+        residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
+    """
+
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    cost: float
+    num_inliers: int
+    readings: float
+    weight: float
+    chi_square: float
+    residuals: NDArray[np.float32]
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingResult:
+    """Outcome of one registration.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that make the frame's intensities those of the map.
+        converged: Whether all checks passed.
+        reason: The failed check, empty if none.
+        inlier_share: Share of the static readings that fall on the map.
+        residual: Root mean square distance residual, metres at one metre depth.
+        condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
+        iterations: Linearisations over all levels.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings; NaN where the
+            image shows nothing.
+        settled: Whether the last level ended with a step too small to matter, not for want of iterations.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    converged: bool
+    reason: str
+    inlier_share: float
+    residual: float
+    condition: float
+    iterations: int
+    color_residual: float = 0.0
+    settled: bool = True
+
+
+class Tracker:
+    """Direct registration of a frame against the map by Levenberg-Marquardt, coarse to fine."""
+
+    def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
+        self.config = config
+        self.sensor = sensor
+
+    def align(
+        self,
+        volume: TsdfVolume,
+        levels: list[Level],
+        T_init: NDArray[np.float64],
+        static_weights: list[NDArray[np.float32]] | None = None,
+        first_level: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
+    ) -> TrackingResult:
+        """Pose that minimises the distances and intensity differences of a frame to the map (eq. 4.32).
+
+        Args:
+            volume: The map.
+            levels: Image pyramid, coarse to fine.
+            T_init: (4, 4) first guess of T_world_camera.
+            static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
+            first_level: Number of the first of these levels in the configuration.
+            exposure: Gain and offset; fitted anew if the first of these levels is the coarsest.
+        """
+        volume.look_at(T_init)
+        T, iterations, system, settled = T_init, 0, None, True
+        weights = np.ones_like(levels[-1].depth)
+        for index, level in enumerate(levels):
+            limit = self.config.iterations[first_level + index]
+            if limit == 0:
+                continue
+            weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
+            lit = exposed(level, exposure)
+            system = self.linearize(volume, lit, T, weights)
+            iterations += 1
+            if self.config.exposure and index == 0 and first_level == 0:
+                change = fit_exposure(lit.intensity, system.residuals[1], weights)
+                if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
+                    exposure = chained(exposure, change)
+                    lit = exposed(level, exposure)
+                    system = self.linearize(volume, lit, T, weights)
+                    iterations += 1
+            finest = first_level + index == len(self.config.iterations) - 1
+            stop = self.config.stop if finest else COARSE * self.config.stop
+            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop)
+            iterations += used
+        if system is None:  # every level is left out: judge the first guess
+            system = self.linearize(volume, levels[-1], T, weights)
+        T = T.copy()
+        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
+        return replace(self._judge(T, exposure, system, weights, iterations), settled=settled)
+
+    def _optimize(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: LinearSystem,
+        limit: int,
+        stop: float,
+    ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
+        """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
+        damping, used = self.config.damping, 0
+        for _ in range(limit):
+            diagonal = np.diag(system.H)
+            if not diagonal.max() > 0:
+                break
+            damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+            step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
+            T_trial, length = moved(T, step), np.linalg.norm(step)
+            if length < stop:  # known to be small before it is tried: take it and be done
+                return T_trial, system, used, True
+            trial = self.linearize(volume, level, T_trial, weights)
+            used += 1
+            gain = abs(trial.cost - system.cost)
+            settled = length < SHORT * stop and gain < self.config.stop_gain * system.cost
+            if trial.cost < system.cost:
+                T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
+            else:
+                damping *= 5
+            if settled:
+                return T, system, used, True
+        return T, system, used, False
+
+    def linearize(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        color_weight: float | None = None,
+    ) -> LinearSystem:
+        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose; the colour's weight from the
+        configuration, unless another is given."""
+        camera, config, sensor = level.camera, self.config, self.sensor
+        color_weight = config.color_weight if color_weight is None else color_weight
+        parameters = np.array(
+            [
+                volume.voxel_size, volume.sdf_unit, config.huber, config.tukey if config.robust == "tukey" else 0,
+                color_weight, config.color_huber, sensor.sigma_base, sensor.sigma_scale,
+                sensor.sigma_base + sensor.sigma_scale, config.noise_weighting, volume.truncation,
+                volume.config.truncation_noise,
+            ],
+            dtype=np.float32,
+        )  # fmt: skip
+        window, geometry = volume.window, volume.blocks.geometry.reshape(-1)
+        height, width = level.depth.shape
+        ranges = bands(height, -(-PIXELS_PER_BAND // width))
+        sums = np.zeros((len(ranges), registration.NUM_SUMS))
+        residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
+        T = window.lattice(T_world_camera)
+        run_bands(
+            lambda start, stop, out: registration.linearize(
+                start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window.cells, window.shape,
+                geometry, parameters, residuals, out,
+            ),
+            ranges, list(sums),
+        )  # fmt: skip
+        total = sums.sum(axis=0)
+        return LinearSystem(
+            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
+            float(total[30]), float(total[31]), residuals,
+        )  # fmt: skip
+
+    def _judge(
+        self,
+        T: NDArray[np.float64],
+        exposure: tuple[float, float],
+        system: LinearSystem,
+        weights: NDArray[np.float32],
+        iterations: int,
+    ) -> TrackingResult:
+        """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
+        config = self.config
+        share = system.weight / max(system.readings, 1.0)
+        residual = float(np.sqrt(system.chi_square / max(system.weight, 1e-9)))
+        scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
+        eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
+        condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
+        if system.weight < 100:
+            reason = f"only {system.weight:.0f} static readings fall on the map"
+        elif share < config.min_inliers:
+            reason = f"only {share:.0%} of the static readings fall on the map"
+        elif residual > config.max_residual * (self.sensor.sigma_base + self.sensor.sigma_scale):
+            reason = f"readings lie {1000 * residual:.1f} mm off the map"
+        elif condition < config.min_condition:
+            reason = "the view does not constrain all directions of motion"
+        else:
+            reason = ""
+        difference = system.residuals[1, ::4, ::4][weights[::4, ::4] > 0.5]
+        difference = np.abs(difference[np.isfinite(difference)])
+        color_residual = float(median(difference)) if len(difference) else 0.0
+        return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
+
+
+def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose after a twist (v, omega) about the camera's centre, world axes."""
+    out = T_world_camera.copy()
+    out[:3, :3] = se3.exp_rotation(step[3:]) @ T_world_camera[:3, :3]
+    out[:3, 3] += step[:3]
+    return out
+
+
+def exposed(level: Level, exposure: tuple[float, float]) -> Level:
+    """Level with gain and offset applied to its intensities."""
+    gain, offset = exposure
+    if (gain, offset) == (1.0, 0.0):
+        return level
+    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
+
+
+def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of one exposure after another."""
+    return then[0] * first[0], then[0] * first[1] + then[1]
+
+
+def fit_exposure(
+    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Gain and offset with ``gain * intensity + offset`` nearest to the map's intensities, robustly.
+
+    Auto-exposure changes all intensities at once; unexplained, such a change looks like motion.
+
+    Args:
+        intensity: (h, w) float32 of the image.
+        difference: (h, w) float32 map minus image, NaN off the map.
+        weights: (h, w) float32 static weights.
+    """
+    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
+    if len(used) < 100:
+        return 1.0, 0.0
+    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
+    x = intensity.reshape(-1)[used].astype(np.float64)
+    y = x + difference.reshape(-1)[used]
+    gain, offset = 1.0, float(median(y - x))
+    for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
+        error = y - gain * x - offset
+        scale = max(1.5 * float(median(np.abs(error))), 0.01)
+        w = 1 / (1 + (error / scale) ** 2)
+        total = w.sum()
+        # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
+        prior = 0.1 * total * 0.04
+        x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
+        variance = (w * (x - x_mean) ** 2).sum() + prior
+        covariance = (w * (x - x_mean) * (y - y_mean)).sum() + prior
+        gain = float(np.clip(covariance / variance, 0.5, 2.0))
+        offset = float(y_mean - gain * x_mean)
+    return gain, offset
