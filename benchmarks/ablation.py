@@ -13,7 +13,7 @@ from dudmap.benchmark.entries import Entry, local_entries
 from dudmap.benchmark.measure import Job, Row, measure_all
 from dudmap.benchmark.table import grid, save
 from dudmap.config import Config
-from dudmap.pipeline.metrics import machine, versions
+from dudmap.pipeline.environment import machine, versions
 
 PARTS: dict[str, tuple[str, ...]] = {
     "default": (),

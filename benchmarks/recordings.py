@@ -14,7 +14,7 @@ from dudmap.benchmark.entries import local_entries
 from dudmap.benchmark.measure import Job, Row, measure_all
 from dudmap.benchmark.systems import systems
 from dudmap.benchmark.table import COLUMNS, Column, grid, markdown, save
-from dudmap.pipeline.metrics import machine, versions
+from dudmap.pipeline.environment import machine, versions
 
 TWINS = {"fr1_xyz_confusao": "fr1_xyz_static"}
 """The same frames without people."""

@@ -19,7 +19,7 @@ from numba import njit
 from dudmap.benchmark.table import grid
 from dudmap.config import Config
 from dudmap.kernels.threads import num_threads
-from dudmap.pipeline.metrics import machine, versions
+from dudmap.pipeline.environment import machine, versions
 from dudmap.slam import Slam
 from dudmap.synthetic import sequence
 

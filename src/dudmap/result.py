@@ -1,15 +1,12 @@
 """What one frame gave, and how long each stage took."""
 
-import time
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.detector import Labels
+from dudmap.dynamics.masks import Labels
 from dudmap.objects.object_tracker import Mover
 from dudmap.tracking.tracker import TrackingResult
 
@@ -55,17 +52,3 @@ class FrameResult:
     submap: int = 0
     corrected: bool = False
     blind: bool = False
-
-
-class Clock:
-    """Milliseconds per stage; a stage that runs twice adds up."""
-
-    def __init__(self, timings: dict[str, float] | None = None) -> None:
-        self.timings = timings or {}
-
-    @contextmanager
-    def __call__(self, stage: str) -> Iterator[None]:
-        """Time a block of code."""
-        start = time.perf_counter()
-        yield
-        self.timings[stage] = self.timings.get(stage, 0.0) + 1000 * (time.perf_counter() - start)

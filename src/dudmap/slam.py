@@ -8,28 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.detector import DynamicDetector, Labels, full_mask, full_size, grown_mask
-from dudmap.dynamics.segments import Pieces
+from dudmap.dynamics.detector import DynamicDetector
+from dudmap.dynamics.masks import Labels, full_mask, full_size, grown_mask
+from dudmap.dynamics.segments import Segmentation
+from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Observation, Preprocessor, exposed_color
-from dudmap.frames.pyramid import Pyramid, mostly
+from dudmap.frames.observation import Level, Observation
+from dudmap.frames.preprocess import Preprocessor
+from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
+from dudmap.geometry.alignment import agree
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.objects.object_fusion import RigidFusion
-from dudmap.objects.object_map import Body
-from dudmap.objects.object_tracker import Mover, MoverTracker
+from dudmap.objects.object_fusion import ObjectFusion
+from dudmap.objects.object_map import RigidObject
+from dudmap.objects.object_tracker import Mover, ObjectTracker
 from dudmap.places.atlas import Atlas
-from dudmap.places.frame_store import History
+from dudmap.places.frame_store import FrameStore
 from dudmap.places.loop_closing import LoopCloser, View
-from dudmap.places.place_recognition import Keyframes, agree
+from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.redundancy import RedundantViews
-from dudmap.result import Clock, FrameResult
-from dudmap.tracking.front_end import Registration, Task, static_weights
+from dudmap.result import FrameResult
+from dudmap.stage_timer import StageTimer
+from dudmap.tracking.front_end import FrontEnd, RegistrationInput, static_weights
 from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.pose_prediction import CLEARLY, FirstGuess
-from dudmap.tracking.quality_monitor import TrackingHealth
-from dudmap.tracking.tracker import Level, Tracker, TrackingResult
+from dudmap.tracking.pose_prediction import CLEARLY, PosePredictor
+from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.tracker import Tracker, TrackingResult
 
 FLAT = 0.01
 """An image whose intensities (0..1) have a smaller standard deviation shows nothing: black, or blinded."""
@@ -52,7 +57,7 @@ class Prepared:
 
     observation: Observation
     pyramid: Pyramid
-    surface: Callable[[], Pieces] | None
+    surface: Callable[[], Segmentation] | None
     ms: float
 
 
@@ -75,23 +80,23 @@ class Slam:
         self.detector = DynamicDetector(self.config.dynamics, self.config.sensor)
         self.redundant = RedundantViews(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
-        self.registration = Registration(self.config, self.tracker, self.detector, self.motion)
-        self.health = TrackingHealth()
-        self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
+        self.registration = FrontEnd(self.config, self.tracker, self.detector, self.motion)
+        self.health = QualityMonitor()
+        self.keyframes = KeyframeDatabase(self.config.relocalization, self.camera, self.config.sensor)
         self.atlas = Atlas(self._empty_volume, self.keyframes, self._history())
-        self._knowledge: TsdfVolume | None = None  # the map of a first pass, and where it saw the frames
+        self._prior_map: TsdfVolume | None = None  # the map of a first pass, and where it saw the frames
         seen: dict[float, NDArray[np.float64]] = {}
         if first_pass is not None:
             main = first_pass.atlas.by_size()[0]
             self.keyframes = first_pass.keyframes
             self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
-            self._knowledge = first_pass.atlas.volumes[main]
+            self._prior_map = first_pass.atlas.volumes[main]
             seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
-            self.detector.memory.know(first_pass.detector.memory, seen)
+            self.detector.memory.import_from(first_pass.detector.memory, seen)
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
-        self.movers = MoverTracker(self.config.movers)
-        self.fusion = RigidFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
-        self.first_guess = FirstGuess(self.config, self.registration, seen)
+        self.movers = ObjectTracker(self.config.movers)
+        self.fusion = ObjectFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
+        self.first_guess = PosePredictor(self.config, self.registration, seen)
         # the first frame and what is known to move in it, until a second one shows what moves besides
         self._first: tuple[Observation, Pyramid, NDArray[np.bool_]] | None = None
         self._lost_since: float | None = None
@@ -105,7 +110,7 @@ class Slam:
     @property
     def reference(self) -> TsdfVolume:
         """The map that frames are compared with: the own one, or in a second pass that of the first."""
-        return self._knowledge or self.volume
+        return self._prior_map or self.volume
 
     @property
     def trajectory(self) -> Trajectory:
@@ -118,7 +123,7 @@ class Slam:
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
     @property
-    def bodies(self) -> list[Body]:
+    def bodies(self) -> list[RigidObject]:
         """The moving bodies so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
         if self.fusion is None:
             return []
@@ -154,23 +159,23 @@ class Slam:
             DatasetError: The images do not fit the camera or each other.
         """
         prepared = frame if isinstance(frame, Prepared) else self.prepare(frame)
-        observation, pyramid, clock = prepared.observation, prepared.pyramid, Clock({"preprocess": prepared.ms})
+        observation, pyramid, clock = prepared.observation, prepared.pyramid, StageTimer({"preprocess": prepared.ms})
         known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         flat = bool(pyramid.coarse.intensity.std() < FLAT)
         if self.reference.is_empty:
             self._map_blind = flat
-            return self._as_recorded(self._start(observation, pyramid, known, clock))
+            return self._to_raw_image(self._start(observation, pyramid, known, clock))
         if prepared.surface is not None:
-            self.detector.take(pyramid.labelled, prepared.surface)
-        guess = self.first_guess.expect(observation.timestamp, pyramid, self.reference, clock)
+            self.detector.set_segmentation(pyramid.labelled, prepared.surface)
+        guess = self.first_guess.predict(observation.timestamp, pyramid, self.reference, clock)
         if guess.moving_before is not None:
             self._start_again(guess.moving_before)
         self.detector.begin(observation.timestamp, guess.moving)
         blind = flat and not self._map_blind
-        task = Task(observation.timestamp, pyramid, known, self.first_guess.unproven, blind, clock)
+        task = RegistrationInput(observation.timestamp, pyramid, known, self.first_guess.unverified_mask, blind, clock)
         similar = self.redundant.ask(observation.rgb, guess.T_world_camera)
         tracked, labels = self._register(task, guess.T_world_camera)
-        reason = self._doubt(task, tracked, labels)
+        reason = self._rejection_reason(task, tracked, labels)
         recognised = self._recognise(observation, task) if reason else None
         if recognised is not None:
             (tracked, labels), reason = recognised, ""
@@ -180,17 +185,17 @@ class Slam:
         if reason:
             self._lose(observation.timestamp)
             if self._start_submap(observation):
-                return self._as_recorded(self._start(observation, pyramid, known, clock))
-            return self._as_recorded(self._result(observation, task, labels, tracked, reason, fused=False))
+                return self._to_raw_image(self._start(observation, pyramid, known, clock))
+            return self._to_raw_image(self._result(observation, task, labels, tracked, reason, fused=False))
         self._keep(task, tracked, labels)
         result = self._result(observation, task, labels, tracked, "", fused=fused, relocalized=bool(recognised))
         self._remember(observation, result, clock)
         if fused:
             with clock("integrate"):
                 self._integrate(observation, tracked.T_world_camera, result.dynamic_mask, tracked.exposure)
-        return self._as_recorded(self._close_loop(observation, task, result))
+        return self._to_raw_image(self._close_loop(observation, task, result))
 
-    def _keep(self, task: Task, tracked: TrackingResult, labels: Labels | None) -> None:
+    def _keep(self, task: RegistrationInput, tracked: TrackingResult, labels: Labels | None) -> None:
         """Take over a frame whose pose is believed: what the next one is predicted and judged from."""
         self.registration.keep(self.reference, task, tracked, labels)
         self.health.tracked(tracked)
@@ -201,12 +206,12 @@ class Slam:
         else:
             self.first_guess.keep(task.timestamp, task.pyramid, tracked.T_world_camera, self.volume)
 
-    def _as_recorded(self, result: FrameResult) -> FrameResult:
+    def _to_raw_image(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
         return replace(result, dynamic_mask=self.preprocess.distorted(result.dynamic_mask))
 
     def _start(
-        self, observation: Observation, pyramid: Pyramid, known: NDArray[np.bool_] | None, clock: Clock
+        self, observation: Observation, pyramid: Pyramid, known: NDArray[np.bool_] | None, clock: StageTimer
     ) -> FrameResult:
         """The first frame with readings is the world: identity pose, what is not known to move is taken as static."""
         nothing = np.zeros(observation.depth.shape, dtype=bool) if known is None else known
@@ -247,7 +252,7 @@ class Slam:
             self.atlas.history.drop_last()
         self._integrate(first, np.eye(4), known | full_size(moving, pyramid.labelled.depth, first.depth))
 
-    def _register(self, task: Task, T_init: NDArray[np.float64]) -> tuple[TrackingResult, Labels | None]:
+    def _register(self, task: RegistrationInput, T_init: NDArray[np.float64]) -> tuple[TrackingResult, Labels | None]:
         """Register and label a frame; if it fits unusually badly, or the registration was still on its way, once more
         from where the last image puts the camera.
 
@@ -267,13 +272,13 @@ class Slam:
         better = again.converged and (not tracked.converged or misfit_again < CLEARLY * misfit)
         return (again, labels_again) if better else (tracked, labels)
 
-    def _doubt(self, task: Task, tracked: TrackingResult, labels: Labels | None) -> str:
+    def _rejection_reason(self, task: RegistrationInput, tracked: TrackingResult, labels: Labels | None) -> str:
         """Sentence on why a registration is not to be believed, empty if it is."""
-        crowded = labels is not None and mostly(labels.dynamic, task.pyramid.labelled)
+        crowded = labels is not None and is_majority_dynamic(labels.dynamic, task.pyramid.labelled)
         return (
             tracked.reason
             or self.motion.implausible(task.timestamp, tracked.T_world_camera)
-            or self.health.doubt(tracked, crowded=crowded)
+            or self.health.rejection_reason(tracked, crowded=crowded)
             or self._undecided(task.pyramid.labelled, labels, tracked)
         )
 
@@ -290,13 +295,15 @@ class Slam:
             return f"{share:.0%} of the readings seem to move, and only {known:.0%} rest where the map has a surface"
         return ""
 
-    def _remember(self, observation: Observation, result: FrameResult, clock: Clock) -> None:
+    def _remember(self, observation: Observation, result: FrameResult, clock: StageTimer) -> None:
         """Keep a tracked frame as a keyframe if the camera has been nowhere near and the image shows something."""
         if self.config.relocalization.enabled and not result.blind and result.T_world_camera is not None:
             with clock("keyframe"):
                 self.keyframes.add(observation, result.T_world_camera, ~result.dynamic_mask, self.atlas.current)
 
-    def _recognise(self, observation: Observation, task: Task) -> tuple[TrackingResult, Labels | None] | None:
+    def _recognise(
+        self, observation: Observation, task: RegistrationInput
+    ) -> tuple[TrackingResult, Labels | None] | None:
         """Registration of a lost frame from the pose of a place it shows; None where nothing is beyond doubt.
 
         Features and map must agree: the registration passes all checks at the stricter limits that hold after a loss,
@@ -317,7 +324,7 @@ class Slam:
             static = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / readings
             if (
                 tracked.converged
-                and not self.health.doubt(tracked, recognised=True)
+                and not self.health.rejection_reason(tracked, recognised=True)
                 and static * tracked.inlier_share >= config.min_on_map
                 and agree(tracked.T_world_camera, T_world_camera, config.max_distance, config.max_angle_deg)
             ):
@@ -343,18 +350,18 @@ class Slam:
         if len(self.keyframes.features(observation).points) < self.config.relocalization.min_inliers:
             return False
         self.atlas.start_submap()
-        self.health, self._lost_since = TrackingHealth(), None
+        self.health, self._lost_since = QualityMonitor(), None
         self.redundant.forget()
         return True
 
-    def _close_loop(self, observation: Observation, task: Task, result: FrameResult) -> FrameResult:
+    def _close_loop(self, observation: Observation, task: RegistrationInput, result: FrameResult) -> FrameResult:
         """Look for a place seen before; where the tracking has drifted since, everything moves."""
         tracked = result.tracking
         if self.atlas.history is None or tracked is None or task.blind:
             return result
         with task.clock("loops"):
             levels, labels = task.pyramid.tracked, result.labels
-            weights = None if labels is None else static_weights(labels, levels, task.unproven)
+            weights = None if labels is None else static_weights(labels, levels, task.unverified_mask)
             view = View(observation, levels, weights, ~result.dynamic_mask, tracked)
             correction = self.loops.close(view, self.health)
         if correction is None:
@@ -367,11 +374,11 @@ class Slam:
     def _empty_volume(self) -> TsdfVolume:
         return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
 
-    def _history(self) -> History | None:
+    def _history(self) -> FrameStore | None:
         loops = self.config.loops
         if not self.config.relocalization.enabled or not (loops.enabled or self.config.submaps.enabled):
             return None
-        return History(self.camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
+        return FrameStore(self.camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
 
     def _integrate(
         self,
@@ -390,7 +397,7 @@ class Slam:
     def _result(
         self,
         observation: Observation,
-        task: Task,
+        task: RegistrationInput,
         labels: Labels | None,
         tracked: TrackingResult,
         reason: str,

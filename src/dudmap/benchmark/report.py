@@ -11,7 +11,7 @@ from dudmap.benchmark.suites import Suite
 from dudmap.benchmark.table import COLUMNS, grid, markdown, save, shown
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
-from dudmap.pipeline.metrics import machine, versions
+from dudmap.pipeline.environment import machine, versions
 
 
 def run_suite(

@@ -196,9 +196,9 @@ def _time_frames(job: tuple[float, int]) -> Row:
 
 def _time_again(slam: "Slam", frame: "Frame") -> Row:
     """Extraction of what one more frame changed in the mesh, and how many chunks that are."""
-    from dudmap.mapping.incremental_mesh import LiveMesh
+    from dudmap.mapping.incremental_mesh import IncrementalMesh
 
-    live = LiveMesh(slam.volume)
+    live = IncrementalMesh(slam.volume)
     live.update()
     slam.process(frame)
     start = time.perf_counter()
@@ -218,8 +218,8 @@ def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
 
 def _time_iteration(frames: int) -> Row:
     """One linearisation of the level that is 320 pixels wide, against the map of a few frames."""
-    from dudmap.frames.preprocess import pyramid
-    from dudmap.tracking.tracker import Level
+    from dudmap.frames.observation import Level
+    from dudmap.frames.pyramid import halved
 
     sequence = _room(frames)
     slam = None
@@ -227,7 +227,7 @@ def _time_iteration(frames: int) -> Row:
         pass
     assert slam is not None
     halvings = round(np.log2(slam.camera.width / 320))
-    depth, intensity = pyramid(slam.preprocess(sequence[frames - 1]), halvings)
+    depth, intensity = halved(slam.preprocess(sequence[frames - 1]), halvings)
     level = Level(slam.camera.scaled(halvings), depth, intensity)
     pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
     slam.volume.look_at(pose)

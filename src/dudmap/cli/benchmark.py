@@ -115,7 +115,7 @@ def limits(
     from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
     from dudmap.benchmark.systems import systems as find_systems
     from dudmap.benchmark.table import save
-    from dudmap.pipeline.metrics import machine, versions
+    from dudmap.pipeline.environment import machine, versions
 
     wanted = find_systems(systems)
     sweeps = sweeping.QUICK_SWEEPS if quick else sweeping.SWEEPS
@@ -157,7 +157,7 @@ def speed(
 
     from dudmap.benchmark import speed as timing
     from dudmap.benchmark.interleaved import find_open3d
-    from dudmap.pipeline.metrics import machine, versions
+    from dudmap.pipeline.environment import machine, versions
 
     frames, long_frames = (20, 60) if quick else (300, 2000)
     figures = timing.speed_figures(

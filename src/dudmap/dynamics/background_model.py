@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import splatting
-from dudmap.tracking.tracker import Level
 
 DIFFERENT = 0.15
 """Intensities that differ by more, from all around, are not of the same thing."""
@@ -22,7 +22,7 @@ SMALLEST = 0.005
 """Share of the image that is left out if nothing larger is hidden."""
 
 
-class Background:
+class BackgroundModel:
     """The last static reading of every pixel, as a point in the world that is carried from image to image.
 
     A thing that gives no reading hides what is known to be behind it: its pixels look unlike that. A shadow of the

@@ -15,11 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.dynamics.ransac import NOISE_PX, projected, rigid_motion
-from dudmap.dynamics.segments import Pieces
-from dudmap.frames.optical_flow import followed, rests_as_well
+from dudmap.dynamics.segments import Segmentation
+from dudmap.frames.observation import Level
+from dudmap.frames.optical_flow import consistent_with_static, track_forward_backward
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry import se3
-from dudmap.tracking.tracker import Level
 
 MOVES_PX = 1.0
 """A corner farther off than this,"""
@@ -78,7 +78,7 @@ class DominantMotion:
         return self.look_back()
 
 
-class Parallax:
+class EgoMotionSegmenter:
     """Finds movers from image to image while the map is too young to know them, or most of the view is hidden.
 
     Args:
@@ -92,8 +92,8 @@ class Parallax:
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
         self._until, self._longest = -np.inf, -np.inf
-        self._before: tuple[Pyramid, Pieces, NDArray[np.bool_] | None] | None = None
-        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Pieces]] = deque()
+        self._before: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
+        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Segmentation]] = deque()
         self._compared: tuple[float, DominantMotion | None] | None = None  # time of the last comparison, and its result
         self.active = False
 
@@ -120,7 +120,7 @@ class Parallax:
         timestamp: float,
         T_world_camera: NDArray[np.float64],
         pyramid: Pyramid,
-        surface: Pieces,
+        surface: Segmentation,
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
         """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
@@ -136,7 +136,7 @@ class Parallax:
         self._before, self._compared, self.active = None, None, False
 
     def compare(
-        self, timestamp: float, pyramid: Pyramid, surface: Pieces, T_expected: NDArray[np.float64] | None = None
+        self, timestamp: float, pyramid: Pyramid, surface: Segmentation, T_expected: NDArray[np.float64] | None = None
     ) -> DominantMotion | None:
         """The static world's motion since the remembered frame, and what does not follow it; None if unknown.
 
@@ -148,12 +148,16 @@ class Parallax:
             before, surface_before, moved = self._before
             motion = dominant_motion(before, pyramid, (surface_before, surface), moved, T_expected)
             self._compared = timestamp, motion
-            if motion is not None and self.young(timestamp) and several(motion.moving_after, pyramid.labelled):
+            if (
+                motion is not None
+                and self.young(timestamp)
+                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
+            ):
                 self._until = min(timestamp + self.seconds, self._longest)
         return self._compared[1]
 
     def slow(
-        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, surface: Pieces
+        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, surface: Segmentation
     ) -> NDArray[np.bool_]:
         """What has moved (h, w) since a somewhat older frame, as far as is known, while the map is young.
 
@@ -173,7 +177,7 @@ class Parallax:
         return np.zeros(pyramid.labelled.depth.shape, dtype=bool) if motion is None else motion.moving_after
 
 
-def several(moving: NDArray[np.bool_], level: Level) -> bool:
+def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
     """Whether so many readings of an image move (h, w) that it is more than noise."""
     return bool(np.count_nonzero(moving) > SEVERAL * np.count_nonzero(level.depth))
 
@@ -181,7 +185,7 @@ def several(moving: NDArray[np.bool_], level: Level) -> bool:
 def dominant_motion(
     before: Pyramid,
     after: Pyramid,
-    surfaces: tuple[Pieces, Pieces],
+    surfaces: tuple[Segmentation, Segmentation],
     moved: NDArray[np.bool_] | None = None,
     T_expected: NDArray[np.float64] | None = None,
     whole: bool = False,
@@ -193,7 +197,7 @@ def dominant_motion(
 
     Args:
         before, after: Both images; corners are followed in the finest levels.
-        surfaces: Pieces of surface of both, at the size of the labels.
+        surfaces: Segmentation of surface of both, at the size of the labels.
         moved: (h, w) bool at that size, what is known to move in the first image; it has little say in what the
             static world is.
         T_expected: (4, 4) what the motion should be: where corners are looked for first, and what decides between
@@ -203,7 +207,7 @@ def dominant_motion(
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
     T_expected = np.eye(4) if T_expected is None else T_expected
     expected = projected(T_expected, _points(fine, before.corners), fine.camera)
-    pixels, targets, unlike = followed(first, second, before.corners, expected)
+    pixels, targets, unlike = track_forward_backward(first, second, before.corners, expected)
     if len(pixels) < FEWEST:
         return None
     points = _points(fine, pixels)
@@ -225,7 +229,7 @@ def dominant_motion(
     allowed = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
     moves = error > allowed
     certain = ~moves
-    certain[moves] = ~rests_as_well(
+    certain[moves] = ~consistent_with_static(
         first, second, pixels[moves], projected(T, points[moves], fine.camera), allowed[moves], unlike[moves]
     )
     pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
@@ -248,7 +252,7 @@ def dominant_motion(
 
 def _spread(
     level: Level,
-    surface: Pieces,
+    surface: Segmentation,
     points: NDArray[np.float64],
     pixels: NDArray[np.int64],
     moves: NDArray[np.bool_],
@@ -294,7 +298,7 @@ def _spread(
     return out
 
 
-def _rest(surface: Pieces, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
+def _rest(surface: Segmentation, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Pixels (h, w) of pieces that hold enough corners at rest, and not too many others; arguments as above."""
     piece = surface.labels[pixels[:, 1], pixels[:, 0]]
     resting = np.bincount(piece[~moves], minlength=surface.count + 1)

@@ -54,7 +54,7 @@ def rigid_motion(
     usual = np.ascontiguousarray((expected - start).T)
     explained = np.zeros(len(guesses) + 1)
     run_bands(
-        lambda start, stop: consensus.explained(
+        lambda start, stop: consensus.msac_scores(
             start, stop, guesses, by_axis, flow_by_axis, usual, surface, NOISE_PX, NEAR_PX, explained
         ),
         bands(len(guesses), 64),

@@ -166,7 +166,7 @@ def point_triangle_distances(points: Points, corners: Points) -> NDArray[np.floa
 
 
 @dataclass(frozen=True, eq=False)
-class Registration:
+class SurfaceAlignment:
     """Outcome of the registration of two surfaces.
 
     Attributes:
@@ -191,7 +191,7 @@ def register(
     reach: float = 0.3,
     samples: int = 30_000,
     iterations: int = 60,
-) -> Registration:
+) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 
     In every step the ``overlap`` share of the points with the smallest distances counts, so that ghosts and missing
@@ -236,7 +236,7 @@ def register(
         rmse, free = float(np.sqrt(np.mean(residual**2))), int(np.count_nonzero(~determined))
         if np.linalg.norm(xi[:3]) < 1e-6 and np.linalg.norm(xi[3:]) < 1e-6:
             break
-    return Registration(T, rmse, steps, free)
+    return SurfaceAlignment(T, rmse, steps, free)
 
 
 def moved(mesh: Mesh, T: NDArray[np.float64]) -> Mesh:

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.tracking.tracker import Level
+from dudmap.frames.observation import Level
 
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
@@ -37,7 +37,7 @@ def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
     return np.stack([columns, rows], axis=1)[useful]
 
 
-def followed(
+def track_forward_backward(
     first: NDArray[np.uint8],
     second: NDArray[np.uint8],
     pixels: NDArray[np.int64],
@@ -68,7 +68,7 @@ def followed(
     return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
 
 
-def rests_as_well(
+def consistent_with_static(
     first: NDArray[np.uint8],
     second: NDArray[np.uint8],
     pixels: NDArray[np.int64],

@@ -1,6 +1,6 @@
 """From a camera's frame to what the algorithm works on: undistorted, limited, filled, smoothed (thesis section 4.3)."""
 
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.config import PreprocessConfig
 from dudmap.errors import DatasetError
 from dudmap.frames.frame import Frame
+from dudmap.frames.observation import Observation
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import filtering
 from dudmap.kernels.threads import bands, run_bands
@@ -16,30 +17,6 @@ BAND = 120
 """Image rows of one piece of work."""
 NOISE_FLOOR = 0.01
 """Readings of a small hole's neighbourhood may always differ by this much, metres."""
-HALVING_BAND = 0.02
-"""Readings this far (m, and share of the depth) behind the nearest of a 2x2 block belong to the same surface."""
-
-
-@dataclass(frozen=True, eq=False)
-class Observation:
-    """A frame made ready.
-
-    Attributes:
-        timestamp: Seconds, of the depth image.
-        camera: Camera of all images here; without distortion.
-        depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
-        raw_depth: (H, W) float32, metres, limited and undistorted only, 0 = none.
-        intensity: (H, W) float32, 0..1.
-        rgb: (H, W, 3) uint8.
-    """
-
-    timestamp: float
-    camera: Camera
-    depth: NDArray[np.float32]
-    raw_depth: NDArray[np.float32]
-    intensity: NDArray[np.float32]
-    rgb: NDArray[np.uint8]
-    _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
 
 class Preprocessor:
@@ -162,41 +139,6 @@ class Preprocessor:
         margin, alpha = self.config.filter_radius, np.float32(self.config.filter_alpha)
         filtering.pad(0, depth.shape[0], depth, margin, padded)
         run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, spatial, depth), ranges)
-
-
-def pyramid(observation: Observation, level: int) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth and intensity (H >> level, W >> level) of ``camera.scaled(level)``: ``level`` halvings by 2x2 blocks.
-
-    Intensity is the mean of a block; depth the mean of its readings on the nearest surface. Each halving is computed
-    once per observation.
-    """
-    halvings = observation._halvings
-    while len(halvings) < level:
-        depth, intensity = halvings[-1] if halvings else (observation.depth, observation.intensity)
-        halvings.append(_halved(depth, intensity))
-    return halvings[level - 1] if level else (observation.depth, observation.intensity)
-
-
-def _halved(
-    depth: NDArray[np.float32], intensity: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    shape = (depth.shape[0] // 2, depth.shape[1] // 2)
-    small = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    filtering.halve_depth(0, shape[0], depth, np.float32(HALVING_BAND), small[0])
-    filtering.halve_intensity(0, shape[0], intensity, small[1])
-    return small
-
-
-def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
-    import cv2
-
-    gain, offset = exposure
-    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
-
-
-def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
-    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
 
 
 def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:

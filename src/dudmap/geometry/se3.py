@@ -138,3 +138,11 @@ def nearest_rotation(R: Matrix) -> Matrix:
     """Rotation closest to ``R`` (3, 3) in the Frobenius norm: removes the drift of repeated products."""
     U, _, V_t = np.linalg.svd(R)
     return U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
+
+
+def retract(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose after a twist (v, omega) about the camera's centre, world axes."""
+    out = T_world_camera.copy()
+    out[:3, :3] = exp_rotation(step[3:]) @ T_world_camera[:3, :3]
+    out[:3, 3] += step[:3]
+    return out

@@ -6,7 +6,7 @@ from dudmap.kernels.threads import kernel
 
 
 @kernel
-def explained(start, stop, guesses, jacobian, flow, usual, surface, noise, near, out):
+def msac_scores(start, stop, guesses, jacobian, flow, usual, surface, noise, near, out):
     """Surface that guesses ``start`` to ``stop`` explain, counted as in MSAC (Torr and Zisserman 2000), by how likely.
 
     Args:

@@ -9,7 +9,7 @@ STEP = np.float32(0.35)
 
 
 @kernel
-def hollows(depth, intrinsics, tolerance, reach, sine, normals, edge):
+def concave_edges(depth, intrinsics, tolerance, reach, sine, normals, edge):
     """Pixels in a hollow: those between whose neighbours the surface turns towards the camera.
 
     With points a, b on either side of a pixel and their normals, (n_b - n_a) . (b - a) is negative in a hollow and
@@ -100,10 +100,10 @@ def _end(depth, tolerance, v, u, dv, du):
 
 @kernel
 def segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
-    """Connected pieces of surface, cut along depth edges and hollows; pixels in a hollow join the piece beside them.
+    """Connected pieces of surface, cut along depth and concave edges; pixels on a concave edge join their neighbour.
 
     Args:
-        depth, intrinsics, tolerance, normals, edge: See ``hollows``.
+        depth, intrinsics, tolerance, normals, edge: See ``concave_edges``.
         labels: (h, w) int32 out: number from 1, 0 = no reading.
         passes: Pixels that a piece may reach into a hollow.
 
@@ -201,7 +201,7 @@ def sums(labels, used, moving, distance, sigma, difference, gradient, out):
 
 
 @kernel
-def against(
+def reproject_difference(
     row_start, row_stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
 ):
     """A depth image against an older one of the same camera, seen from where the older one was.

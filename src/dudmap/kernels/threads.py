@@ -33,7 +33,7 @@ def _pool() -> ThreadPoolExecutor:
     return ThreadPoolExecutor(max(1, num_threads() - 1), thread_name_prefix="dudmap")
 
 
-def begun(function: Callable[[], Result]) -> Callable[[], Result]:
+def submit(function: Callable[[], Result]) -> Callable[[], Result]:
     """Begin ``function`` beside the caller, where there is a core for it; what is returned waits for its result."""
     if num_threads() > 1:
         return _pool().submit(function).result

@@ -11,7 +11,7 @@ MARGIN = 3
 """Blocks that the view may move before the window follows it; its edge has room for them."""
 
 
-class Window:
+class BlockWindow:
     """What the hash table of the blocks, which stays the authoritative index, holds around the view.
 
     Args:
@@ -47,7 +47,7 @@ class Window:
         hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries)
         self.near = np.sort(self.cells[self.cells >= 0])
 
-    def lattice(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+    def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to lattice (3, 4): in voxels, from the first voxel of the window on."""
         assert self.origin is not None
         T = T_world_camera[:3] / (self.block_size / BLOCK)

@@ -15,7 +15,7 @@ EDGE = 4
 Chunk = tuple[int, int, int]
 
 
-class LiveMesh:
+class IncrementalMesh:
     """Keeps the mesh of a volume up to date, for a view of the map while it is made.
 
     The map is cut into chunks of 4x4x4 blocks. An update extracts those chunks again that a frame wrote to since the
@@ -34,7 +34,7 @@ class LiveMesh:
     def __init__(self, volume: "TsdfVolume") -> None:
         self.chunks: dict[Chunk, Mesh] = {}
         self._volume = volume
-        self._born = volume.born
+        self._map_id = volume.map_id
         self._seen = -1
         self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
 
@@ -44,10 +44,10 @@ class LiveMesh:
         A chunk that is returned and is not in ``chunks`` has no surface any more.
         """
         forgotten: list[Chunk] = []
-        if self._volume.born != self._born:  # the map was cleared: its frames count from zero again
+        if self._volume.map_id != self._map_id:  # the map was cleared: its frames count from zero again
             forgotten = list(self.chunks)
             self.chunks.clear()
-            self._born, self._seen, self._coords_of = self._volume.born, -1, self._coords_of[:0]
+            self._map_id, self._seen, self._coords_of = self._volume.map_id, -1, self._coords_of[:0]
         slots, coords = self._volume.written_since(self._seen)
         self._seen = self._volume.num_integrated
         known = slots[slots < len(self._coords_of)]

@@ -19,7 +19,7 @@ NEAREST = 0.05
 """Blocks nearer to the camera than this are not seen, metres."""
 
 
-class Fusion:
+class Integrator:
     """One frame that is fused into a map.
 
     Args:
@@ -35,7 +35,7 @@ class Fusion:
         self.volume = volume
         self.depth = depth
         self.number = number
-        self.T_lattice_camera = volume.window.lattice(T_world_camera)
+        self.T_lattice_camera = volume.window.T_grid_camera(T_world_camera)
         self.T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
         self.size = np.array(depth.shape, dtype=np.int64)
         tiles = -(-depth.shape[0] // visibility.TILE), -(-depth.shape[1] // visibility.TILE)

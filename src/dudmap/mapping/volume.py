@@ -14,16 +14,16 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.kernels import meshing, raycasting, sampling
 from dudmap.kernels.threads import bands, run_bands
-from dudmap.mapping.block_window import Window
-from dudmap.mapping.integrator import Fusion, reading_weights
+from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.integrator import Integrator, reading_weights
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
-_BIRTHS = itertools.count()
+_MAP_IDS = itertools.count()
 FORMAT = "dudmap map 1"
 STEEPEST = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of sight; what is steeper is the edge between a band and the free space beside it."""
-NOTHING, SURFACE, FREE = 0, 1, 2
+UNKNOWN, SURFACE, FREE = 0, 1, 2
 """What the map says of a point: unknown, near a surface, in confirmed free space."""
 
 
@@ -49,7 +49,7 @@ class MapSample:
     Attributes:
         distance: (h, w) float32 signed distance in metres, NaN where the map has none.
         difference: (h, w) float32 map minus image intensity (0..1), NaN likewise.
-        place: (h, w) uint8: NOTHING, SURFACE or FREE.
+        place: (h, w) uint8: UNKNOWN, SURFACE or FREE.
     """
 
     distance: NDArray[np.float32]
@@ -109,10 +109,10 @@ class TsdfVolume:
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
-        self.window = Window(self.block_size, cells)
+        self.window = BlockWindow(self.block_size, cells)
         self.blocks = VoxelBlocks()
         self._frame_number = 0
-        self.born = next(_BIRTHS)
+        self.map_id = next(_MAP_IDS)
         self._pixels: NDArray[np.int32] | None = None
 
     @property
@@ -183,7 +183,7 @@ class TsdfVolume:
             depth[~static_mask] = 0
         self._frame_number += 1
         self.look_at(T_world_camera)
-        fusion = Fusion(self, depth, T_world_camera, self._frame_number)
+        fusion = Integrator(self, depth, T_world_camera, self._frame_number)
         fusion.allocate()
         weights = reading_weights(depth, self.camera, self.config, self.sensor) if weights is None else weights
         fusion.average(frame.color, weights, count)
@@ -220,7 +220,7 @@ class TsdfVolume:
         """What the map says at the points of a depth image (h, w) of ``camera`` at a pose inside the window."""
         shape = depth.shape
         out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-        window, T = self.window, self.window.lattice(T_world_camera)
+        window, T = self.window, self.window.T_grid_camera(T_world_camera)
         run_bands(
             lambda start, stop: sampling.sample_map(
                 start, stop, depth, intensity, camera.intrinsics, T, window.cells, window.shape,

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Observation
+from dudmap.frames.observation import Level, Observation
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.objects.object_map import Body, BodyTrack, BodyVolume
+from dudmap.objects.object_map import ObjectTrack, ObjectVolume, RigidObject
 from dudmap.objects.object_tracker import Mover
-from dudmap.objects.object_view import BodyView, body_view
-from dudmap.tracking.tracker import Level, Tracker, TrackingResult
+from dudmap.objects.object_view import ObjectView, crop_object
+from dudmap.tracking.tracker import Tracker, TrackingResult
 
 MOST_BODIES = 4
 """Bodies that are looked at in one frame; each costs a few milliseconds and some megabytes."""
@@ -42,7 +42,7 @@ POINTS = 2000
 """Surface points that are looked at again."""
 
 
-class RigidFusion:
+class ObjectFusion:
     """Shape and trajectory of the moving bodies of a recording.
 
     Args:
@@ -64,11 +64,11 @@ class RigidFusion:
         self.tracker = Tracker(steps, config.sensor)
         self._volume = config.volume.model_copy(update={"voxel_size": config.movers.mesh_voxel_size})
         self._rng = np.random.default_rng(0)
-        self._tracks: dict[int, BodyTrack] = {}
+        self._tracks: dict[int, ObjectTrack] = {}
         self._rejected: set[int] = set()
-        self._finished: list[tuple[Body, dict[float, NDArray[np.float64]]]] = []
+        self._finished: list[tuple[RigidObject, dict[float, NDArray[np.float64]]]] = []
 
-    def bodies(self, poses: dict[float, NDArray[np.float64]]) -> list[Body]:
+    def bodies(self, poses: dict[float, NDArray[np.float64]]) -> list[RigidObject]:
         """All bodies so far, by id, with the trajectories that the camera's poses T_world_camera by time give them."""
         out = []
         for body, Ts in self._finished + [track.finished() for track in self._tracks.values()]:
@@ -107,7 +107,7 @@ class RigidFusion:
             track = self._tracks.get(mover.id)
             if mover.id in self._rejected or (track is None and len(self._tracks) >= MOST_BODIES):
                 continue
-            view = body_view(observation, mover, level, exposure)
+            view = crop_object(observation, mover, level, exposure)
             if view is None:
                 continue
             if track is None:
@@ -137,25 +137,32 @@ class RigidFusion:
         body, Ts = self._tracks.pop(id).finished()
         self._rejected.add(id)
         if body.rigid and sum(other.rigid for other, _ in self._finished) >= MOST_MESHES:
-            body = Body(id, False, f"{MOST_MESHES} meshes are kept already", body.frames)
+            body = RigidObject(id, False, f"{MOST_MESHES} meshes are kept already", body.frames)
         self._finished.append((body, Ts if body.rigid else {}))
 
     def _start(
-        self, mover: Mover, view: BodyView, now: float, T_world_camera: NDArray[np.float64], begun: tuple[str, ...] = ()
+        self,
+        mover: Mover,
+        view: ObjectView,
+        now: float,
+        T_world_camera: NDArray[np.float64],
+        begun: tuple[str, ...] = (),
     ) -> None:
         T = np.eye(4)
         T[:3, 3] = mover.centroid
-        volume = BodyVolume(view.levels[-1].camera, self._volume, self.config.sensor, self.config.preprocess.depth_max)
-        track = BodyTrack(mover.id, volume, view.area, T, T.copy(), now, now, begun=begun)
+        volume = ObjectVolume(
+            view.levels[-1].camera, self._volume, self.config.sensor, self.config.preprocess.depth_max
+        )
+        track = ObjectTrack(mover.id, volume, view.area, T, T.copy(), now, now, begun=begun)
         track.motion[:3] = mover.velocity
         self._tracks[mover.id] = track
         self._fuse(track, view, se3.inverse(T) @ T_world_camera, now)
 
     def _follow(
         self,
-        track: BodyTrack,
+        track: ObjectTrack,
         mover: Mover,
-        view: BodyView,
+        view: ObjectView,
         observation: Observation,
         T_world_camera: NDArray[np.float64],
     ) -> None:
@@ -187,7 +194,7 @@ class RigidFusion:
         if through <= 2 * SEEN_THROUGH and off <= OFF:
             self._fuse(track, view, T_body_camera, now)
 
-    def _registered(self, volume: BodyVolume, view: BodyView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
+    def _registered(self, volume: ObjectVolume, view: ObjectView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
         """Pose T_body_camera from the best of some guesses.
 
         A reading that is off the map there is a side of the body not seen before: it has no say. In the camera's
@@ -202,7 +209,7 @@ class RigidFusion:
             weights.append(mask * np.isfinite(sample.distance).astype(np.float32))
         return self.tracker.align(volume, view.levels, T, weights, first_level=3 - len(view.levels))
 
-    def _fuse(self, track: BodyTrack, view: BodyView, T_body_camera: NDArray[np.float64], now: float) -> None:
+    def _fuse(self, track: ObjectTrack, view: ObjectView, T_body_camera: NDArray[np.float64], now: float) -> None:
         level, mask = view.levels[-1], view.mask
         track.volume.camera = level.camera
         track.volume.integrate(Frame(now, level.depth, view.color), T_body_camera, mask)
@@ -222,7 +229,7 @@ class RigidFusion:
             track.farthest, float(np.median(np.linalg.norm(corners @ change[:, :3].T + change[:, 3], axis=1)))
         )
 
-    def _seen_through(self, track: BodyTrack, observation: Observation, T_body_camera: NDArray[np.float64]) -> float:
+    def _seen_through(self, track: ObjectTrack, observation: Observation, T_body_camera: NDArray[np.float64]) -> float:
         """Share of the body's known surface, as far as it is not hidden, that the image sees through."""
         T, camera, sensor = se3.inverse(T_body_camera), observation.camera, self.config.sensor
         x, y, z = (track.points @ T[:3, :3].T + T[:3, 3]).T
@@ -241,7 +248,7 @@ class RigidFusion:
         seen = read & (np.abs(around - z).min(axis=0) <= margin)
         return float(np.count_nonzero(gone) / max(np.count_nonzero(gone | seen), 1))
 
-    def _off(self, track: BodyTrack, view: BodyView, T_body_camera: NDArray[np.float64]) -> float:
+    def _off(self, track: ObjectTrack, view: ObjectView, T_body_camera: NDArray[np.float64]) -> float:
         """Share of the body's readings near its map that lie off its surface."""
         level, sensor = view.levels[-1], self.config.sensor
         sample = track.volume.sample(level.depth, level.intensity, level.camera, T_body_camera)

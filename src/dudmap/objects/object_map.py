@@ -22,11 +22,11 @@ FAILED = 0.3
 FARTHEST_STILL = 0.03
 """What has not moved farther than this is no moving body, metres."""
 FLECK = 0.05
-"""Pieces of a mesh that have a smaller share of the largest piece's vertices than this are left out."""
+"""Segmentation of a mesh that have a smaller share of the largest piece's vertices than this are left out."""
 
 
 @dataclass(frozen=True, eq=False)
-class Body:
+class RigidObject:
     """What is known of a moving body.
 
     Attributes:
@@ -47,7 +47,7 @@ class Body:
     trajectory: Trajectory | None = None
 
 
-class BodyVolume(TsdfVolume):
+class ObjectVolume(TsdfVolume):
     """The map of a body: its window stays around the body's origin wherever the camera is.
 
     Args:
@@ -69,7 +69,7 @@ class BodyVolume(TsdfVolume):
 
 
 @dataclass(eq=False)
-class BodyTrack:
+class ObjectTrack:
     """A body that is being registered.
 
     Attributes:
@@ -89,7 +89,7 @@ class BodyTrack:
     """
 
     id: int
-    volume: BodyVolume
+    volume: ObjectVolume
     area: float
     T_world_body: NDArray[np.float64]
     T_first: NDArray[np.float64]
@@ -121,17 +121,17 @@ class BodyTrack:
             return f"moved by {100 * self.farthest:.1f} cm only"
         return ""
 
-    def finished(self) -> tuple[Body, dict[float, NDArray[np.float64]]]:
+    def finished(self) -> tuple[RigidObject, dict[float, NDArray[np.float64]]]:
         """What came of a body, and its poses T_camera_body by time."""
         why, frames = self.why(), len(self.Ts_camera_body)
         if why:
-            return Body(self.id, False, why, frames), {}
+            return RigidObject(self.id, False, why, frames), {}
         mesh = _without_flecks(self.volume.extract_mesh())
         middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
         T = np.eye(4)
         T[:3, 3] = middle
         mesh = replace(mesh, vertices=mesh.vertices - middle)
-        return Body(self.id, True, "", frames, mesh), {t: pose @ T for t, pose in self.Ts_camera_body.items()}
+        return RigidObject(self.id, True, "", frames, mesh), {t: pose @ T for t, pose in self.Ts_camera_body.items()}
 
 
 def _without_flecks(mesh: Mesh) -> Mesh:

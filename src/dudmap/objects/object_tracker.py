@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import MoversConfig
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling
 from dudmap.kernels.median import median
 from dudmap.objects.scene_flow import Seen, displacements
-from dudmap.tracking.tracker import Level
 
 SAMPLES = 60
 """Points per region that measure the gap to another region."""
@@ -104,7 +104,7 @@ class _Part:
     box: NDArray[np.float32]
 
 
-class MoverTracker:
+class ObjectTracker:
     """Bodies of a frame, matched to those of the frames before.
 
     The moving pixels of the last frame, carried along by their bodies' velocities, tell whose a region is. Where two

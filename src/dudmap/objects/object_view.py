@@ -5,10 +5,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.detector import full_size
-from dudmap.frames.preprocess import Observation, exposed_color, pyramid
+from dudmap.dynamics.masks import full_size
+from dudmap.frames.exposure import exposed_color
+from dudmap.frames.observation import Level, Observation
+from dudmap.frames.pyramid import halved
 from dudmap.objects.object_tracker import Mover
-from dudmap.tracking.tracker import Level
 
 FEWEST_PIXELS = 60
 """Pixels at the labels' resolution that a body is looked at from."""
@@ -21,7 +22,7 @@ RIM = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class BodyView:
+class ObjectView:
     """A body in an image: the levels around it, coarse to fine, their weights, and the finest one's colours."""
 
     levels: list[Level]
@@ -40,7 +41,9 @@ class BodyView:
         return float(np.sum(np.square(level.depth[self.mask]))) / (level.camera.fx * level.camera.fy)
 
 
-def body_view(observation: Observation, mover: Mover, level: Level, exposure: tuple[float, float]) -> BodyView | None:
+def crop_object(
+    observation: Observation, mover: Mover, level: Level, exposure: tuple[float, float]
+) -> ObjectView | None:
     """The part of the images that shows a body, halved until few enough pixels do; None if it is too small."""
     import cv2
 
@@ -71,7 +74,7 @@ def body_view(observation: Observation, mover: Mover, level: Level, exposure: tu
             continue
         small = camera.scaled(halvings)
         cut = np.s_[y >> halvings : (y >> halvings) + small.height, x >> halvings : (x >> halvings) + small.width]
-        depth, intensity = (np.ascontiguousarray(image[cut]) for image in pyramid(observation, halvings))
+        depth, intensity = (np.ascontiguousarray(image[cut]) for image in halved(observation, halvings))
         inner = cv2.resize(mask.astype(np.float32), (small.width, small.height), interpolation=cv2.INTER_AREA) > 0.99
         levels.append(Level(small, depth, gain * intensity + offset))
         weights.append((inner & (depth > 0)).astype(np.float32))
@@ -80,7 +83,7 @@ def body_view(observation: Observation, mover: Mover, level: Level, exposure: tu
     color = exposed_color(np.ascontiguousarray(observation.rgb[crop]), exposure)
     if finest:
         color = np.asarray(cv2.resize(color, weights[-1].shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
-    return BodyView(levels, weights, color)
+    return ObjectView(levels, weights, color)
 
 
 def _around(inside: NDArray[np.int64], least: int, size: int) -> slice:

@@ -2,21 +2,17 @@
 
 import csv
 import json
-import os
-import platform
-import sys
 import time
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap import __version__
 from dudmap.errors import DatasetError
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
     from dudmap.objects.object_tracker import Mover
@@ -114,7 +110,7 @@ class RunRecord:
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
         """
-        from dudmap.dynamics.detector import BINS, LARGEST, fit_mixture
+        from dudmap.dynamics.mixture import BINS, LARGEST, fit_mixture
 
         if not self.residuals.any():
             return
@@ -180,40 +176,6 @@ def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
     except DatasetError as error:
         out["accuracy_missing"] = str(error)
     return out
-
-
-def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far, MB; None where the system does not tell."""
-    if sys.platform == "win32":
-        return None
-    import resource
-
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return round(peak / (1e6 if sys.platform == "darwin" else 1e3), 1)
-
-
-def versions() -> dict[str, str]:
-    """Versions of dudmap and of what its figures depend on."""
-    import cv2
-
-    return {
-        "dudmap": __version__,
-        "python": platform.python_version(),
-        "numpy": np.__version__,
-        "numba": version("numba"),
-        "opencv": cv2.__version__,
-    }
-
-
-def machine() -> dict[str, Any]:
-    """Processor, cores and operating system."""
-    cpu = platform.processor() or platform.machine()
-    info = Path("/proc/cpuinfo")
-    if info.is_file():
-        names = [line for line in info.read_text(encoding="utf-8").splitlines() if line.startswith("model name")]
-        cpu = names[0].partition(":")[2].strip() if names else cpu
-    usable = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
-    return {"cpu": cpu, "cores": os.cpu_count(), "cores_usable": usable, "os": platform.platform()}
 
 
 def _row(mover: "Mover") -> dict[str, Any]:

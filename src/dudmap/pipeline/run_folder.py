@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.metrics import RunRecord, accuracy, machine, versions
+from dudmap.pipeline.environment import machine, versions
+from dudmap.pipeline.metrics import RunRecord, accuracy
 
 if TYPE_CHECKING:
-    from dudmap.objects.object_map import Body
+    from dudmap.objects.object_map import RigidObject
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
 
@@ -151,7 +152,7 @@ def write(
     return RunReport(out, metrics, trajectory)
 
 
-def _save_bodies(folder: Path, bodies: "list[Body]") -> list[dict[str, Any]]:
+def _save_bodies(folder: Path, bodies: "list[RigidObject]") -> list[dict[str, Any]]:
     """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
     out = []
     for body in bodies:

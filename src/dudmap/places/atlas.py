@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.frame_store import History
-from dudmap.places.place_recognition import Keyframes
+from dudmap.places.frame_store import FrameStore
+from dudmap.places.place_recognition import KeyframeDatabase
 
 
 @dataclass(eq=False)
@@ -43,8 +43,8 @@ class Atlas:
     def __init__(
         self,
         make_volume: Callable[[], TsdfVolume],
-        keyframes: Keyframes,
-        history: History | None,
+        keyframes: KeyframeDatabase,
+        history: FrameStore | None,
         number: int = 0,
     ) -> None:
         self.make_volume = make_volume

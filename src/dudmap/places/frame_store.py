@@ -42,7 +42,7 @@ class StoredFrame:
     count: int
 
 
-class History:
+class FrameStore:
     """The fused frames, thinned, in a temporary file that the system removes: memory grows by some hundred bytes each.
 
     A frame is kept where the camera has moved or turned since the last one kept, or after a number of frames; the

@@ -9,14 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.frames.preprocess import Observation
+from dudmap.frames.observation import Level, Observation
 from dudmap.geometry import se3
+from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
-from dudmap.places.place_recognition import Keyframe, Place, agree
+from dudmap.places.place_recognition import Keyframe, PlaceMatch
 from dudmap.places.pose_graph import Edge, optimize
-from dudmap.tracking.quality_monitor import TrackingHealth
-from dudmap.tracking.tracker import Level, Tracker, TrackingResult
+from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.tracker import Tracker, TrackingResult
 
 NEAR = 0.5, 30.0
 """A keyframe within this distance (m) and angle (deg) is being seen; frames that close to it show its place."""
@@ -70,7 +71,7 @@ class Search:
     view: View
     submap: int
     returned: bool
-    places: "Future[list[Place]]"
+    places: "Future[list[PlaceMatch]]"
     due: int
 
 
@@ -101,7 +102,7 @@ class LoopCloser:
         self._pending: tuple[int, NDArray[np.float64]] | None = None  # submap and correction a first frame measured
         self._edges: list[Edge] = []
 
-    def close(self, view: View, health: TrackingHealth) -> NDArray[np.float64] | None:
+    def close(self, view: View, health: QualityMonitor) -> NDArray[np.float64] | None:
         """Correct the atlas if a frame shows a place from which the tracking has drifted, or one of another submap.
 
         The features are compared beside the next frames; a frame's places are decided on a fixed number of frames
@@ -150,7 +151,7 @@ class LoopCloser:
             return self.config.submaps.enabled
         return self.config.loops.enabled and self._old(keyframe, now)
 
-    def _decide(self, search: "Search", health: TrackingHealth) -> NDArray[np.float64] | None:
+    def _decide(self, search: "Search", health: QualityMonitor) -> NDArray[np.float64] | None:
         """Correction by the places that a frame was found to show, None if none was made."""
         view, T = search.view, search.view.tracked.T_world_camera
         pending, self._pending = self._pending, None
@@ -181,14 +182,14 @@ class LoopCloser:
             self._next_attempt = self._count + self._failures * self.config.loops.gap
         return None
 
-    def _confirm(self, place: Place, view: View) -> None:
+    def _confirm(self, place: PlaceMatch, view: View) -> None:
         """Remember that there was no drift between a place and now: later corrections leave that part alone."""
         self._failures = 0
         T = view.tracked.T_world_camera
         self._edges += self._edge(place, view, T)
         _see(self.atlas.keyframes.near(T, self.atlas.current, *NEAR), view.observation.timestamp)
 
-    def _edge(self, place: Place, view: View, T_world_camera: NDArray[np.float64]) -> list[Edge]:
+    def _edge(self, place: PlaceMatch, view: View, T_world_camera: NDArray[np.float64]) -> list[Edge]:
         """Measured motion from a kept frame of a place to the newest kept frame; none if they are the same."""
         history = self.atlas.history
         assert history is not None
@@ -203,7 +204,7 @@ class LoopCloser:
         T_old_new = se3.inverse(history.Ts_world_camera[old]) @ T_world_camera @ T_camera_new
         return [Edge(old, nodes[-1], T_old_new, *LOOP_NOISE)]
 
-    def _believable(self, place: Place, T: NDArray[np.float64]) -> bool:
+    def _believable(self, place: PlaceMatch, T: NDArray[np.float64]) -> bool:
         """Whether the path since a place was last seen is long enough for such a drift."""
         since = [
             pose.T_world_camera
@@ -215,7 +216,7 @@ class LoopCloser:
         limit = 0.05 + self.config.loops.max_drift * path
         return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
 
-    def _registered(self, place: Place, view: View, health: TrackingHealth) -> NDArray[np.float64] | None:
+    def _registered(self, place: PlaceMatch, view: View, health: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose of the frame in the map of a place's own time; None unless features, distances and image agree."""
         history = self.atlas.history
         assert history is not None
@@ -237,14 +238,14 @@ class LoopCloser:
         )
         if (
             found.converged
-            and not health.doubt(found, recognised=True)
+            and not health.rejection_reason(found, recognised=True)
             and found.inlier_share >= limits.min_on_map
             and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
         ):
             return found.T_world_camera
         return None
 
-    def _correct(self, place: Place, view: View, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    def _correct(self, place: PlaceMatch, view: View, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
         """Spread the drift over the kept frames, build the map anew, and take it over if it is no worse."""
         history = self.atlas.history
         assert history is not None

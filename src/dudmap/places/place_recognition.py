@@ -12,19 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import RelocalizationConfig, SensorConfig
-from dudmap.frames.preprocess import Observation
-from dudmap.geometry import se3
+from dudmap.frames.observation import Observation
+from dudmap.geometry.alignment import agree, rigid_ransac
 from dudmap.geometry.camera import Camera
 
 COMPARED = 64
 """Strongest features of each keyframe that choose the keyframes worth a closer look."""
 LOOKED_AT = 5
-"""Keyframes per lost frame that get that closer look."""
-TRIPLES = 3000
-"""Triples of matches that are drawn; those whose sides have the same lengths in both frames become hypotheses."""
-HYPOTHESES = 400
-SHORTEST_SIDE = 0.1
-"""Triples with a shorter side than this define no pose, metres."""
+"""KeyframeDatabase per lost frame that get that closer look."""
 SLACK = 0.01
 """Two places of one feature differ by this beyond the sensor's noise, metres per metre of depth (half a pixel)."""
 SAME_PLACE = 0.1, 5.0
@@ -64,7 +59,7 @@ class Keyframe:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class PlaceMatch:
     """A keyframe that a frame was recognised to show.
 
     Attributes:
@@ -78,7 +73,7 @@ class Place:
     support: int
 
 
-class Keyframes:
+class KeyframeDatabase:
     """Remembers where the camera has been, and recognises these places.
 
     Args:
@@ -127,7 +122,7 @@ class Keyframes:
             self._forget_one()
         return True
 
-    def find(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> list[Place]:
+    def find(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> list[PlaceMatch]:
         """Known places that a frame may show, the best supported first."""
         return self.match(self._features(observation, static_mask), self.keyframes) if self.keyframes else []
 
@@ -137,11 +132,11 @@ class Keyframes:
             self._latest = observation, self._features(observation, static_mask)
         return self._latest[1]
 
-    def match(self, features: PlacedFeatures, among: Sequence[Keyframe]) -> list[Place]:
-        """Keyframes among these that a frame with such features may show, the best supported first."""
+    def match(self, features: PlacedFeatures, among: Sequence[Keyframe]) -> list[PlaceMatch]:
+        """KeyframeDatabase among these that a frame with such features may show, the best supported first."""
         if len(features.points) < self.config.min_inliers or not among:
             return []
-        found: list[Place] = []
+        found: list[PlaceMatch] = []
         for keyframe in _most_alike(features, among):
             pairs = matches(features.descriptors, keyframe.features.descriptors, self.config.ratio)
             if len(pairs) < self.config.min_inliers:
@@ -150,9 +145,9 @@ class Keyframes:
             T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b))
             count = int(np.count_nonzero(inliers))
             if count >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
-                found.append(Place(keyframe, keyframe.T_world_camera @ T_keyframe_camera, count))
+                found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, count))
         found.sort(key=lambda place: -place.support)
-        places: list[Place] = []
+        places: list[PlaceMatch] = []
         for place in found:
             if not any(
                 place.keyframe.submap == other.keyframe.submap
@@ -165,7 +160,7 @@ class Keyframes:
     def near(
         self, T_world_camera: NDArray[np.float64], submap: int, distance: float, angle_deg: float
     ) -> list[Keyframe]:
-        """Keyframes of a submap closer to a pose than a distance (m) and an angle (deg)."""
+        """KeyframeDatabase of a submap closer to a pose than a distance (m) and an angle (deg)."""
         if not self.keyframes:
             return []
         places = np.array([known.T_world_camera for known in self.keyframes])
@@ -223,7 +218,7 @@ class Keyframes:
 
 
 def _most_alike(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
-    """Keyframes whose strongest features resemble the frame's most, the best first."""
+    """KeyframeDatabase whose strongest features resemble the frame's most, the best first."""
     if len(among) <= LOOKED_AT:
         return among
     parts = [known.features.descriptors[:COMPARED] for known in among]
@@ -254,64 +249,6 @@ def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDA
     distinct = 2 - 2 * first < ratio**2 * (2 - 2 * second)
     chosen = np.flatnonzero(mutual & distinct)
     return np.stack([chosen, nearest[chosen]], axis=1)
-
-
-def rigid_ransac(
-    a: NDArray[np.float64], b: NDArray[np.float64], tolerance: NDArray[np.float64], seed: int = 1
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Rigid motion T_a_b that most pairs of points agree with, and which do; the same input gives the same answer.
-
-    Args:
-        a, b: (m, 3) the same points in two frames, metres.
-        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of a pair that agrees.
-        seed: Of the draws.
-
-    Returns:
-        T_a_b (4, 4) refined on all pairs that agree, and those pairs (m,) bool; none where nothing was found.
-    """
-    nothing = np.eye(4), np.zeros(len(a), dtype=bool)
-    if len(a) < 3:
-        return nothing
-    triples = np.random.default_rng(seed).integers(0, len(a), (TRIPLES, 3))
-    sides = [(0, 1), (1, 2), (2, 0)]
-    lengths = np.array(
-        [[np.linalg.norm(p[triples[:, i]] - p[triples[:, j]], axis=1) for i, j in sides] for p in (a, b)]
-    )
-    slack = np.array([tolerance[triples[:, i]] + tolerance[triples[:, j]] for i, j in sides])
-    alike = np.all(np.abs(lengths[0] - lengths[1]) < slack, axis=0) & (lengths.min(axis=(0, 1)) > SHORTEST_SIDE)
-    triples = triples[alike][:HYPOTHESES]
-    if len(triples) == 0:
-        return nothing
-    Ts = kabsch(a[triples], b[triples])
-    moved = np.einsum("hij,mj->hmi", Ts[:, :3, :3], b) + Ts[:, None, :3, 3]
-    agreeing = np.linalg.norm(moved - a, axis=-1) < tolerance
-    inliers = agreeing[int(np.argmax(agreeing.sum(axis=1)))]
-    T = np.eye(4)
-    for _ in range(3):
-        if np.count_nonzero(inliers) < 3:
-            return nothing
-        T = kabsch(a[inliers], b[inliers])
-        inliers = np.linalg.norm(b @ T[:3, :3].T + T[:3, 3] - a, axis=1) < tolerance
-    return T, inliers
-
-
-def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
-    a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
-    U, _, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
-    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # no mirror images
-    T = np.zeros((*a.shape[:-2], 4, 4))
-    T[..., :3, :3] = U @ V_t
-    T[..., :3, 3] = (a_mean - b_mean @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
-    T[..., 3, 3] = 1
-    return T
-
-
-def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:
-    """Whether two poses are closer than a distance (m) and an angle (deg)."""
-    if np.linalg.norm(T_a[:3, 3] - T_b[:3, 3]) >= distance:
-        return False
-    return float(np.degrees(se3.rotation_angle(T_a[:3, :3].T @ T_b[:3, :3]))) < angle_deg
 
 
 def _around(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SimilarityConfig
 from dudmap.geometry import se3
-from dudmap.kernels.threads import begun
+from dudmap.kernels.threads import submit
 
 FEWEST = 20
 """With fewer features than this in a frame nothing can be said; the frame is taken as new."""
@@ -134,7 +134,7 @@ class RedundantViews:
         if self._untested > 0:
             self._untested -= 1
             return lambda T_world_camera: False
-        test = begun(lambda: self.test.redundant(rgb))
+        test = submit(lambda: self.test.redundant(rgb))
 
         def answer(T_world_camera: NDArray[np.float64]) -> bool:
             redundant = test() and self._near(T_world_camera)

@@ -6,27 +6,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.detector import DynamicDetector, Labels
+from dudmap.dynamics.detector import DynamicDetector
+from dudmap.dynamics.masks import Labels
+from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid, reduced
 from dudmap.mapping.volume import SURFACE, TsdfVolume
-from dudmap.result import Clock
+from dudmap.stage_timer import StageTimer
 from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.time_offset import DepthDelay
-from dudmap.tracking.tracker import Level, Tracker, TrackingResult
+from dudmap.tracking.time_offset import DepthTimeOffset
+from dudmap.tracking.tracker import Tracker, TrackingResult
 
-AS_EXPECTED = 0.02
+UNCHANGED_SHARE = 0.02
 """Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
 
 
 @dataclass(frozen=True, eq=False)
-class Task:
+class RegistrationInput:
     """What is to be registered.
 
     Attributes:
         timestamp: Seconds.
         pyramid: The image.
         known: (H, W) bool, pixels that are known to move from elsewhere; None where nothing is.
-        unproven: (h, w) bool, at the size of the labels, what nothing shows to rest while a crowd moves; or None.
+        unverified_mask: (h, w) bool, label resolution, pixels not verified as static while a crowd moves; or None.
         blind: The image shows nothing; the distances alone have to give the pose.
         clock: Takes the time of the stages.
     """
@@ -34,12 +36,12 @@ class Task:
     timestamp: float
     pyramid: Pyramid
     known: NDArray[np.bool_] | None
-    unproven: NDArray[np.bool_] | None
+    unverified_mask: NDArray[np.bool_] | None
     blind: bool
-    clock: Clock
+    clock: StageTimer
 
 
-class Registration:
+class FrontEnd:
     """Poses and labels of frames, each of which needs the other.
 
     Args:
@@ -56,11 +58,11 @@ class Registration:
         self.blind_tracker = Tracker(by_distance, config.sensor)
         self.detector = detector
         self.motion = motion
-        self.delay = DepthDelay()
+        self.delay = DepthTimeOffset()
         self.moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame, if anything moved
 
     def register(
-        self, volume: TsdfVolume, task: Task, T_init: NDArray[np.float64]
+        self, volume: TsdfVolume, task: RegistrationInput, T_init: NDArray[np.float64]
     ) -> tuple[TrackingResult, Labels | None]:
         """Pose and labels of a frame against a map, from a first guess (4, 4) of the pose on.
 
@@ -80,23 +82,23 @@ class Registration:
             tracked = tracker.align(volume, levels[:split], T_init, self.expected(levels, unmasked))
         labels = self._detect(volume, task, tracked)
         with clock("track_again"):
-            enough = split < len(levels) and tracked.settled and self._as_expected(labels)
+            enough = split < len(levels) and tracked.settled and self._labels_unchanged(labels)
             first = split if enough else split - 1
-            weights = static_weights(labels, levels[first:], task.unproven)
+            weights = static_weights(labels, levels[first:], task.unverified_mask)
             pose, exposure = tracked.T_world_camera, tracked.exposure
             tracked = tracker.align(volume, levels[first:], pose, weights, first_level=first, exposure=exposure)
         if task.blind:
             tracked = replace(tracked, color_residual=np.nan)
         return tracked, labels
 
-    def keep(self, volume: TsdfVolume, task: Task, tracked: TrackingResult, labels: Labels | None) -> None:
+    def keep(self, volume: TsdfVolume, task: RegistrationInput, tracked: TrackingResult, labels: Labels | None) -> None:
         """Take over a frame whose pose is believed: what the next one is judged from."""
         velocity = self.motion.update(task.timestamp, tracked.T_world_camera)
         self.moved = labels.dynamic if labels is not None and labels.dynamic.any() else None
         if labels is None or task.blind:
             return
         coarse = task.pyramid.coarse
-        weights = static_weights(labels, [coarse], task.unproven)[0]
+        weights = static_weights(labels, [coarse], task.unverified_mask)[0]
         self.delay.learn(self.tracker, volume, coarse, tracked.T_world_camera, velocity, weights)
         self.detector.remember(task.pyramid.labelled, tracked.T_world_camera, tracked.exposure, labels)
 
@@ -114,22 +116,22 @@ class Registration:
         weights = [np.float32(1) - np.float32(0.9) * reduced(self.moved, level) for level in levels]
         return weights if unmasked is None else [a * b for a, b in zip(weights, unmasked, strict=True)]
 
-    def _unmasked(self, task: Task) -> list[NDArray[np.float32]] | None:
+    def _unmasked(self, task: RegistrationInput) -> list[NDArray[np.float32]] | None:
         """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
-        masks = [mask for mask in (task.known, self.detector.moving, task.unproven) if mask is not None]
+        masks = [mask for mask in (task.known, self.detector.moving, task.unverified_mask) if mask is not None]
         if not masks:
             return None
         levels = task.pyramid.tracked
         return [(~np.any([reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
 
-    def _as_expected(self, labels: Labels) -> bool:
+    def _labels_unchanged(self, labels: Labels) -> bool:
         """Whether so little of what lies on the map moves other than in the last frame that no coarser level need be
         registered again."""
         changed = labels.dynamic if self.moved is None else labels.dynamic != self.moved
         counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
-        return bool(np.count_nonzero(changed & counted) <= AS_EXPECTED * np.count_nonzero(counted))
+        return bool(np.count_nonzero(changed & counted) <= UNCHANGED_SHARE * np.count_nonzero(counted))
 
-    def _detect(self, volume: TsdfVolume, task: Task, tracked: TrackingResult) -> Labels:
+    def _detect(self, volume: TsdfVolume, task: RegistrationInput, tracked: TrackingResult) -> Labels:
         level = task.pyramid.labelled
         with task.clock("label"):
             T_depth = tracked.T_world_camera
@@ -147,12 +149,12 @@ class Registration:
 
 
 def static_weights(
-    labels: Labels, levels: list[Level], unproven: NDArray[np.bool_] | None = None
+    labels: Labels, levels: list[Level], unverified_mask: NDArray[np.bool_] | None = None
 ) -> list[NDArray[np.float32]]:
     """Weights (h, w) of the second registration at each level: what moves, or may, has none."""
     import cv2
 
-    static = labels.static_probability if unproven is None else labels.static_probability * ~unproven
+    static = labels.static_probability if unverified_mask is None else labels.static_probability * ~unverified_mask
     return [
         np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
         for level in levels

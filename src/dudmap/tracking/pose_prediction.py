@@ -7,20 +7,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.ego_motion import DominantMotion, Parallax, several
-from dudmap.frames.pyramid import Pyramid, mostly
+from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, exceeds_noise_share
+from dudmap.frames.observation import Level
+from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.geometry import se3
-from dudmap.mapping.volume import FREE, NOTHING, TsdfVolume
-from dudmap.result import Clock
-from dudmap.tracking.front_end import Registration
-from dudmap.tracking.tracker import Level
+from dudmap.mapping.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.stage_timer import StageTimer
+from dudmap.tracking.front_end import FrontEnd
 
 CLEARLY = 0.95
 """A pose explains an image clearly better than another if its cost is below this share of the other's."""
 
 
 @dataclass(frozen=True, eq=False)
-class Guess:
+class PosePrediction:
     """What is expected of a frame.
 
     Attributes:
@@ -34,7 +34,7 @@ class Guess:
     moving_before: NDArray[np.bool_] | None = None
 
 
-class FirstGuess:
+class PosePredictor:
     """Expects that the camera goes on as it did, and while the map is young, or movers hide most of the view, looks.
 
     Args:
@@ -44,15 +44,15 @@ class FirstGuess:
 
     Attributes:
         parallax: Compares images.
-        unproven: (h, w) bool, what nothing shows to rest, while a crowd moves; else None.
+        unverified_mask: (h, w) bool, what nothing shows to rest, while a crowd moves; else None.
     """
 
     def __init__(
-        self, config: Config, registration: Registration, seen: Mapping[float, NDArray[np.float64]] | None = None
+        self, config: Config, registration: FrontEnd, seen: Mapping[float, NDArray[np.float64]] | None = None
     ) -> None:
         self.registration = registration
-        self.parallax = Parallax(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
-        self.unproven: NDArray[np.bool_] | None = None
+        self.parallax = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
+        self.unverified_mask: NDArray[np.bool_] | None = None
         self._seen = seen or {}
         self._alone = False  # the map was made of one image, and nothing has shown what moves in it
         self._crowd = False  # most of the view has moved from the first frame on
@@ -62,35 +62,35 @@ class FirstGuess:
         self.parallax.start(timestamp)
         self._alone = self._crowd = True
 
-    def expect(self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume, clock: Clock) -> Guess:
+    def predict(self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume, clock: StageTimer) -> PosePrediction:
         """First guess for a frame that is to be registered to a map."""
         if self._seen and not self.parallax.started:  # a second pass
             self.parallax.start(timestamp)
         T_expected = self._seen.get(timestamp, self.registration.motion.predict(timestamp))
-        self.unproven = None
+        self.unverified_mask = None
         if not self.parallax.active:
-            return Guess(T_expected)
+            return PosePrediction(T_expected)
         with clock("parallax"):
             seen = self.see(timestamp, pyramid, volume)
             if seen is None:
-                return Guess(T_expected)
+                return PosePrediction(T_expected)
             motion, T_seen = seen
             moving_before = motion.moving_before if self._alone else None
             if timestamp in self._seen:
                 T_seen = T_expected
             elif not self._alone and self.fits_better(volume, T_expected, T_seen, pyramid.coarse):
-                return Guess(T_expected)  # what most corners follow is not the static world
+                return PosePrediction(T_expected)  # what most corners follow is not the static world
             self._alone = False
             moving, small = motion.moving_after, pyramid.labelled
-            if not several(moving, small):  # else something slow hardly drags the camera on its own
+            if not exceeds_noise_share(moving, small):  # else something slow hardly drags the camera on its own
                 surface = self.registration.detector.pieces(small, volume)
                 moving = moving | self.parallax.slow(timestamp, T_seen, pyramid, surface)
-            self._crowd = self._crowd and self.parallax.young(timestamp) and mostly(moving, small)
+            self._crowd = self._crowd and self.parallax.young(timestamp) and is_majority_dynamic(moving, small)
             if self._crowd:
-                self.unproven = ~motion.resting_after
+                self.unverified_mask = ~motion.resting_after
             if not self.parallax.young(timestamp):  # elsewhere the map knows better what moves
-                moving = moving & (_place(volume, small, T_seen) == NOTHING)
-            return Guess(T_seen, moving, moving_before)
+                moving = moving & (_place(volume, small, T_seen) == UNKNOWN)
+            return PosePrediction(T_seen, moving, moving_before)
 
     def see(
         self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume
@@ -120,6 +120,6 @@ class FirstGuess:
 
 
 def _place(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """What a map knows of the points of an image (h, w): SURFACE, FREE or NOTHING."""
+    """What a map knows of the points of an image (h, w): SURFACE, FREE or UNKNOWN."""
     volume.look_at(T_world_camera)
     return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).place

@@ -16,7 +16,7 @@ UNUSUAL_RESIDUAL, UNUSUAL_COLOR = 1.5, 1.8
 """A registration whose residuals, or intensity differences, are more than this times the usual ones may be wrong."""
 
 
-class TrackingHealth:
+class QualityMonitor:
     """Compares a registration's residuals and share of readings on the map with the recent ones.
 
     A registration that slid into a wrong minimum explains the frame much worse than its predecessors were explained,
@@ -30,7 +30,7 @@ class TrackingHealth:
         self._colors: deque[float] = deque(maxlen=MEMORY)
         self.recovering = False
 
-    def doubt(self, tracked: TrackingResult, *, recognised: bool = False, crowded: bool = False) -> str:
+    def rejection_reason(self, tracked: TrackingResult, *, recognised: bool = False, crowded: bool = False) -> str:
         """Sentence on what is much worse than before, empty if nothing is.
 
         Args:

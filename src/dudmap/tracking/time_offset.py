@@ -3,9 +3,11 @@
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.observation import Level
+from dudmap.geometry.se3 import retract
 from dudmap.kernels.median import median
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.tracker import Level, Tracker, moved
+from dudmap.tracking.tracker import Tracker
 
 USUAL, LONGEST = 0.015, 0.06
 """Standard deviation of the delays of sensors before anything is known, and the longest, seconds."""
@@ -19,7 +21,7 @@ LARGEST = 6.0
 """Faster motion, metres per second, is no motion but a wrong pose, or a camera that was set down elsewhere."""
 
 
-class DepthDelay:
+class DepthTimeOffset:
     """The delay of the depth against the pose that depth and colour have together.
 
     No pose fits both images of a moving camera if they are taken milliseconds apart: a hand at half a metre per second
@@ -49,7 +51,7 @@ class DepthDelay:
         twist, speed = _seen_motion(level, T_world_camera, velocity)
         if speed >= LARGEST or abs(self.seconds) * speed < NOISE:
             return T_world_camera
-        return moved(T_world_camera, self.seconds * twist)
+        return retract(T_world_camera, self.seconds * twist)
 
     def learn(
         self,
@@ -73,7 +75,7 @@ class DepthDelay:
         if not 0 < speed < LARGEST:
             return
         variance = ALIKE * (tracker.sensor.sigma_base + tracker.sensor.sigma_scale) ** 2
-        T_depth = moved(T_world_camera, self.seconds * twist)
+        T_depth = retract(T_world_camera, self.seconds * twist)
         system = tracker.linearize(volume, level, T_depth, weights, color_weight=0.0)
         information = float(twist @ system.H @ twist) / variance
         evidence = information * self.seconds - float(twist @ system.b) / variance

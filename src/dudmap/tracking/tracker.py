@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.frames.exposure import chained, exposed, fit_exposure
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
 from dudmap.kernels import registration
 from dudmap.kernels.median import median
 from dudmap.kernels.threads import bands, run_bands
@@ -21,15 +22,6 @@ SHORT = 4
 """Only steps shorter than this many times that end a level by how little they gain."""
 EXPOSURE_NOISE = 0.01
 """Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
-
-    camera: Camera
-    depth: NDArray[np.float32]
-    intensity: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -159,7 +151,7 @@ class Tracker:
                 break
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
-            T_trial, length = moved(T, step), np.linalg.norm(step)
+            T_trial, length = se3.retract(T, step), np.linalg.norm(step)
             if length < stop:  # known to be small before it is tried: take it and be done
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
@@ -200,7 +192,7 @@ class Tracker:
         ranges = bands(height, -(-PIXELS_PER_BAND // width))
         sums = np.zeros((len(ranges), registration.NUM_SUMS))
         residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
-        T = window.lattice(T_world_camera)
+        T = window.T_grid_camera(T_world_camera)
         run_bands(
             lambda start, stop, out: registration.linearize(
                 start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window.cells, window.shape,
@@ -243,58 +235,3 @@ class Tracker:
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
         return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
-
-
-def moved(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pose after a twist (v, omega) about the camera's centre, world axes."""
-    out = T_world_camera.copy()
-    out[:3, :3] = se3.exp_rotation(step[3:]) @ T_world_camera[:3, :3]
-    out[:3, 3] += step[:3]
-    return out
-
-
-def exposed(level: Level, exposure: tuple[float, float]) -> Level:
-    """Level with gain and offset applied to its intensities."""
-    gain, offset = exposure
-    if (gain, offset) == (1.0, 0.0):
-        return level
-    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
-
-
-def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
-    """Gain and offset of one exposure after another."""
-    return then[0] * first[0], then[0] * first[1] + then[1]
-
-
-def fit_exposure(
-    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
-) -> tuple[float, float]:
-    """Gain and offset with ``gain * intensity + offset`` nearest to the map's intensities, robustly.
-
-    Auto-exposure changes all intensities at once; unexplained, such a change looks like motion.
-
-    Args:
-        intensity: (h, w) float32 of the image.
-        difference: (h, w) float32 map minus image, NaN off the map.
-        weights: (h, w) float32 static weights.
-    """
-    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
-    if len(used) < 100:
-        return 1.0, 0.0
-    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
-    x = intensity.reshape(-1)[used].astype(np.float64)
-    y = x + difference.reshape(-1)[used]
-    gain, offset = 1.0, float(median(y - x))
-    for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
-        error = y - gain * x - offset
-        scale = max(1.5 * float(median(np.abs(error))), 0.01)
-        w = 1 / (1 + (error / scale) ** 2)
-        total = w.sum()
-        # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
-        prior = 0.1 * total * 0.04
-        x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
-        variance = (w * (x - x_mean) ** 2).sum() + prior
-        covariance = (w * (x - x_mean) * (y - y_mean)).sum() + prior
-        gain = float(np.clip(covariance / variance, 0.5, 2.0))
-        offset = float(y_mean - gain * x_mean)
-    return gain, offset

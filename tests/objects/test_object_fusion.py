@@ -8,17 +8,18 @@ from scipy.optimize import least_squares
 
 import dudmap.synthetic
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.frames.preprocess import Preprocessor, pyramid
+from dudmap.frames.observation import Level
+from dudmap.frames.preprocess import Preprocessor
+from dudmap.frames.pyramid import halved
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.objects.object_fusion import RigidFusion
-from dudmap.objects.object_map import Body, BodyVolume
+from dudmap.objects.object_fusion import ObjectFusion
+from dudmap.objects.object_map import ObjectVolume, RigidObject
 from dudmap.objects.object_tracker import Mover
 from dudmap.pipeline.run import run
 from dudmap.slam import Slam
-from dudmap.tracking.tracker import Level
 
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 ON = Config().override(["movers.meshes=true"])
@@ -26,13 +27,13 @@ ON = Config().override(["movers.meshes=true"])
 
 def fused(sequence, frames):
     """All bodies of some frames, with the true poses and the true masks of the movers, by the movers' numbers."""
-    fusion, preprocess, last = RigidFusion(ON), Preprocessor(sequence.camera), {}
+    fusion, preprocess, last = ObjectFusion(ON), Preprocessor(sequence.camera), {}
     poses = {}
     for i in frames:
         observation = preprocess(sequence[i])
         T = sequence.ground_truth.Ts_world_camera[i]
         poses[observation.timestamp] = T
-        depth, intensity = pyramid(observation, 1)
+        depth, intensity = halved(observation, 1)
         level = Level(sequence.camera.scaled(1), depth, intensity)
         numbers = sequence.mover_numbers(i)[1::2, 1::2]
         movers = []
@@ -72,12 +73,12 @@ def errors(body, mover, T_world):
 
 
 def test_the_window_stays_with_the_body_and_is_small():
-    volume = BodyVolume(SMALL, VolumeConfig(voxel_size=0.005), SensorConfig(), 6.0)
+    volume = ObjectVolume(SMALL, VolumeConfig(voxel_size=0.005), SensorConfig(), 6.0)
     T = np.eye(4)
     T[:3, 3] = 0, 0, -3
     volume.look_at(T)
     half = volume.window.shape * volume.block_size / 2
-    origin = volume.window.lattice(np.eye(4))[:, 3] * volume.voxel_size
+    origin = volume.window.T_grid_camera(np.eye(4))[:, 3] * volume.voxel_size
     np.testing.assert_allclose(origin, half, atol=2 * volume.block_size)
     assert (half > 1.0).all()
     assert volume.window.cells.nbytes < 4e6
@@ -161,7 +162,7 @@ def test_run_writes_meshes_of_rigid_movers(tmp_path):
         number = rigid[0]["id"]
         assert sorted(path.name for path in (out / "movers").iterdir()) == [f"{number}.ply", f"{number}.txt"]
         mesh, path = Mesh.load(out / "movers" / f"{number}.ply"), Trajectory.load(out / "movers" / f"{number}.txt")
-        body = Body(number, True, "", rigid[0]["frames"], mesh, path)
+        body = RigidObject(number, True, "", rigid[0]["frames"], mesh, path)
         shape, way = errors(body, sequence._movers[0], sequence.ground_truth.Ts_world_camera[0])
         assert np.median(shape) < 0.004
         assert np.percentile(shape, 90) < 0.02

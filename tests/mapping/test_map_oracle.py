@@ -14,17 +14,7 @@ from dudmap.mapping.integrator import reading_weights
 from dudmap.mapping.volume import FREE, TsdfVolume
 from dudmap.mapping.voxel_blocks import FULLEST
 from oracle import fuse, trilinear
-
-CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
-CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant", carve_rate=1)
-
-
-def wall(distance: float, seed: int = 0, bump: float = 0.1) -> Frame:
-    """A wavy wall in front of the camera with random colours."""
-    rng = np.random.default_rng(seed)
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    depth = distance + bump * np.sin(u / 9.0) * np.cos(v / 7.0)
-    return Frame(float(seed), depth.astype(np.float32), rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8))
+from wavy_wall import CAMERA, CONSTANT, wall
 
 
 def poses(count: int) -> list[np.ndarray]:

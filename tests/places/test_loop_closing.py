@@ -16,8 +16,8 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.run import run
 from dudmap.places.atlas import Atlas, at_time
-from dudmap.places.frame_store import History
-from dudmap.places.place_recognition import Keyframe, Keyframes, PlacedFeatures
+from dudmap.places.frame_store import FrameStore
+from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
 
@@ -45,8 +45,8 @@ def wall(timestamp):
 
 def made_up_atlas(submaps):
     """An atlas with one frame a second at x = the time, all kept, in the submaps given."""
-    keyframes = Keyframes(RelocalizationConfig(), TINY)
-    atlas = Atlas(lambda: TsdfVolume(TINY), keyframes, History(TINY, gap=1))
+    keyframes = KeyframeDatabase(RelocalizationConfig(), TINY)
+    atlas = Atlas(lambda: TsdfVolume(TINY), keyframes, FrameStore(TINY, gap=1))
     everything = np.ones((60, 80), dtype=bool)
     for second, submap in enumerate(submaps):
         if submap not in atlas.volumes:
@@ -73,7 +73,7 @@ def test_everything_moves_along_with_a_correction():
     assert [round(known.T_world_camera[1, 3], 6) for known in atlas.keyframes.keyframes] == [0, 0.02, 0.04]
     np.testing.assert_allclose(atlas.history.Ts_world_camera, Ts_new)
     assert atlas.volume is volume_before  # views of the map stay connected
-    assert atlas.volume.born == volume.born
+    assert atlas.volume.map_id == volume.map_id
 
 
 def test_join_brings_one_map_into_the_other():

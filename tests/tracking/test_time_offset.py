@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 
 from dudmap.config import TrackerConfig
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.time_offset import LONGEST, DepthDelay
-from dudmap.tracking.tracker import Level, Tracker
-from test_registration_oracle import CAMERA, SENSOR, corner, corner_map, level_of, ones
+from dudmap.tracking.time_offset import LONGEST, DepthTimeOffset
+from dudmap.tracking.tracker import Tracker
+from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 FPS = 30.0
 
@@ -23,9 +24,9 @@ def swing(time: float) -> np.ndarray:
     return np.array([0.04, -0.03, 0.02, 0.02, -0.02, 0.01]) * np.sin(12 * time)
 
 
-def learnt(volume: TsdfVolume, delay: float, spoil=None, frames: int = 20) -> tuple[DepthDelay, list[np.ndarray]]:
+def learnt(volume: TsdfVolume, delay: float, spoil=None, frames: int = 20) -> tuple[DepthTimeOffset, list[np.ndarray]]:
     """What is learnt from frames whose depth is of ``delay`` seconds later, and how far off the poses are, twists."""
-    tracker, found, errors = Tracker(TrackerConfig(), SENSOR), DepthDelay(), []
+    tracker, found, errors = Tracker(TrackerConfig(), SENSOR), DepthTimeOffset(), []
     before = se3.exp(swing(0))
     for number in range(1, frames):
         time = number / FPS
@@ -68,7 +69,7 @@ def test_what_moves_on_its_own_is_no_delay(volume):
 
 
 def test_a_camera_at_rest_and_a_wrong_pose_teach_nothing(volume):
-    tracker, found, level = Tracker(TrackerConfig(), SENSOR), DepthDelay(), level_of(corner())
+    tracker, found, level = Tracker(TrackerConfig(), SENSOR), DepthTimeOffset(), level_of(corner())
     volume.look_at(np.eye(4))
     nothing = Level(CAMERA, np.zeros_like(level.depth), level.intensity)
     for seen, velocity in ((level, np.zeros(6)), (level, np.full(6, 50.0)), (nothing, np.ones(6))):

@@ -3,44 +3,18 @@
 import numpy as np
 import pytest
 
-from dudmap.config import SensorConfig, TrackerConfig, VolumeConfig
+from dudmap.config import TrackerConfig, VolumeConfig
+from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.frame import Frame
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.geometry.se3 import retract
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.quality_monitor import TrackingHealth
-from dudmap.tracking.tracker import Level, Tracker, TrackingResult, chained, exposed, fit_exposure, moved
-
-CAMERA = Camera(80.0, 80.0, 39.5, 29.5, 80, 60)
-SENSOR = SensorConfig()
-
-
-def corner(shift: np.ndarray | None = None) -> Frame:
-    """Three walls that meet, with a smooth texture, seen from a camera moved by a twist."""
-    T = np.eye(4) if shift is None else se3.exp(shift)
-    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
-    normals = np.array([[0.75, 0.1, 0.65], [-0.65, 0.15, 0.75], [0.05, 0.8, 0.6]])
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    t = (np.array([1.3, 1.35, 1.25]) - normals @ T[:3, 3]) / (rays @ normals.T)
-    t = np.where(t > 0, t, np.inf).min(axis=-1)
-    points = rays * t[..., None] + T[:3, 3]
-    shade = 0.5 + 0.2 * np.sin(points[..., 0] * 9) * np.cos(points[..., 1] * 8) + 0.15 * np.sin(points[..., 2] * 7)
-    gray = np.clip(255 * shade, 0, 255).astype(np.uint8)
-    return Frame(0.0, t.astype(np.float32), np.repeat(gray[..., None], 3, axis=2))
-
-
-def level_of(frame: Frame) -> Level:
-    return Level(CAMERA, frame.depth, frame.color[..., 0].astype(np.float32) / 255)
-
-
-def corner_map() -> TsdfVolume:
-    """The corner after three frames from where it is known."""
-    volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
-    for _ in range(3):
-        volume.integrate(corner(), np.eye(4))
-    return volume
+from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.tracker import Tracker, TrackingResult
+from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +22,12 @@ def volume() -> TsdfVolume:
     return corner_map()
 
 
-def ones(level: Level) -> np.ndarray:
-    return np.ones_like(level.depth)
-
-
 def interior(tracker: Tracker, volume: TsdfVolume, level: Level, T: np.ndarray, reach: float) -> np.ndarray:
     """Weights of the pixels that stay on the map for all small steps."""
     valid = np.isfinite(tracker.linearize(volume, level, T, ones(level)).residuals[1])
     for axis in range(6):
         for sign in (-1, 1):
-            T_near = moved(T, sign * reach * np.eye(6)[axis])
+            T_near = retract(T, sign * reach * np.eye(6)[axis])
             valid &= np.isfinite(tracker.linearize(volume, level, T_near, ones(level)).residuals[1])
     return valid.astype(np.float32)
 
@@ -67,15 +37,15 @@ def interior(tracker: Tracker, volume: TsdfVolume, level: Level, T: np.ndarray, 
 def test_the_gradient_is_that_of_the_cost(volume, robust, noisy):
     config = TrackerConfig(robust=robust, huber=0.02, tukey=0.2, color_weight=0.3, noise_weighting=noisy)
     tracker, level = Tracker(config, SENSOR), level_of(corner())
-    T = moved(np.eye(4), np.array([0.006, -0.004, 0.005, 0.004, 0.003, -0.004]))
+    T = retract(np.eye(4), np.array([0.006, -0.004, 0.005, 0.004, 0.003, -0.004]))
     step = 5e-5
     weights = interior(tracker, volume, level, T, 2 * step)
     assert weights.mean() > 0.5
     b = tracker.linearize(volume, level, T, weights).b
     numerical = np.zeros(6)
     for axis in range(6):
-        ahead = tracker.linearize(volume, level, moved(T, step * np.eye(6)[axis]), weights).cost
-        back = tracker.linearize(volume, level, moved(T, -step * np.eye(6)[axis]), weights).cost
+        ahead = tracker.linearize(volume, level, retract(T, step * np.eye(6)[axis]), weights).cost
+        back = tracker.linearize(volume, level, retract(T, -step * np.eye(6)[axis]), weights).cost
         numerical[axis] = (ahead - back) / (2 * step)
     assert np.linalg.norm(b - numerical) < 0.05 * np.linalg.norm(numerical)
 
@@ -84,15 +54,15 @@ def test_normal_equations_equal_a_plain_sum_over_pixels(volume):
     """H and b rebuilt from numerically differentiated residuals of every pixel, with quadratic cost."""
     config = TrackerConfig(huber=10.0, color_huber=10.0, color_weight=0.3, noise_weighting=False)
     tracker, level = Tracker(config, SENSOR), level_of(corner())
-    T = moved(np.eye(4), np.array([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]))
+    T = retract(np.eye(4), np.array([0.003, 0.002, -0.004, 0.002, -0.001, 0.003]))
     step = 1e-4
     weights = interior(tracker, volume, level, T, 2 * step)
     system = tracker.linearize(volume, level, T, weights)
     r = system.residuals[:, weights > 0].astype(np.float64)
     J = np.empty((*r.shape, 6))
     for axis in range(6):
-        ahead = tracker.linearize(volume, level, moved(T, step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
-        back = tracker.linearize(volume, level, moved(T, -step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
+        ahead = tracker.linearize(volume, level, retract(T, step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
+        back = tracker.linearize(volume, level, retract(T, -step * np.eye(6)[axis]), weights).residuals[:, weights > 0]
         J[..., axis] = (ahead.astype(np.float64) - back) / (2 * step)
     scale = np.array([1.0, 0.3])[:, None]
     H = np.einsum("cn,cni,cnj->ij", np.broadcast_to(scale, r.shape), J, J)
@@ -207,14 +177,14 @@ def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
     def result(residual: float, share: float) -> TrackingResult:
         return TrackingResult(np.eye(4), (1.0, 0.0), True, "", share, residual, 0.1, 3)
 
-    health = TrackingHealth()
+    health = QualityMonitor()
     for _ in range(10):
-        assert health.doubt(result(0.001, 0.9)) == ""
+        assert health.rejection_reason(result(0.001, 0.9)) == ""
         health.tracked(result(0.001, 0.9))
-    assert health.doubt(result(0.0025, 0.9)) == ""
-    assert "off the map" in health.doubt(result(0.006, 0.9))
+    assert health.rejection_reason(result(0.0025, 0.9)) == ""
+    assert "off the map" in health.rejection_reason(result(0.006, 0.9))
     health.lost()
-    assert "off the map" in health.doubt(result(0.0025, 0.9))
-    assert "fall on the map" in health.doubt(result(0.001, 0.3))
+    assert "off the map" in health.rejection_reason(result(0.0025, 0.9))
+    assert "fall on the map" in health.rejection_reason(result(0.001, 0.3))
     health.tracked(result(0.001, 0.9))
-    assert health.doubt(result(0.0025, 0.3)) == ""
+    assert health.rejection_reason(result(0.0025, 0.3)) == ""

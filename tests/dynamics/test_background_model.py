@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.background_model import Background
+from dudmap.dynamics.background_model import BackgroundModel
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
-from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 V, U = np.indices(CAMERA.shape)
@@ -27,8 +27,8 @@ def pose(i: int) -> np.ndarray:
     return se3.exp(np.array([0.004, 0.002, 0.001, 0.0005, -0.001, 0.002]) * i)
 
 
-def seen(frames: int) -> Background:
-    background = Background(DynamicsConfig(settle_time=1.0))
+def seen(frames: int) -> BackgroundModel:
+    background = BackgroundModel(DynamicsConfig(settle_time=1.0))
     for i in range(frames):
         background.begin(i / 30)
         assert not background.hidden(wall(pose(i)), pose(i)).any()
@@ -81,7 +81,7 @@ def test_a_seam_is_not_hidden():
 
 
 def test_what_moved_is_no_background():
-    background = Background(DynamicsConfig())
+    background = BackgroundModel(DynamicsConfig())
     for i in range(15):
         background.begin(i / 30)
         background.hidden(wall(pose(i)), pose(i))

@@ -11,12 +11,12 @@ from dudmap.config import Config
 from dudmap.dynamics import ego_motion as parallax
 from dudmap.dynamics.ego_motion import dominant_motion
 from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, projected, rigid_motion
-from dudmap.frames.optical_flow import rests_as_well
+from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
 from dudmap.slam import Slam
-from dudmap.tracking.quality_monitor import TrackingHealth
+from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import TrackingResult
 
 CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
@@ -132,7 +132,7 @@ def test_a_corner_that_could_as_well_rest_is_told_from_one_that_moved():
     second = first.copy()
     second[30:90, 88:140] = first[30:90, 80:132]  # the right half of the middle moved by eight pixels
     pixels = np.array([[30, 60], [60, 40], [110, 60], [100, 50]])
-    rests = rests_as_well(first, second, pixels, pixels.astype(float), np.full(4, 1.0), np.full(4, 0.5))
+    rests = consistent_with_static(first, second, pixels, pixels.astype(float), np.full(4, 1.0), np.full(4, 0.5))
     assert rests.tolist() == [True, True, False, False]
 
 
@@ -142,7 +142,7 @@ def test_images_without_corners_tell_nothing(crowd):
 
 
 def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd):
-    known, before, after = parallax.Parallax(1.0), image(crowd, 6), image(crowd, 7)
+    known, before, after = parallax.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
     assert known.compare(0.0, *before) is None
     known.remember(0.0, np.eye(4), *before)
@@ -236,13 +236,13 @@ def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
 
 def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
     good = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.002, 0.01, 3, 0.01)
-    health = TrackingHealth()
+    health = QualityMonitor()
     for _ in range(6):
         health.tracked(good)
     dragged = replace(good, residual=0.0045)
-    assert not health.doubt(dragged)
-    assert "4.5 mm" in health.doubt(dragged, crowded=True)
-    assert not health.doubt(replace(good, residual=0.0035), crowded=True)
+    assert not health.rejection_reason(dragged)
+    assert "4.5 mm" in health.rejection_reason(dragged, crowded=True)
+    assert not health.rejection_reason(replace(good, residual=0.0035), crowded=True)
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

@@ -1,14 +1,15 @@
-"""Pieces of surface: how images are cut, what stands still, and whole slow, starting and stopping things."""
+"""Segmentation of surface: how images are cut, what stands still, and whole slow, starting and stopping things."""
 
 import numpy as np
 import pytest
 
 from dudmap import synthetic
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics import segments as surfaces
+from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment, split
+from dudmap.dynamics.temporal_memory import BODY, MOVED, TemporalMemory
+from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
-from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
@@ -33,8 +34,8 @@ def large(surface):
 
 def test_a_hollow_cuts_and_a_ridge_does_not():
     left, right = plane([-1, 0, 1], [0, 0, 2]), plane([1, 0, 1], [0, 0, 2])
-    assert len(large(surfaces.pieces(level(np.maximum(left, right)), TOLERANCE))) == 1  # the ridge faces the camera
-    hollow = surfaces.pieces(level(np.minimum(left, right)), TOLERANCE)
+    assert len(large(segment(level(np.maximum(left, right)), TOLERANCE))) == 1  # the ridge faces the camera
+    hollow = segment(level(np.minimum(left, right)), TOLERANCE)
     # every reading belongs to a piece, and the seam lies in the hollow
     assert len(large(hollow)) == 2
     assert (hollow.labels > 0).mean() > 0.99
@@ -46,26 +47,26 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
     """Two boards 5 cm apart are two pieces, although a slanted floor has larger steps between its pixels."""
     depth = np.full(CAMERA.shape, 2.0)
     depth[:, 80:] = 2.05
-    boards = surfaces.pieces(level(depth), TOLERANCE).labels
+    boards = segment(level(depth), TOLERANCE).labels
     assert np.all(boards[:, :75] == boards[60, 20])
     assert np.all(boards[:, 85:] == boards[60, 140])
     assert boards[60, 20] != boards[60, 140]
     floor = plane([0, 1, 0.1], [0, 0.6, 0])
     floor[(floor <= 0) | (floor > 4)] = 0
     assert np.abs(np.diff(floor[70:], axis=0)).max() > 0.05
-    assert len(large(surfaces.pieces(level(floor), TOLERANCE))) == 1
+    assert len(large(segment(level(floor), TOLERANCE))) == 1
 
 
 def test_pieces_that_met_are_split_by_what_they_were():
-    whole = surfaces.pieces(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
+    whole = segment(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
     body = np.zeros(CAMERA.shape, bool)
-    assert surfaces.split(whole, body) is whole
+    assert split(whole, body) is whole
     body[:, :60] = True
-    two = surfaces.split(whole, body)
+    two = split(whole, body)
     assert two.count == whole.count + 1
     assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
     body[:, 6:60] = False  # a strip that came into view
-    assert surfaces.split(whole, body) is whole
+    assert split(whole, body) is whole
 
 
 def scene(x):
@@ -80,11 +81,11 @@ def scene(x):
 
 @pytest.mark.parametrize(("speed", "stands"), [(0.0, True), (0.05, False)])
 def test_what_stood_still_for_the_settle_time_stands(speed, stands):
-    memory = surfaces.StandStill(DynamicsConfig(settle_time=1.0))
+    memory = TemporalMemory(DynamicsConfig(settle_time=1.0))
     sigma = np.full(CAMERA.shape, 0.01, np.float32)
     for i in range(35):
         image, board = scene(speed * i / 30)
-        surface = surfaces.pieces(image, TOLERANCE)
+        surface = segment(image, TOLERANCE)
         memory.begin(i / 30)
         still = memory.standing(image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
@@ -94,7 +95,7 @@ def test_what_stood_still_for_the_settle_time_stands(speed, stands):
         marks = memory.marks(image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
-        assert (marks[inner] == surfaces.MOVED | surfaces.BODY).mean() > 0.9
+        assert (marks[inner] == MOVED | BODY).mean() > 0.9
     assert (still[board].mean() > 0.9) == stands
     memory.forget()
     assert not memory.standing(image, np.eye(4), surface, sigma, board).any()
@@ -102,7 +103,7 @@ def test_what_stood_still_for_the_settle_time_stands(speed, stands):
 
 def test_single_frames_tell_who_stands_where_they_saw_farther():
     """A board that walks through a room, seen by a camera that walks too, against where both are."""
-    memory = surfaces.StandStill(DynamicsConfig())
+    memory = TemporalMemory(DynamicsConfig())
     noise = np.full(CAMERA.shape, 0.1, np.float32)
     v, u = np.indices(CAMERA.shape)
 
@@ -129,8 +130,8 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
     wall = ~board & (u > 8) & (u < 150) & (X < -0.6)  # never hidden
     assert rested[wall].mean() > 0.95
     # another pass over the same frames knows also what comes later
-    again = surfaces.StandStill(DynamicsConfig())
-    again.know(
+    again = TemporalMemory(DynamicsConfig())
+    again.import_from(
         memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
     )
     again.begin(0.0)
@@ -197,8 +198,8 @@ def test_a_thing_that_stops_becomes_map_after_the_settle_time():
 def test_a_thing_does_not_move_by_halves(moved, mismatch, whole):
     """Half of a piece goes on moving: so does all of it, if the rest fits less well than what rests usually does."""
     one, many = np.array([0.0, 500.0]), np.array([0.0, 20000.0])
-    verdict = surfaces.Verdict(
+    verdict = SegmentEvidence(
         size=np.append(one, many[1]), known=np.ones(3), moving=np.array([0, 0.5, 0]), rest=np.array([0, 250.0, 20000]),
         shift=np.array([0, 0.3, 0.1]), mismatch=np.array([0, mismatch, 0.05]), texture=np.array([0, 0.07, 0.07]),
     )  # fmt: skip
-    assert surfaces.moves_as_a_whole(verdict, np.array([0, moved, 0])).tolist() == [False, whole, False]
+    assert classify_segments(verdict, np.array([0, moved, 0])).tolist() == [False, whole, False]

@@ -13,7 +13,7 @@ from dudmap.sequences import Sequence, open_sequence
 from dudmap.sequences.tum import TumSequence
 from recordings import HEIGHT, WIDTH, color_image, cut, depth_image, write_recording
 
-EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
+EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 
 
 @pytest.fixture

@@ -8,9 +8,10 @@ from dudmap.config import RelocalizationConfig
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.geometry import se3
+from dudmap.geometry.alignment import agree, kabsch, rigid_ransac
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.places.place_recognition import Keyframes, agree, kabsch, matches, rigid_ransac
+from dudmap.places.place_recognition import KeyframeDatabase, matches
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
 
@@ -84,7 +85,7 @@ def room():
 
 
 def keyframes_of(room, **config):
-    out = Keyframes(RelocalizationConfig(keyframe_gap=0, **config), SMALL)
+    out = KeyframeDatabase(RelocalizationConfig(keyframe_gap=0, **config), SMALL)
     return out, [out.add(observation, T) for observation, T in room]
 
 
@@ -94,7 +95,9 @@ def test_keyframes_are_made_where_the_camera_has_not_been(room):
     assert 2 <= len(known.keyframes) < len(room)
     observation, T = room[0]
     assert not known.add(observation, T)
-    patient = Keyframes(RelocalizationConfig(keyframe_gap=3, keyframe_distance=1e-6, keyframe_angle_deg=1e-6), SMALL)
+    patient = KeyframeDatabase(
+        RelocalizationConfig(keyframe_gap=3, keyframe_distance=1e-6, keyframe_angle_deg=1e-6), SMALL
+    )
     assert [patient.add(observation, T @ se3.exp(np.full(6, 0.01 * i))) for i in range(9)] == [
         True, False, False, False, True, False, False, False, True
     ]  # fmt: skip
@@ -135,16 +138,16 @@ def test_an_unknown_or_empty_view_is_not_recognised(room):
     nothing = np.zeros(SMALL.shape, np.float32)
     assert known.find(prepare(Frame(0.0, nothing, np.zeros((*SMALL.shape, 3), np.uint8)))) == []
     assert known.find(prepare(Frame(0.0, nothing, room[0][0].rgb))) == []
-    assert Keyframes(RelocalizationConfig(), SMALL).find(room[0][0]) == []
+    assert KeyframeDatabase(RelocalizationConfig(), SMALL).find(room[0][0]) == []
 
 
 def test_moving_pixels_give_no_features(room):
     observation, T = room[0]
     static = np.zeros(SMALL.shape, dtype=bool)
-    known = Keyframes(RelocalizationConfig(), SMALL)
+    known = KeyframeDatabase(RelocalizationConfig(), SMALL)
     assert not known.add(observation, T, static)
     static[:, :160] = True
-    known = Keyframes(RelocalizationConfig(), SMALL)
+    known = KeyframeDatabase(RelocalizationConfig(), SMALL)
     assert known.add(observation, T, static)
     u = SMALL.project(known.keyframes[0].features.points)[:, 0]
     assert u.max() < 160

@@ -17,7 +17,7 @@ from dudmap.sequences import open_sequence
 from dudmap.sequences.masks import MaskFolder
 from dudmap.slam import Slam
 
-EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
+EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 CAMERA = Camera(fx=80, fy=80, cx=31.5, cy=23.5, width=64, height=48)
 
 

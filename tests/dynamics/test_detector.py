@@ -9,7 +9,7 @@ import pytest
 from dudmap import synthetic
 from dudmap.benchmark.systems import systems
 from dudmap.config import Config
-from dudmap.dynamics.detector import BINS, LARGEST, Mixture, fit_mixture
+from dudmap.dynamics.mixture import BINS, LARGEST, Mixture, fit_mixture
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling

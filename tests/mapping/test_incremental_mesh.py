@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from dudmap.geometry import se3
-from dudmap.mapping.incremental_mesh import EDGE, LiveMesh
+from dudmap.mapping.incremental_mesh import EDGE, IncrementalMesh
 from dudmap.mapping.volume import TsdfVolume
-from test_map_oracle import CAMERA, CONSTANT, wall
+from wavy_wall import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1})
 
@@ -35,7 +35,7 @@ def volume():
 
 
 def test_it_equals_the_full_extraction_after_every_frame(volume):
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     for number, angle in enumerate((0, 3, -40, 40, 40)):
         volume.integrate(wall(1.5 + 0.02 * number, number), turned(angle))
         live.update()
@@ -44,7 +44,7 @@ def test_it_equals_the_full_extraction_after_every_frame(volume):
 
 
 def test_several_frames_may_pass_between_updates(volume):
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     volume.integrate(wall(1.5), turned(0))
     live.update()
     for number in range(3):
@@ -55,7 +55,7 @@ def test_several_frames_may_pass_between_updates(volume):
 
 def test_only_what_was_written_is_extracted_again():
     volume = TsdfVolume(CAMERA, CONFIG.model_copy(update={"voxel_size": 0.0125}), depth_max=4.0)
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     for angle in (0, 90, 180):
         volume.integrate(wall(1.5), turned(angle))
     live.update()
@@ -75,7 +75,7 @@ def test_only_what_was_written_is_extracted_again():
 
 def test_blocks_that_give_back_their_voxels_leave_the_mesh():
     volume = TsdfVolume(CAMERA, CONFIG.model_copy(update={"carve_rate": 8, "carving": True}), depth_max=4.0)
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     volume.integrate(wall(1.0), np.eye(4))
     live.update()
     first = set(live.chunks)
@@ -92,7 +92,7 @@ def test_blocks_that_give_back_their_voxels_leave_the_mesh():
 
 def test_slots_that_changed_hands_between_updates(volume):
     """A slot given back and taken again elsewhere leaves its old place without a surface."""
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     volume.integrate(wall(1.5), np.eye(4))
     live.update()
     slots = volume.active_slots
@@ -106,7 +106,7 @@ def test_slots_that_changed_hands_between_updates(volume):
 
 
 def test_an_empty_map_has_an_empty_mesh(volume):
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     assert live.update() == []
     assert len(live.mesh().faces) == 0
 
@@ -115,7 +115,7 @@ def test_a_loaded_map_is_meshed_whole(volume, tmp_path):
     for angle in (0, 60):
         volume.integrate(wall(1.5), turned(angle))
     volume.save(tmp_path / "map.npz")
-    live = LiveMesh(TsdfVolume.load(tmp_path / "map.npz"))
+    live = IncrementalMesh(TsdfVolume.load(tmp_path / "map.npz"))
     live.update()
     np.testing.assert_array_equal(triangles(live.mesh()), triangles(volume.extract_mesh()))
     live._volume.integrate(wall(1.4), turned(60))
@@ -124,7 +124,7 @@ def test_a_loaded_map_is_meshed_whole(volume, tmp_path):
 
 
 def test_a_map_made_anew_is_meshed_anew(volume):
-    live = LiveMesh(volume)
+    live = IncrementalMesh(volume)
     for angle in (0, 60):
         volume.integrate(wall(1.5), turned(angle))
     live.update()

@@ -16,19 +16,6 @@ from dudmap.cli.config import commented
 from dudmap.config import PRESETS, Config
 from dudmap.geometry.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH, cut, write_recording
-from test_run import StandIn
-
-
-@pytest.fixture
-def slam(monkeypatch):
-    """A stand-in for dudmap.slam.Slam; tests set ``slam.script``."""
-    import types
-
-    stand_in = type("Slam", (StandIn,), {"script": {}})
-    module = types.ModuleType("dudmap.slam")
-    module.Slam = stand_in
-    monkeypatch.setitem(sys.modules, "dudmap.slam", module)
-    return stand_in
 
 
 @pytest.fixture

@@ -10,7 +10,7 @@ from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import ConfigError
 
-HERE = Path(__file__).parent
+HERE = Path(__file__).parents[1]
 RECORDED = gate.load_figures(HERE / "gate.toml")
 ENTRIES = {entry.name: entry for entry in gate.gate_entries(HERE / "fixtures")}
 

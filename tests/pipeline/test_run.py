@@ -2,11 +2,6 @@
 
 import csv
 import json
-import sys
-import types
-from dataclasses import dataclass, field
-from types import SimpleNamespace
-from typing import ClassVar
 
 import cv2
 import numpy as np
@@ -19,95 +14,8 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.frame_source import read_ahead
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
+from fake_slam import SECOND, Volume
 from recordings import HEIGHT, WIDTH, cut, write_recording
-
-TRIANGLE = Mesh(
-    np.eye(3, dtype=np.float32),
-    np.array([[0, 1, 2]], np.int32),
-    np.full((3, 3), 9, np.uint8),
-    np.eye(3, dtype=np.float32),
-)
-
-
-@dataclass
-class Result:
-    timestamp: float
-    state: str = "tracked"
-    lost_reason: str = ""
-    T_world_camera: np.ndarray | None = None
-    fused: bool = True
-    skipped_similar: bool = False
-    relocalized: bool = False
-    corrected: bool = False
-    blind: bool = False
-    dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
-    dynamic_share: float = 0.0
-    labels: None = None
-    movers: tuple = ()
-    timings: dict = field(default_factory=lambda: {"track": 2.0})
-
-
-class Volume:
-    num_blocks, num_bytes, is_empty = 3, 12345, False
-
-    def save(self, path):
-        path.write_bytes(b"map")
-
-    def extract_mesh(self):
-        return TRIANGLE
-
-
-SECOND = 1000
-"""Added to a frame number of the script: that frame of a second pass."""
-
-
-class StandIn:
-    """Moves 1 cm per frame along x; ``script`` holds what happens at a frame number."""
-
-    script: ClassVar[dict] = {}
-
-    def __init__(self, camera, config, first_pass=None):
-        self.volume, self.poses, self.frames, self.first_pass = Volume(), [], [], first_pass
-        self.registration = SimpleNamespace(delay=SimpleNamespace(seconds=-0.015))
-
-    @property
-    def trajectory(self):
-        return Trajectory.from_poses(self.poses)
-
-    @property
-    def maps(self):
-        return [(self.trajectory, self.volume)]
-
-    def prepare(self, frame):
-        return frame
-
-    def process(self, frame):
-        index = len(self.frames)
-        self.frames.append(frame)
-        event = self.script.get(index if self.first_pass is None else index + SECOND)
-        if isinstance(event, BaseException):
-            raise event
-        if event == "lost":
-            return Result(frame.timestamp, "lost", "too few inliers", fused=False)
-        T = np.eye(4)
-        T[0, 3] = 0.01 * index
-        self.poses.append((frame.timestamp, T))
-        mask = np.zeros((HEIGHT, WIDTH), bool)
-        mask[:24, :32] = True
-        return Result(
-            frame.timestamp, T_world_camera=T, fused=event != "similar", skipped_similar=event == "similar",
-            dynamic_mask=mask, dynamic_share=0.25,
-        )  # fmt: skip
-
-
-@pytest.fixture
-def slam(monkeypatch):
-    """The stand-in in place of dudmap.slam.Slam; tests set ``slam.script``."""
-    stand_in = type("Slam", (StandIn,), {"script": {}})
-    module = types.ModuleType("dudmap.slam")
-    module.Slam = stand_in
-    monkeypatch.setitem(sys.modules, "dudmap.slam", module)
-    return stand_in
 
 
 @pytest.fixture

@@ -9,7 +9,7 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.frame_store import DEPTH_UNIT, History
+from dudmap.places.frame_store import DEPTH_UNIT, FrameStore
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 
@@ -30,7 +30,7 @@ def smooth_frame(rng, timestamp):
 
 def test_frames_come_back_as_they_were():
     rng = np.random.default_rng(1)
-    history = History(CAMERA, gap=1)
+    history = FrameStore(CAMERA, gap=1)
     frames = [smooth_frame(rng, 0.1 * n) for n in range(7)]
     masks = [rng.random((120, 160)) < 0.7 for _ in frames]
     for n, (frame, mask) in enumerate(zip(frames, masks, strict=True)):
@@ -50,7 +50,7 @@ def test_frames_come_back_as_they_were():
 def test_like_frames_count_towards_the_last_kept_one():
     frame = smooth_frame(np.random.default_rng(2), 0.0)
     everything = np.ones((120, 160), dtype=bool)
-    history = History(CAMERA, distance=0.08, angle_deg=5.0, gap=4)
+    history = FrameStore(CAMERA, distance=0.08, angle_deg=5.0, gap=4)
     kept = [history.add(frame, everything, shifted(x)) for x in (0, 0.05, 0.07, 0.09, 0.09, 0.09, 0.09, 0.09)]
     assert kept == [True, False, False, True, False, False, False, True]
     assert history.counts == [3, 4, 1]
@@ -64,7 +64,7 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("dudmap.places.frame_store.tempfile.TemporaryFile", full)
-    history, frame = History(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
+    history, frame = FrameStore(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
 
     def keep():
         history.add(frame, np.ones((120, 160), dtype=bool), shifted(0))
@@ -80,7 +80,7 @@ def room():
 
 
 def test_map_built_again_equals_the_map(room):
-    live, history = TsdfVolume(room.camera), History(room.camera, gap=1)
+    live, history = TsdfVolume(room.camera), FrameStore(room.camera, gap=1)
     Ts = room.ground_truth.Ts_world_camera
     everything = np.ones(room.camera.shape, dtype=bool)
     for n in range(len(room)):
@@ -98,7 +98,7 @@ def test_map_built_again_equals_the_map(room):
 
 
 def test_poses_and_masks_replace_the_stored_ones(room):
-    history = History(room.camera, gap=1)
+    history = FrameStore(room.camera, gap=1)
     everything = np.ones(room.camera.shape, dtype=bool)
     left = np.zeros_like(everything)
     left[:, :80] = True

@@ -8,12 +8,12 @@ import pytest
 
 import dudmap.synthetic
 from dudmap.config import Config, MoversConfig
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
-from dudmap.objects.object_tracker import MoverTracker
+from dudmap.objects.object_tracker import ObjectTracker
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.slam import Slam
-from dudmap.tracking.tracker import Level
 
 CAMERA = Camera(fx=131, fy=131, cx=79.5, cy=59.5, width=160, height=120)
 RNG = np.random.default_rng(3)
@@ -46,13 +46,13 @@ def joined(*images):
 
 def test_nothing_moves():
     mask, level = board(0.0)
-    assert MoverTracker(MoversConfig()).update(0.0, np.zeros_like(mask), level, np.eye(4)) == []
+    assert ObjectTracker(MoversConfig()).update(0.0, np.zeros_like(mask), level, np.eye(4)) == []
 
 
 def test_place_and_extent_in_the_world():
     mask, level = board(0.3)
     T = se3.exp(np.array([1.0, 2.0, 3.0, 0.0, np.pi / 2, 0.0]))
-    (mover,) = MoverTracker(MoversConfig()).update(0.0, mask, level, T)
+    (mover,) = ObjectTracker(MoversConfig()).update(0.0, mask, level, T)
     there = T[:3, :3] @ [0.3, 0, 2] + T[:3, 3]
     np.testing.assert_allclose(mover.centroid, there, atol=0.01)
     assert mover.points.shape == (mask.sum(), 3)
@@ -66,7 +66,7 @@ def test_place_and_extent_in_the_world():
 @pytest.mark.parametrize("camera_speed", [0.0, 0.5])
 def test_velocity_and_identity(velocity, camera_speed):
     """A board walks sideways while the camera moves too."""
-    tracker = MoverTracker(MoversConfig())
+    tracker = ObjectTracker(MoversConfig())
     for i in range(10):
         t = i / 30
         T = np.eye(4)
@@ -80,7 +80,7 @@ def test_velocity_and_identity(velocity, camera_speed):
 
 def test_velocity_of_a_body_that_enters_the_image():
     """Its visible part grows, so that the centroid moves at half the speed; the surface tells the truth."""
-    tracker = MoverTracker(MoversConfig())
+    tracker = ObjectTracker(MoversConfig())
     for i in range(8):
         mask, level = board(-1.30 + i / 30)
         (mover,) = tracker.update(i / 30, mask, level, np.eye(4))
@@ -89,7 +89,7 @@ def test_velocity_of_a_body_that_enters_the_image():
 
 
 def test_two_bodies_keep_their_numbers():
-    tracker, first = MoverTracker(MoversConfig()), 0
+    tracker, first = ObjectTracker(MoversConfig()), 0
     for i in range(12):
         shift = 0.03 * i
         mask, level = joined(board(-0.8 + shift, z=2.5), board(0.8 - shift, z=2.0, width=0.4))
@@ -102,7 +102,7 @@ def test_two_bodies_keep_their_numbers():
 
 def test_bodies_that_touch_stay_two():
     """Two boards meet at one depth, hang together for a while, and part again; each pixel stays with its board."""
-    tracker = MoverTracker(MoversConfig())
+    tracker = ObjectTracker(MoversConfig())
     touched = 0
     for i in range(90):
         way = 0.7 * np.cos(2 * np.pi * i / 89)  # apart, together, apart
@@ -121,7 +121,7 @@ def test_bodies_that_touch_stay_two():
 
 
 def test_a_body_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
-    tracker = MoverTracker(MoversConfig(memory=0.5))
+    tracker = ObjectTracker(MoversConfig(memory=0.5))
     mask, level = board(0.0)
     nothing = np.zeros_like(mask)
     numbers = []
@@ -135,19 +135,19 @@ def test_fragments_are_one_body_and_specks_none():
     split = mask.copy()
     split[90:93] = False  # cut off near the lower end
     split[2:4, 2:4] = True
-    movers = MoverTracker(MoversConfig()).update(0.0, split, level, np.eye(4))
+    movers = ObjectTracker(MoversConfig()).update(0.0, split, level, np.eye(4))
     assert len(movers) == 1
     assert movers[0].mask.sum() == (split & mask).sum()
 
 
 def test_far_fragments_are_two_bodies():
     mask, level = joined(board(-0.5), board(0.5, width=0.2))
-    assert len(MoverTracker(MoversConfig()).update(0.0, mask, level, np.eye(4))) == 2
+    assert len(ObjectTracker(MoversConfig()).update(0.0, mask, level, np.eye(4))) == 2
 
 
 def test_lines_of_the_file(tmp_path):
     mask, level = board(0.3)
-    movers = tuple(MoverTracker(MoversConfig()).update(0.0, mask, level, np.eye(4)))
+    movers = tuple(ObjectTracker(MoversConfig()).update(0.0, mask, level, np.eye(4)))
     record = RunRecord()
     for stamp, found in [(1.5, movers), (1.6, ())]:
         record.add(

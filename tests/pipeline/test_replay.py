@@ -13,11 +13,11 @@ from dudmap.errors import DatasetError
 from dudmap.pipeline.replay import Arrival, Newest, live, replay
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
+from fake_slam import StandIn
 from recordings import cut, write_recording
-from test_run import StandIn, slam  # noqa: F401
 
 
-class Clock:
+class StageTimer:
     """Time that passes only where somebody waits or works."""
 
     def __init__(self):
@@ -33,7 +33,7 @@ class Clock:
 
 def replayed(timestamps, reading_s):
     """Numbers and times of the frames that a sensor with so slow a reader offers."""
-    clock, offered = Clock(), []
+    clock, offered = StageTimer(), []
 
     def read(index):
         clock.time += reading_s
@@ -124,7 +124,7 @@ def recording(tmp_path):
     return folder
 
 
-def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, monkeypatch):  # noqa: F811
+def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, monkeypatch):
     fast = StandIn.process
 
     def slow(self, frame):
@@ -148,7 +148,7 @@ def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, mo
     assert f"live: {metrics['dropped']} of 8 frames dropped" in capsys.readouterr().err
 
 
-def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):  # noqa: F811
+def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):
     cut(recording / "depth/3.png")
     start = time.perf_counter()
     metrics = run(open_sequence(recording), Config(), tmp_path / "out", live=True, progress=False).metrics
@@ -157,5 +157,5 @@ def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):  #
     assert "dropped" not in capsys.readouterr().err
 
 
-def test_a_run_that_waits_says_nothing_of_dropped_frames(slam, recording, tmp_path):  # noqa: F811
+def test_a_run_that_waits_says_nothing_of_dropped_frames(slam, recording, tmp_path):
     assert "dropped" not in run(open_sequence(recording), Config(), tmp_path / "out", progress=False).metrics

@@ -1,0 +1,82 @@
+"""Labels of a frame and the masks that are made from them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.dynamics.mixture import Mixture
+from dudmap.dynamics.segments import Segmentation
+from dudmap.frames.observation import Level
+from dudmap.kernels import labeling
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.mapping.volume import MapSample
+
+
+@dataclass(frozen=True, eq=False)
+class Labels:
+    """Outcome for one frame, at the resolution of the label level.
+
+    Attributes:
+        static_probability: (h, w) float32 in [0, 1]; the weight of the second registration.
+        dynamic: (h, w) bool.
+        mixture: The fitted densities, None for methods that fit none.
+        histogram: (BINS,) normalised residuals.
+        sample: What the map says at the points.
+        surface: Segmentation of surface, None where they are not asked.
+        hidden: (h, w) bool, pixels without a reading that hide something static; None where they are not asked for.
+    """
+
+    static_probability: NDArray[np.float32]
+    dynamic: NDArray[np.bool_]
+    mixture: Mixture | None
+    histogram: NDArray[np.int64]
+    sample: MapSample
+    surface: Segmentation | None = None
+    hidden: NDArray[np.bool_] | None = None
+
+
+def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask without what is thinner than three pixels: the seams along depth edges, where readings fit no map."""
+    import cv2
+
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+
+
+def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Moving pixels (H, W) bool at full size; holes in the depth inside a moving region belong to it."""
+    import cv2
+
+    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, elliptical_kernel(2))
+    low[(level.depth > 0) & ~labels.dynamic] = 0
+    if labels.hidden is not None:
+        low[labels.hidden] = 1
+    return full_size(low > 0, level.depth, depth)
+
+
+def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Mask (h, w) at the size (H, W) of a depth image: a pixel takes after the nearby one whose depth is most alike."""
+    out = np.empty(depth.shape, dtype=np.uint8)
+    stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)
+    run_bands(
+        lambda start, stop: labeling.upsample(start, stop, marks, low_depth, depth, stride, out),
+        bands(depth.shape[0], 60),
+    )
+    return out > 0
+
+
+def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
+    """Mask (H, W) widened by some pixels."""
+    import cv2
+
+    if pixels == 0 or not mask.any():
+        return mask
+    return cv2.dilate(mask.astype(np.uint8), elliptical_kernel(pixels)) > 0
+
+
+def elliptical_kernel(radius: float) -> NDArray[np.uint8]:
+    """Elliptical structuring element of at least 3x3 pixels."""
+    import cv2
+
+    side = 2 * max(round(radius), 1) + 1
+    return cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)).astype(np.uint8)

@@ -1,0 +1,47 @@
+"""Mixture of two half-normal densities of the normalised residual (thesis section 4.6, eq. 4.52-4.56)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.kernels import labeling
+
+BINS = 128
+LARGEST = 16.0
+"""Normalised residuals are counted in BINS bins from 0 to LARGEST standard deviations."""
+
+
+@dataclass(frozen=True)
+class Mixture:
+    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56): static and dynamic."""
+
+    prior: tuple[float, float]
+    sigma: tuple[float, float]
+
+    def log_odds(self, residual: NDArray[np.floating]) -> NDArray[np.float32]:
+        """Log odds static : dynamic of normalised residuals >= 0."""
+        (p_static, p_dynamic), (s, d) = self.prior, self.sigma
+        r2 = np.square(residual, dtype=np.float32)
+        return (np.log(p_static / p_dynamic * d / s) + r2 * np.float32(0.5 / d**2 - 0.5 / s**2)).astype(np.float32)
+
+    def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
+        """Densities (2, ...) of both components, priors included."""
+        r = np.asarray(residual, dtype=np.float64)
+        return np.stack(
+            [
+                p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2)
+                for p, s in zip(self.prior, self.sigma, strict=True)
+            ]
+        )
+
+
+def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = 30) -> Mixture:
+    """Expectation maximisation on a histogram of normalised residuals (eq. 4.52-4.56; Dempster et al. 1977).
+
+    The static density is kept at one to two standard deviations of the sensor and the dynamic one at no less than
+    three times the static one, so that the names of the components cannot swap.
+    """
+    centers = (edges[:-1] + edges[1:]) / 2
+    prior, static, dynamic = labeling.fit_mixture(histogram.astype(np.float64), centers, iterations, LARGEST)
+    return Mixture((1 - prior, prior), (static, dynamic))

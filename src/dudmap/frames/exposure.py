@@ -1,0 +1,66 @@
+"""Gain and offset between the intensities of an image and those of the map."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.frames.observation import Level
+from dudmap.kernels.median import median
+
+
+def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
+    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
+    import cv2
+
+    gain, offset = exposure
+    return rgb if exposure == (1.0, 0.0) else np.asarray(cv2.LUT(rgb, _curve(gain, offset)), dtype=np.uint8)
+
+
+def _curve(gain: float, offset: float) -> NDArray[np.uint8]:
+    return np.clip(gain * np.arange(256) + 255 * offset + 0.5, 0, 255).astype(np.uint8)
+
+
+def exposed(level: Level, exposure: tuple[float, float]) -> Level:
+    """Level with gain and offset applied to its intensities."""
+    gain, offset = exposure
+    if (gain, offset) == (1.0, 0.0):
+        return level
+    return Level(level.camera, level.depth, np.float32(gain) * level.intensity + np.float32(offset))
+
+
+def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
+    """Gain and offset of one exposure after another."""
+    return then[0] * first[0], then[0] * first[1] + then[1]
+
+
+def fit_exposure(
+    intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
+) -> tuple[float, float]:
+    """Gain and offset with ``gain * intensity + offset`` nearest to the map's intensities, robustly.
+
+    Auto-exposure changes all intensities at once; unexplained, such a change looks like motion.
+
+    Args:
+        intensity: (h, w) float32 of the image.
+        difference: (h, w) float32 map minus image, NaN off the map.
+        weights: (h, w) float32 static weights.
+    """
+    used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
+    if len(used) < 100:
+        return 1.0, 0.0
+    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
+    x = intensity.reshape(-1)[used].astype(np.float64)
+    y = x + difference.reshape(-1)[used]
+    gain, offset = 1.0, float(median(y - x))
+    for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
+        error = y - gain * x - offset
+        scale = max(1.5 * float(median(np.abs(error))), 0.01)
+        w = 1 / (1 + (error / scale) ** 2)
+        total = w.sum()
+        # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
+        prior = 0.1 * total * 0.04
+        x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
+        variance = (w * (x - x_mean) ** 2).sum() + prior
+        covariance = (w * (x - x_mean) * (y - y_mean)).sum() + prior
+        gain = float(np.clip(covariance / variance, 0.5, 2.0))
+        offset = float(y_mean - gain * x_mean)
+    return gain, offset

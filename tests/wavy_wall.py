@@ -1,0 +1,18 @@
+"""A wavy wall with random colours, and the small camera and map configuration that go with it."""
+
+import numpy as np
+
+from dudmap.config import VolumeConfig
+from dudmap.frames.frame import Frame
+from dudmap.geometry.camera import Camera
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant", carve_rate=1)
+
+
+def wall(distance: float, seed: int = 0, bump: float = 0.1) -> Frame:
+    """A wavy wall in front of the camera with random colours."""
+    rng = np.random.default_rng(seed)
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    depth = distance + bump * np.sin(u / 9.0) * np.cos(v / 7.0)
+    return Frame(float(seed), depth.astype(np.float32), rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8))
