@@ -57,7 +57,7 @@ class StandIn:
 
     def __init__(self, camera, config, first_pass=None):
         self.volume, self.poses, self.frames, self.first_pass = Volume(), [], [], first_pass
-        self.registration = SimpleNamespace(delay=SimpleNamespace(seconds=-0.015))
+        self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
 
     @property
     def trajectory(self):

@@ -118,7 +118,7 @@ def test_a_camera_that_is_blinded_goes_on_by_distances_and_fuses_nothing(recordi
     assert all(result.state == "tracked" for result in results), [result.lost_reason for result in results]
     assert [(result.blind, result.fused) for result in results[10:]] == [(True, False)] * 8
     assert slam.volume.num_blocks == before
-    assert not slam.first_guess.parallax.active  # the last image with something to see was taken from elsewhere
+    assert not slam.predictor.ego_motion.active  # the last image with something to see was taken from elsewhere
     results.append(slam.process(frames[18]))
     assert (results[-1].blind, results[-1].fused) == (False, True)
     assert errors(sequence, results).max() < 0.05

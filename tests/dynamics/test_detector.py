@@ -138,7 +138,7 @@ def test_the_depth_is_compared_from_where_it_was_taken(monkeypatch):
     for index in range(6):
         slam.process(replace(first, timestamp=index / 30))
     Ts = sequence.ground_truth.Ts_world_camera
-    monkeypatch.setattr(slam.registration.delay, "depth_pose", lambda *_: se3.inverse(Ts[0]) @ Ts[1])
+    monkeypatch.setattr(slam.front_end.time_offset, "depth_pose", lambda *_: se3.inverse(Ts[0]) @ Ts[1])
     late = slam.process(replace(first, timestamp=0.2, depth=second.depth))
     assert late.state == "tracked"
     assert np.nanmedian(np.abs(late.residuals)) < 0.004  # 8 mm from where the colour was taken

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from dudmap import synthetic
-from dudmap.config import Config
+from dudmap.config import Config, TrackerConfig
 from dudmap.dynamics import ego_motion as parallax
 from dudmap.dynamics.ego_motion import dominant_motion
 from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, projected, rigid_motion
@@ -16,6 +16,8 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
 from dudmap.slam import Slam
+from dudmap.tracking.estimate import PoseEstimate
+from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import TrackingResult
 
@@ -32,7 +34,7 @@ def image(sequence, index, **changed):
     """Pyramid of a frame, whose finest level has something changed, and its pieces."""
     prepared = Slam(sequence.camera, Config()).prepare(sequence[index])
     *coarser, fine = prepared.pyramid.tracked
-    return replace(prepared.pyramid, tracked=[*coarser, replace(fine, **changed)]), prepared.surface()
+    return replace(prepared.pyramid, tracked=[*coarser, replace(fine, **changed)]), prepared.segmentation()
 
 
 def compare(before, after, moved=None):
@@ -184,24 +186,26 @@ def test_the_pose_that_explains_the_image_is_kept():
     slam = Slam(room.camera)
     for index in range(5):
         slam.process(room[index])
-    level, guess = slam.prepare(room[5]).pyramid.coarse, slam.first_guess
+    level, predictor = slam.prepare(room[5]).pyramid.coarse, slam.predictor
     truth = room.ground_truth.Ts_world_camera
     right = se3.inverse(truth[0]) @ truth[5]
     wrong = right @ se3.exp(np.array([0.08, 0, 0, 0, 0, 0]))
-    assert guess.fits_better(slam.volume, right, wrong, level)
-    assert not guess.fits_better(slam.volume, wrong, right, level)
-    assert not guess.fits_better(slam.volume, right, right, level)
+    assert predictor.fits_better(slam.volume, right, wrong, level, None)
+    assert not predictor.fits_better(slam.volume, wrong, right, level, None)
+    assert not predictor.fits_better(slam.volume, right, right, level, None)
 
 
 def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     slam = Slam(crowd.camera)
     results = [slam.process(crowd[index]) for index in range(3)]
     labels, tracked = results[2].labels, results[2].tracking
-    level = slam.prepare(crowd[2]).pyramid.labelled
+    view = slam.prepare(crowd[2])
     rows = np.arange(labels.dynamic.shape[0])[:, None] >= 0.2 * labels.dynamic.shape[0]
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
-    assert slam._undecided(level, hidden, replace(tracked, inlier_share=0.9)) == ""
-    assert "rest where the map" in slam._undecided(level, hidden, replace(tracked, inlier_share=0.2))
+    monitor = QualityMonitor(slam.config, slam.motion)
+    well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
+    assert monitor.rejection_reason(view, well_known) == ""
+    assert "rest where the map" in monitor.rejection_reason(view, unknown)
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
@@ -236,13 +240,13 @@ def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
 
 def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
     good = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.002, 0.01, 3, 0.01)
-    health = QualityMonitor()
+    monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
     for _ in range(6):
-        health.tracked(good)
+        monitor.accept(good)
     dragged = replace(good, residual=0.0045)
-    assert not health.rejection_reason(dragged)
-    assert "4.5 mm" in health.rejection_reason(dragged, crowded=True)
-    assert not health.rejection_reason(replace(good, residual=0.0035), crowded=True)
+    assert not monitor.deviation(dragged)
+    assert "4.5 mm" in monitor.deviation(dragged, crowded=True)
+    assert not monitor.deviation(replace(good, residual=0.0035), crowded=True)
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dudmap.config import TrackerConfig, VolumeConfig
+from dudmap.config import Config, TrackerConfig, VolumeConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.frame import Frame
 from dudmap.frames.observation import Level
@@ -170,21 +170,21 @@ def test_constant_velocity_goes_on_and_stops_some_time_after_a_loss():
     assert np.allclose(model.predict(0.2), motion @ motion, atol=1e-9)  # a single frame without a pose
     model.lost(0.3)
     assert np.allclose(model.predict(0.3), motion)
-    assert "jumped" in model.implausible(0.2, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
+    assert "jumped" in model.rejection_reason(0.2, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
 
 
 def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
     def result(residual: float, share: float) -> TrackingResult:
         return TrackingResult(np.eye(4), (1.0, 0.0), True, "", share, residual, 0.1, 3)
 
-    health = QualityMonitor()
+    monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
     for _ in range(10):
-        assert health.rejection_reason(result(0.001, 0.9)) == ""
-        health.tracked(result(0.001, 0.9))
-    assert health.rejection_reason(result(0.0025, 0.9)) == ""
-    assert "off the map" in health.rejection_reason(result(0.006, 0.9))
-    health.lost()
-    assert "off the map" in health.rejection_reason(result(0.0025, 0.9))
-    assert "fall on the map" in health.rejection_reason(result(0.001, 0.3))
-    health.tracked(result(0.001, 0.9))
-    assert health.rejection_reason(result(0.0025, 0.3)) == ""
+        assert monitor.deviation(result(0.001, 0.9)) == ""
+        monitor.accept(result(0.001, 0.9))
+    assert monitor.deviation(result(0.0025, 0.9)) == ""
+    assert "off the map" in monitor.deviation(result(0.006, 0.9))
+    monitor.lose()
+    assert "off the map" in monitor.deviation(result(0.0025, 0.9))
+    assert "fall on the map" in monitor.deviation(result(0.001, 0.3))
+    monitor.accept(result(0.001, 0.9))
+    assert monitor.deviation(result(0.0025, 0.3)) == ""

@@ -7,7 +7,7 @@ from dudmap.config import TrackerConfig
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.time_offset import LONGEST, DepthTimeOffset
+from dudmap.tracking.time_offset import MAX_OFFSET, DepthTimeOffset
 from dudmap.tracking.tracker import Tracker
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
@@ -82,4 +82,4 @@ def test_a_camera_at_rest_and_a_wrong_pose_teach_nothing(volume):
 
 def test_a_delay_has_a_limit(volume):
     found, _ = learnt(volume, 0.2, frames=8)
-    assert abs(found.seconds) <= LONGEST
+    assert abs(found.seconds) <= MAX_OFFSET

@@ -16,7 +16,8 @@ from dudmap.frames.frame import Frame
 if TYPE_CHECKING:
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
-    from dudmap.slam import Prepared, Slam
+    from dudmap.slam import Slam
+    from dudmap.tracking.frame_view import FrameView
 
 AHEAD = 4
 """Frames of a recording on disk that are read while an earlier one is processed."""
@@ -37,7 +38,7 @@ class Reading(NamedTuple):
     mask: NDArray[np.bool_] | FrameError | None
     ms: float
     known: NDArray[np.bool_] | FrameError | None = None
-    prepared: "Prepared | None" = None
+    prepared: "FrameView | None" = None
 
 
 class Turn(NamedTuple):

@@ -103,7 +103,7 @@ def write(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
-    metrics["depth_delay_ms"] = 1000 * slam.registration.delay.seconds
+    metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()
@@ -137,7 +137,7 @@ def write(
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
     if config.movers.meshes:
-        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.bodies)))
+        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.rigid_objects)))
     problems = []
     try:
         for step in steps:

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
@@ -58,6 +59,18 @@ class Atlas:
     def volume(self) -> TsdfVolume:
         """The map that is tracked."""
         return self.volumes[self.current]
+
+    def integrate(self, frame: Frame, static_mask: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> None:
+        """Fuse the static pixels (H, W) of a frame into the current map, and keep the frame for later corrections."""
+        self.volume.integrate(frame, T_world_camera, static_mask)
+        if self.history is not None:
+            self.history.add(frame, static_mask, T_world_camera, self.current)
+
+    def clear_first_frame(self) -> None:
+        """Empty the current map, which holds a single frame."""
+        self.volume.clear()
+        if self.history is not None:
+            self.history.drop_last()
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Take over the pose of a tracked frame."""

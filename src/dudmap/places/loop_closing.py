@@ -238,7 +238,7 @@ class LoopCloser:
         )
         if (
             found.converged
-            and not health.rejection_reason(found, recognised=True)
+            and not health.deviation(found, recognized=True)
             and found.inlier_share >= limits.min_on_map
             and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
         ):

@@ -1,6 +1,6 @@
-"""Register a frame, find what moves, register again without that (thesis algorithm 4)."""
+"""Registration and labelling of a frame, each of which needs the other (thesis algorithm 4)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,154 +8,153 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import Labels
-from dudmap.frames.observation import Level
-from dudmap.frames.pyramid import Pyramid, reduced
+from dudmap.frames.pyramid import reduced
+from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import SURFACE, TsdfVolume
-from dudmap.stage_timer import StageTimer
+from dudmap.tracking.estimate import PoseEstimate, initial_weights, static_weights
+from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.time_offset import DepthTimeOffset
 from dudmap.tracking.tracker import Tracker, TrackingResult
 
 UNCHANGED_SHARE = 0.02
-"""Share of the surface whose labels may differ from the last frame's where one level is registered a second time."""
-
-
-@dataclass(frozen=True, eq=False)
-class RegistrationInput:
-    """What is to be registered.
-
-    Attributes:
-        timestamp: Seconds.
-        pyramid: The image.
-        known: (H, W) bool, pixels that are known to move from elsewhere; None where nothing is.
-        unverified_mask: (h, w) bool, label resolution, pixels not verified as static while a crowd moves; or None.
-        blind: The image shows nothing; the distances alone have to give the pose.
-        clock: Takes the time of the stages.
-    """
-
-    timestamp: float
-    pyramid: Pyramid
-    known: NDArray[np.bool_] | None
-    unverified_mask: NDArray[np.bool_] | None
-    blind: bool
-    clock: StageTimer
+"""Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
+on at the finest level alone."""
+SAME_POSE = 0.01, 0.25
+"""Initial poses nearer to each other than this (m, deg) lead to the same registration."""
 
 
 class FrontEnd:
-    """Poses and labels of frames, each of which needs the other.
+    """Registers frames to a map and labels their dynamic pixels.
 
     Args:
         config: All parameters.
-        tracker: Registers an image.
-        detector: Finds what moves in one that is registered.
-        motion: The camera's velocity.
+        tracker: Registers an image pyramid.
+        detector: Labels the pixels of a registered image.
+        motion: Velocity of the camera.
+        monitor: Knows the residuals of the previous frames.
+
+    Attributes:
+        last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
+        time_offset: Delay between depth and colour.
     """
 
-    def __init__(self, config: Config, tracker: Tracker, detector: DynamicDetector, motion: MotionModel) -> None:
+    def __init__(
+        self,
+        config: Config,
+        tracker: Tracker,
+        detector: DynamicDetector,
+        motion: MotionModel,
+        monitor: QualityMonitor,
+    ) -> None:
         self.config = config
         self.tracker = tracker
-        by_distance = config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
-        self.blind_tracker = Tracker(by_distance, config.sensor)
+        distances_only = config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
+        self.blind_tracker = Tracker(distances_only, config.sensor)
         self.detector = detector
         self.motion = motion
-        self.delay = DepthTimeOffset()
-        self.moved: NDArray[np.bool_] | None = None  # label image of the last tracked frame, if anything moved
+        self.monitor = monitor
+        self.time_offset = DepthTimeOffset()
+        self.last_dynamic: NDArray[np.bool_] | None = None
 
-    def register(
-        self, volume: TsdfVolume, task: RegistrationInput, T_init: NDArray[np.float64]
-    ) -> tuple[TrackingResult, Labels | None]:
-        """Pose and labels of a frame against a map, from a first guess (4, 4) of the pose on.
+    def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
+        """Pose and labels of a frame, from its predicted pose on.
 
-        The coarse levels bring the pose near enough to tell what moves, the fine ones make it exact.
+        A registration that fits unusually badly, or that did not settle and moved far from its prediction, is repeated
+        from the pose that the ego-motion between the last two images gives; the one that fits better is returned.
         """
-        levels, clock = task.pyramid.tracked, task.clock
-        unmasked = self._unmasked(task)
-        tracker = self.blind_tracker if task.blind else self.tracker
+        estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
+        tracking = estimate.tracking
+        arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
+        if arrived and not self.monitor.is_unusual(tracking):
+            return estimate
+        with view.timer("parallax"):
+            T_image = prediction.image_pose()
+        if T_image is None or agree(T_image, tracking.T_world_camera, *SAME_POSE):
+            return estimate
+        other = self.register_from(volume, view, prediction, T_image)
+        misfit, other_misfit = (sum(self.monitor.relative_misfit(e.tracking)) for e in (estimate, other))
+        better = other.tracking.converged and (not tracking.converged or other_misfit < CLEARLY_BETTER * misfit)
+        return other if better else estimate
+
+    def register_from(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_init: NDArray[np.float64]
+    ) -> PoseEstimate:
+        """Pose and labels of a frame from one initial pose (4, 4) on.
+
+        The coarse levels bring the pose near enough to label the frame; the fine levels are registered with the static
+        weights that follow from the labels.
+        """
+        levels, unverified = view.pyramid.tracked, prediction.unverified_mask
+        tracker = self.blind_tracker if view.blind else self.tracker
+        excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
-            with clock("track"):
-                tracked = tracker.align(volume, levels, T_init, unmasked)
-            if self.config.dynamics.method == "none":
-                return tracked, None
-            return tracked, self._detect(volume, task, tracked)
+            with view.timer("track"):
+                tracking = tracker.align(volume, levels, T_init, initial_weights(levels, None, excluded))
+            labelled = self.config.dynamics.method != "none"
+            labels = self._label(volume, view, prediction, tracking) if labelled else None
+            return PoseEstimate(tracking, labels, unverified)
         split = max(1, len(levels) - 1)
-        with clock("track"):
-            tracked = tracker.align(volume, levels[:split], T_init, self.expected(levels, unmasked))
-        labels = self._detect(volume, task, tracked)
-        with clock("track_again"):
-            enough = split < len(levels) and tracked.settled and self._labels_unchanged(labels)
-            first = split if enough else split - 1
-            weights = static_weights(labels, levels[first:], task.unverified_mask)
-            pose, exposure = tracked.T_world_camera, tracked.exposure
-            tracked = tracker.align(volume, levels[first:], pose, weights, first_level=first, exposure=exposure)
-        if task.blind:
-            tracked = replace(tracked, color_residual=np.nan)
-        return tracked, labels
+        with view.timer("track"):
+            weights = initial_weights(levels, self.last_dynamic, excluded)
+            tracking = tracker.align(volume, levels[:split], T_init, weights)
+        labels = self._label(volume, view, prediction, tracking)
+        with view.timer("track_again"):
+            finest_suffices = split < len(levels) and tracking.settled and self._labels_unchanged(labels)
+            first = split if finest_suffices else split - 1
+            weights = static_weights(labels, levels[first:], unverified)
+            pose, exposure = tracking.T_world_camera, tracking.exposure
+            tracking = tracker.align(volume, levels[first:], pose, weights, first_level=first, exposure=exposure)
+        if view.blind:
+            tracking = replace(tracking, color_residual=np.nan)
+        return PoseEstimate(tracking, labels, unverified)
 
-    def keep(self, volume: TsdfVolume, task: RegistrationInput, tracked: TrackingResult, labels: Labels | None) -> None:
-        """Take over a frame whose pose is believed: what the next one is judged from."""
-        velocity = self.motion.update(task.timestamp, tracked.T_world_camera)
-        self.moved = labels.dynamic if labels is not None and labels.dynamic.any() else None
-        if labels is None or task.blind:
+    def update(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> None:
+        """Accept the pose and labels of a frame: velocity, time offset and the memory of the detector follow them."""
+        tracking, labels = estimate.tracking, estimate.labels
+        velocity = self.motion.update(view.timestamp, tracking.T_world_camera)
+        self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
+        self.monitor.accept(tracking)
+        if labels is None or view.blind:
             return
-        coarse = task.pyramid.coarse
-        weights = static_weights(labels, [coarse], task.unverified_mask)[0]
-        self.delay.learn(self.tracker, volume, coarse, tracked.T_world_camera, velocity, weights)
-        self.detector.remember(task.pyramid.labelled, tracked.T_world_camera, tracked.exposure, labels)
+        coarse = view.pyramid.coarse
+        weights = static_weights(labels, [coarse], estimate.unverified_mask)[0]
+        self.time_offset.learn(self.tracker, volume, coarse, tracking.T_world_camera, velocity, weights)
+        self.detector.remember(view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
-    def forget(self) -> None:
-        """Tracking was lost."""
-        self.detector.forget()
-        self.moved = None
-
-    def expected(
-        self, levels: list[Level], unmasked: list[NDArray[np.float32]] | None = None
-    ) -> list[NDArray[np.float32]] | None:
-        """Weights of the first registration: what moved in the last frame has little say in this one."""
-        if self.moved is None:
-            return unmasked
-        weights = [np.float32(1) - np.float32(0.9) * reduced(self.moved, level) for level in levels]
-        return weights if unmasked is None else [a * b for a, b in zip(weights, unmasked, strict=True)]
-
-    def _unmasked(self, task: RegistrationInput) -> list[NDArray[np.float32]] | None:
-        """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
-        masks = [mask for mask in (task.known, self.detector.moving, task.unverified_mask) if mask is not None]
-        if not masks:
-            return None
-        levels = task.pyramid.tracked
-        return [(~np.any([reduced(mask, level) for mask in masks], axis=0)).astype(np.float32) for level in levels]
+    def lose(self, timestamp: float) -> None:
+        """A frame was not tracked; after some time what the previous frames showed is no longer used."""
+        self.monitor.lose()
+        if self.motion.lost(timestamp):
+            self.detector.forget()
+            self.last_dynamic = None
 
     def _labels_unchanged(self, labels: Labels) -> bool:
-        """Whether so little of what lies on the map moves other than in the last frame that no coarser level need be
-        registered again."""
-        changed = labels.dynamic if self.moved is None else labels.dynamic != self.moved
-        counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
-        return bool(np.count_nonzero(changed & counted) <= UNCHANGED_SHARE * np.count_nonzero(counted))
+        """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not
+        be registered again."""
+        changed = labels.dynamic if self.last_dynamic is None else labels.dynamic != self.last_dynamic
+        on_map = labels.sample.place == SURFACE
+        return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
 
-    def _detect(self, volume: TsdfVolume, task: RegistrationInput, tracked: TrackingResult) -> Labels:
-        level = task.pyramid.labelled
-        with task.clock("label"):
-            T_depth = tracked.T_world_camera
-            if not task.blind:
-                velocity = self.motion.velocity_to(task.timestamp, T_depth)
-                T_depth = self.delay.depth_pose(task.pyramid.coarse, T_depth, velocity)
-            labels = self.detector.detect(volume, level, T_depth, tracked.exposure)
-            if task.blind:
+    def _label(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult
+    ) -> Labels:
+        """Labels of a registered frame, seen from where the depth image was taken."""
+        with view.timer("label"):
+            T_depth = tracking.T_world_camera
+            if not view.blind:
+                velocity = self.motion.velocity_to(view.timestamp, T_depth)
+                T_depth = self.time_offset.depth_pose(view.pyramid.coarse, T_depth, velocity)
+            self.detector.begin(view.timestamp, prediction.moving)
+            if view.segmentation is not None:
+                self.detector.set_segmentation(view.labelled, view.segmentation)
+            labels = self.detector.detect(volume, view.labelled, T_depth, tracking.exposure)
+            if view.blind:
                 labels = replace(labels, hidden=None)
-            if task.known is None:
+            if view.known_dynamic is None:
                 return labels
-            masked = reduced(task.known, level)
-            static_probability = np.where(masked, np.float32(0), labels.static_probability)
-            return replace(labels, dynamic=labels.dynamic | masked, static_probability=static_probability)
-
-
-def static_weights(
-    labels: Labels, levels: list[Level], unverified_mask: NDArray[np.bool_] | None = None
-) -> list[NDArray[np.float32]]:
-    """Weights (h, w) of the second registration at each level: what moves, or may, has none."""
-    import cv2
-
-    static = labels.static_probability if unverified_mask is None else labels.static_probability * ~unverified_mask
-    return [
-        np.asarray(cv2.resize(static, level.depth.shape[::-1], interpolation=cv2.INTER_NEAREST), np.float32)
-        for level in levels
-    ]
+            known = reduced(view.known_dynamic, view.labelled)
+            static_probability = np.where(known, np.float32(0), labels.static_probability)
+            return replace(labels, dynamic=labels.dynamic | known, static_probability=static_probability)

@@ -1,4 +1,4 @@
-"""Constant-velocity prediction of the camera, and what it makes of a jump."""
+"""Constant-velocity model of the camera's motion."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -6,66 +6,66 @@ from numpy.typing import NDArray
 from dudmap.config import TrackerConfig
 from dudmap.geometry import se3
 
-KEPT = 0.15
-"""Time after the last good pose in which the camera is taken to go on as it did, seconds."""
+VELOCITY_LIFETIME = 0.15
+"""Time after the last accepted pose during which the velocity is still used, seconds."""
 
 
 class MotionModel:
-    """Predicts the next pose from the last two; some time after a loss it stays at the last good pose.
+    """Predicts the next pose from the last two.
 
     Attributes:
-        T_world_camera: (4, 4), the last good pose.
+        T_world_camera: (4, 4), the last accepted pose.
     """
 
     def __init__(self, config: TrackerConfig) -> None:
         self.config = config
-        self._timestamp = 0.0
         self.T_world_camera = np.eye(4)
+        self._timestamp = 0.0
         self._velocity = np.zeros(6)  # twist per second, camera axes
-        self._known = False
+        self._initialized = False
 
     def predict(self, timestamp: float) -> NDArray[np.float64]:
-        """Pose (4, 4) to start the registration from."""
+        """Predicted pose (4, 4) at a time in seconds."""
         if not self.config.constant_velocity:
             return self.T_world_camera
         return self.T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
 
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Take over the pose of a tracked frame; returns ``velocity_to`` it."""
+        """Accept the pose of a tracked frame; returns ``velocity_to`` it."""
         velocity = self.velocity_to(timestamp, T_world_camera)
-        if self._known:
+        if self._initialized:
             self._velocity = velocity
-        self._timestamp, self.T_world_camera, self._known = timestamp, T_world_camera, True
+        self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
         return velocity
 
     def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Twist per second (6,), camera axes, that leads from the last pose to this one; 0 where there is none."""
-        if not self._known:
+        """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
+        if not self._initialized:
             return np.zeros(6)
         return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
 
     def lost(self, timestamp: float) -> bool:
-        """Take note of a frame without a pose; after a few, the next are tried from the last good pose.
+        """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
 
         Returns:
-            Whether what was known of the last good frame says nothing any more.
+            Whether the velocity's lifetime is over.
         """
-        if timestamp - self._timestamp <= KEPT:
+        if timestamp - self._timestamp <= VELOCITY_LIFETIME:
             return False
         self._velocity = np.zeros(6)
         return True
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Take over the pose of a frame whose place was recognised; what lies before it says nothing of its motion."""
-        self._known, self._velocity = False, np.zeros(6)
+        """Continue from the pose of a relocalised frame with unknown velocity."""
+        self._initialized, self._velocity = False, np.zeros(6)
         self.update(timestamp, T_world_camera)
 
-    def moved(self, T_new_old: NDArray[np.float64]) -> None:
-        """Follow a correction of the world; the velocity, in camera axes, stays."""
+    def apply_correction(self, T_new_old: NDArray[np.float64]) -> None:
+        """Follow a correction of the world frame; the velocity is in camera axes and stays."""
         self.T_world_camera = T_new_old @ self.T_world_camera
 
-    def implausible(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
-        """Sentence on a jump that no camera makes, empty if there is none."""
+    def rejection_reason(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
+        """Sentence on a velocity beyond ``max_speed`` or ``max_turn_deg``; empty if there is none."""
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
         elapsed = self._elapsed(timestamp)
         speed = float(np.linalg.norm(motion[:3, 3])) / elapsed

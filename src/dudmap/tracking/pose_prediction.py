@@ -1,6 +1,6 @@
-"""Where the registration of a frame starts, and what moves in it as far as the last image and this one tell."""
+"""Prediction of the camera pose, by constant velocity or by the ego-motion between two images."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,118 +8,146 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, exceeds_noise_share
+from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
-from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
+from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry import se3
 from dudmap.mapping.volume import FREE, UNKNOWN, TsdfVolume
-from dudmap.stage_timer import StageTimer
-from dudmap.tracking.front_end import FrontEnd
+from dudmap.tracking.estimate import PoseEstimate, initial_weights
+from dudmap.tracking.frame_view import FrameView
+from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.tracker import Tracker
 
-CLEARLY = 0.95
-"""A pose explains an image clearly better than another if its cost is below this share of the other's."""
+CLEARLY_BETTER = 0.95
+"""A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
 
 
 @dataclass(frozen=True, eq=False)
 class PosePrediction:
-    """What is expected of a frame.
+    """Initial pose of a registration and what two images alone tell of the scene's motion.
 
     Attributes:
         T_world_camera: (4, 4).
-        moving: (h, w) bool, what moves in it; None where it was not looked for.
-        moving_before: (h, w) bool, what moves in the first image of a map that was made of it alone; else None.
+        image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
+        moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
+        moving_before: (h, w) bool, the same for the first image of a map made of that image alone; else None.
+        unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
     """
 
     T_world_camera: NDArray[np.float64]
+    image_pose: Callable[[], NDArray[np.float64] | None]
     moving: NDArray[np.bool_] | None = None
     moving_before: NDArray[np.bool_] | None = None
+    unverified_mask: NDArray[np.bool_] | None = None
 
 
 class PosePredictor:
-    """Expects that the camera goes on as it did, and while the map is young, or movers hide most of the view, looks.
+    """Predicts by constant velocity, and by ego-motion while the map is young or most of the view is dynamic.
 
     Args:
         config: All parameters.
-        registration: Knows the camera's velocity and what moved in the last frame.
-        seen: Poses (4, 4) by timestamp, where they are known from a first pass.
-
-    Attributes:
-        parallax: Compares images.
-        unverified_mask: (h, w) bool, what nothing shows to rest, while a crowd moves; else None.
+        motion: Velocity of the camera.
+        tracker: Evaluates the cost of a pose.
+        known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
     """
 
     def __init__(
-        self, config: Config, registration: FrontEnd, seen: Mapping[float, NDArray[np.float64]] | None = None
+        self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
     ) -> None:
-        self.registration = registration
-        self.parallax = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
-        self.unverified_mask: NDArray[np.bool_] | None = None
-        self._seen = seen or {}
-        self._alone = False  # the map was made of one image, and nothing has shown what moves in it
-        self._crowd = False  # most of the view has moved from the first frame on
+        self.motion = motion
+        self.tracker = tracker
+        self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
+        self._known_poses = known_poses
+        self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
+        self._crowded_start = False  # most of the view has moved in every frame so far
 
-    def begin(self, timestamp: float) -> None:
-        """The map has been made of a first frame."""
-        self.parallax.start(timestamp)
-        self._alone = self._crowd = True
+    def start(self, view: FrameView) -> None:
+        """A map has been made of this frame."""
+        self.ego_motion.start(view.timestamp)
+        self._single_frame_map = self._crowded_start = True
 
-    def predict(self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume, clock: StageTimer) -> PosePrediction:
-        """First guess for a frame that is to be registered to a map."""
-        if self._seen and not self.parallax.started:  # a second pass
-            self.parallax.start(timestamp)
-        T_expected = self._seen.get(timestamp, self.registration.motion.predict(timestamp))
-        self.unverified_mask = None
-        if not self.parallax.active:
-            return PosePrediction(T_expected)
-        with clock("parallax"):
-            seen = self.see(timestamp, pyramid, volume)
-            if seen is None:
-                return PosePrediction(T_expected)
-            motion, T_seen = seen
-            moving_before = motion.moving_before if self._alone else None
-            if timestamp in self._seen:
-                T_seen = T_expected
-            elif not self._alone and self.fits_better(volume, T_expected, T_seen, pyramid.coarse):
-                return PosePrediction(T_expected)  # what most corners follow is not the static world
-            self._alone = False
-            moving, small = motion.moving_after, pyramid.labelled
-            if not exceeds_noise_share(moving, small):  # else something slow hardly drags the camera on its own
-                surface = self.registration.detector.pieces(small, volume)
-                moving = moving | self.parallax.slow(timestamp, T_seen, pyramid, surface)
-            self._crowd = self._crowd and self.parallax.young(timestamp) and is_majority_dynamic(moving, small)
-            if self._crowd:
-                self.unverified_mask = ~motion.resting_after
-            if not self.parallax.young(timestamp):  # elsewhere the map knows better what moves
-                moving = moving & (_place(volume, small, T_seen) == UNKNOWN)
-            return PosePrediction(T_seen, moving, moving_before)
+    def predict(
+        self, volume: TsdfVolume, view: FrameView, previously_dynamic: NDArray[np.bool_] | None
+    ) -> PosePrediction:
+        """Initial pose for the registration of a frame to a map.
 
-    def see(
-        self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume
-    ) -> tuple[DominantMotion, NDArray[np.float64]] | None:
-        """The static world's motion from the last image to this one, and the pose (4, 4) it leads to, if known."""
-        surface = self.registration.detector.pieces(pyramid.labelled, volume)
-        model = self.registration.motion
-        T_expected = se3.inverse(model.predict(timestamp)) @ model.T_world_camera
-        motion = self.parallax.compare(timestamp, pyramid, surface, T_expected)
-        return None if motion is None else (motion, model.T_world_camera @ se3.inverse(motion.T_after_before))
+        Args:
+            volume: The map.
+            view: The frame.
+            previously_dynamic: (h, w) bool, dynamic pixels of the previous frame; None for none.
+        """
+        timestamp, pyramid = view.timestamp, view.pyramid
+        if self._known_poses and not self.ego_motion.started:
+            self.ego_motion.start(timestamp)
+        T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
+        by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
+        if not self.ego_motion.active:
+            return by_velocity
+        with view.timer("parallax"):
+            motion = self._ego_motion(view)
+            T_image = self._image_pose(motion)
+            if motion is None or T_image is None:
+                return by_velocity
+            if timestamp in self._known_poses:
+                T_image = T_expected
+            elif not self._single_frame_map and self.fits_better(
+                volume, T_expected, T_image, pyramid.coarse, previously_dynamic
+            ):
+                return by_velocity  # the dominant motion is that of the dynamic objects
+            moving_before = motion.moving_before if self._single_frame_map else None
+            self._single_frame_map = False
+            moving = motion.moving_after
+            if not exceeds_noise_share(moving, view.labelled):  # else the pose is too uncertain for slow motion
+                moving = moving | self.ego_motion.slow(timestamp, T_image, pyramid, _segments(view))
+            young = self.ego_motion.young(timestamp)
+            self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
+            unverified = ~motion.resting_after if self._crowded_start else None
+            if not young:  # where the map is known, it labels better than two images
+                moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
+        return PosePrediction(T_image, by_velocity.image_pose, moving, moving_before, unverified)
 
-    def keep(self, timestamp: float, pyramid: Pyramid, T_world_camera: NDArray[np.float64], volume: TsdfVolume) -> None:
-        """Take over a tracked frame as the one to compare the next with."""
-        if self.parallax.seconds > 0:
-            surface, moved = self.registration.detector.pieces(pyramid.labelled, volume), self.registration.moved
-            self.parallax.remember(timestamp, T_world_camera, pyramid, surface, moved)
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Set the image that the next one is compared with: a frame whose pose is accepted."""
+        if self.ego_motion.seconds == 0:
+            return
+        if view.blind:
+            self.ego_motion.forget()
+            return
+        dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
+        T = estimate.T_world_camera
+        self.ego_motion.remember(view.timestamp, T, view.pyramid, _segments(view), dynamic)
+
+    def _ego_motion(self, view: FrameView) -> DominantMotion | None:
+        """Motion of the static world from the previous image to this one."""
+        if self.ego_motion.seconds == 0:
+            return None
+        T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
+        return self.ego_motion.compare(view.timestamp, view.pyramid, _segments(view), T_expected)
+
+    def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
+        return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)
 
     def fits_better(
-        self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
+        self,
+        volume: TsdfVolume,
+        T: NDArray[np.float64],
+        T_other: NDArray[np.float64],
+        level: Level,
+        previously_dynamic: NDArray[np.bool_] | None,
     ) -> bool:
-        """Whether a pose explains an image clearly better than another one, apart from what has just moved."""
-        weights = self.registration.expected([level]) or [np.ones_like(level.depth)]
-        static = np.where(_place(volume, level, T) == FREE, np.float32(0), weights[0])
-        tracker = self.registration.tracker
-        cost, other = (tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
-        return cost < CLEARLY * other
+        """Whether a pose explains the image clearly better than another one, not counting readings in free space."""
+        weights = initial_weights([level], previously_dynamic, []) or [np.ones_like(level.depth)]
+        static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
+        cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
+        return cost < CLEARLY_BETTER * other
 
 
-def _place(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """What a map knows of the points of an image (h, w): SURFACE, FREE or UNKNOWN."""
+def _segments(view: FrameView) -> Segmentation:
+    assert view.segmentation is not None
+    return view.segmentation()
+
+
+def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Occupancy (h, w) that the map gives the points of an image: UNKNOWN, SURFACE or FREE."""
     volume.look_at(T_world_camera)
     return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).place

@@ -1,81 +1,127 @@
-"""Is a registration as good as those before it? Catches wrong minima that pass every absolute check."""
+"""Acceptance of a registration: absolute checks, and comparison with the registrations before it."""
 
 from collections import deque
 
 import numpy as np
 
+from dudmap.config import Config
+from dudmap.frames.pyramid import is_majority_dynamic
+from dudmap.tracking.estimate import PoseEstimate
+from dudmap.tracking.frame_view import FrameView
+from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.tracker import TrackingResult
 
-MEMORY = 30
-"""Tracked frames that are remembered."""
-SENSOR = 0.0015
-"""Residuals of this, metres at one metre depth, are good with any sensor."""
-DARK = 0.005
-"""Intensity differences below this are as good as none."""
-UNUSUAL_RESIDUAL, UNUSUAL_COLOR = 1.5, 1.8
-"""A registration whose residuals, or intensity differences, are more than this times the usual ones may be wrong."""
+HISTORY = 30
+"""Accepted registrations that are remembered."""
+MIN_HISTORY = 5
+"""Accepted registrations before new ones are compared with them."""
+SMALL_RESIDUAL = 0.0015
+"""Residual, metres at one metre depth, that is good with any sensor."""
+SMALL_COLOR_RESIDUAL = 0.005
+"""Intensity difference (0..1) that is good with any sensor."""
+UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
+"""Multiples of the median residuals from which on a registration is repeated from another initial pose."""
+MIN_VERIFIED_SHARE = 0.09
+"""Share of the readings that must be static and lie on the map where most of the view is dynamic."""
 
 
 class QualityMonitor:
-    """Compares a registration's residuals and share of readings on the map with the recent ones.
+    """Decides whether the registration of a frame can be trusted.
 
-    A registration that slid into a wrong minimum explains the frame much worse than its predecessors were explained,
-    though still well enough for any fixed threshold. After a loss the first guess is poor and such minima are common,
-    so that the comparison is stricter until tracking has been found again.
+    A registration that converged to a wrong minimum explains the frame much worse than its predecessors were explained,
+    though often well enough for any fixed threshold. After a loss the initial pose is poor and wrong minima are common,
+    so the comparison is stricter until a frame has been accepted again.
+
+    Args:
+        config: ``dynamics.max_share``.
+        motion: Velocity of the camera.
     """
 
-    def __init__(self) -> None:
-        self._residuals: deque[float] = deque(maxlen=MEMORY)
-        self._shares: deque[float] = deque(maxlen=MEMORY)
-        self._colors: deque[float] = deque(maxlen=MEMORY)
+    def __init__(self, config: Config, motion: MotionModel) -> None:
+        self.config = config
+        self.motion = motion
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget all registrations: a new map begins."""
+        self._residuals: deque[float] = deque(maxlen=HISTORY)
+        self._shares: deque[float] = deque(maxlen=HISTORY)
+        self._colors: deque[float] = deque(maxlen=HISTORY)
         self.recovering = False
 
-    def rejection_reason(self, tracked: TrackingResult, *, recognised: bool = False, crowded: bool = False) -> str:
-        """Sentence on what is much worse than before, empty if nothing is.
+    def rejection_reason(self, view: FrameView, estimate: PoseEstimate) -> str:
+        """Sentence on the first check that a registered frame fails, empty if it passes all.
+
+        The checks are those of the registration itself (overlap, residual, conditioning), of the camera's velocity, of
+        the residuals against those of the previous frames, and of the share of the view that is static and known.
+        """
+        tracking, labels = estimate.tracking, estimate.labels
+        crowded = labels is not None and is_majority_dynamic(labels.dynamic, view.labelled)
+        return (
+            tracking.reason
+            or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
+            or self.deviation(tracking, crowded=crowded)
+            or self._undetermined(view, estimate)
+        )
+
+    def deviation(self, tracking: TrackingResult, *, recognized: bool = False, crowded: bool = False) -> str:
+        """Sentence on what is much worse than in the previous frames, empty if nothing is.
 
         Args:
-            tracked: The registration.
-            recognised: Whether features put the camera there too; then the distances alone need not be as usual, and
-                less of the view need be known: where the camera looks now, a young map may end.
-            crowded: Whether most of the view moves: a part of that, taken for the world, then drags the pose along, and
-                the distances are the first to tell.
+            tracking: The registration.
+            recognized: Place recognition found the same pose: larger distances and a smaller overlap are accepted.
+            crowded: Most of the view is dynamic: a dynamic object registered as static shows in the distances first,
+                which are therefore judged more strictly.
         """
-        if len(self._residuals) < 5:
+        if len(self._residuals) < MIN_HISTORY:
             return ""
-        strict = self.recovering or recognised
+        strict = self.recovering or recognized
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
-        worst = 2.5 if recognised else 1.6 if self.recovering else 4.0
+        worst = 2.5 if recognized else 1.6 if self.recovering else 4.0
         if crowded and not strict:
-            worst, residual = 2.0, max(residual, SENSOR)
-        if tracked.residual > worst * residual:
-            return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
-        if self.recovering and not recognised and tracked.inlier_share < 0.6 * share:
-            return f"only {tracked.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
-        # one wall fits another of the same room, but it does not look like it
-        if tracked.color_residual > (max(0.02, 2.5 * color) if strict else max(0.03, 4.0 * color)):
-            return f"the image differs by {tracked.color_residual:.1%} from the map, {color:.1%} were usual"
+            worst, residual = 2.0, max(residual, SMALL_RESIDUAL)
+        if tracking.residual > worst * residual:
+            return f"readings lie {1000 * tracking.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
+        if self.recovering and not recognized and tracking.inlier_share < 0.6 * share:
+            return f"only {tracking.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
+        # two walls of one room have the same shape, but not the same texture
+        if tracking.color_residual > (max(0.02, 2.5 * color) if strict else max(0.03, 4.0 * color)):
+            return f"the image differs by {tracking.color_residual:.1%} from the map, {color:.1%} were usual"
         return ""
 
-    def misfit(self, tracked: TrackingResult) -> tuple[float, float]:
-        """Residual and intensity difference over what was usual; (1, 1) before anything is."""
-        if len(self._residuals) < 5:
+    def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
+        """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
+        if len(self._residuals) < MIN_HISTORY:
             return 1.0, 1.0
         residual, color = (float(np.median(q)) for q in (self._residuals, self._colors))
-        return tracked.residual / max(residual, 1e-6), tracked.color_residual / max(color, DARK)
+        return tracking.residual / max(residual, 1e-6), tracking.color_residual / max(color, SMALL_COLOR_RESIDUAL)
 
-    def unusual(self, tracked: TrackingResult) -> bool:
-        """Whether a registration is bad enough to be worth another one from elsewhere."""
-        residual, color = self.misfit(tracked)
-        return not tracked.converged or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR
+    def is_unusual(self, tracking: TrackingResult) -> bool:
+        """Whether a registration failed or fits badly enough to be repeated from another initial pose."""
+        residual, color = self.relative_misfit(tracking)
+        return not tracking.converged or residual > UNUSUAL_RESIDUAL or color > UNUSUAL_COLOR_RESIDUAL
 
-    def tracked(self, tracked: TrackingResult) -> None:
-        """Take over a registration that passed."""
-        self._residuals.append(tracked.residual)
-        self._shares.append(tracked.inlier_share)
-        if np.isfinite(tracked.color_residual):
-            self._colors.append(tracked.color_residual)
+    def accept(self, tracking: TrackingResult) -> None:
+        """Remember a registration that passed all checks."""
+        self._residuals.append(tracking.residual)
+        self._shares.append(tracking.inlier_share)
+        if np.isfinite(tracking.color_residual):
+            self._colors.append(tracking.color_residual)
         self.recovering = False
 
-    def lost(self) -> None:
-        """From here on, until a frame is tracked, only registrations like those before the loss are believed."""
+    def lose(self) -> None:
+        """Judge strictly until a frame is accepted again."""
         self.recovering = True
+
+    def _undetermined(self, view: FrameView, estimate: PoseEstimate) -> str:
+        """Sentence if too much of the view is dynamic, or too little of the rest is known, to determine the pose."""
+        if estimate.labels is None:
+            return ""
+        readings = view.labelled.depth > 0
+        share = np.count_nonzero(estimate.labels.dynamic & readings) / max(np.count_nonzero(readings), 1)
+        if share > self.config.dynamics.max_share:
+            return f"{share:.0%} of the readings seem to move: the static world cannot be told"
+        verified = (1 - share) * estimate.tracking.inlier_share
+        if share > 0.5 and verified < MIN_VERIFIED_SHARE:
+            return f"{share:.0%} of the readings seem to move, and only {verified:.0%} rest where the map has a surface"
+        return ""

@@ -1,4 +1,4 @@
-"""How long before or after the colour the depth was taken, learnt while the camera moves."""
+"""Time offset between depth and colour, estimated while the camera moves."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,29 +9,33 @@ from dudmap.kernels.median import median
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.tracker import Tracker
 
-USUAL, LONGEST = 0.015, 0.06
-"""Standard deviation of the delays of sensors before anything is known, and the longest, seconds."""
-MEMORY = 0.95
-"""What a frame's evidence counts one frame later."""
-ALIKE = 400.0
-"""Readings that err alike and tell as much as one."""
-NOISE = 0.0035
-"""Motion during the delay that is not worth taking into account, metres in the image's middle distance."""
-LARGEST = 6.0
-"""Faster motion, metres per second, is no motion but a wrong pose, or a camera that was set down elsewhere."""
+PRIOR_SIGMA, MAX_OFFSET = 0.015, 0.06
+"""Standard deviation of the offset before anything is known (half a frame period at 30 Hz), and its limit, seconds."""
+FORGETTING = 0.95
+"""Factor by which the information of the past decreases from frame to frame: an average over 20 frames."""
+CORRELATED_READINGS = 400.0
+"""Neighbouring readings whose errors are correlated, and which together count as one."""
+NEGLIGIBLE_SHIFT = 0.0035
+"""Displacement during the offset, metres at the median depth, that is not worth compensating."""
+MAX_SPEED = 6.0
+"""Displacement per second, metres at the median depth, beyond which a velocity is a wrong pose or a gap."""
 
 
 class DepthTimeOffset:
-    """The delay of the depth against the pose that depth and colour have together.
+    """Estimates the offset of the depth image against the pose at which depth and colour agree best.
 
-    No pose fits both images of a moving camera if they are taken milliseconds apart: a hand at half a metre per second
-    leaves a centimetre between them, along every edge of a static scene. The delay is one number: that for which the
-    poses along the camera's own motion bring the distances nearest to the map, by a Gauss-Newton step per frame whose
-    evidence is summed over the last frames, with a Gaussian prior around 0. What moves in the scene does not keep step
-    with the camera, and has little say.
+    If the two images of a moving camera are taken milliseconds apart, no pose fits both: at half a metre per second,
+    20 ms leave a centimetre between them. The offset ``t`` is the one for which the poses ``exp(t v) T`` along the
+    camera's velocity ``v`` minimise the distances of the depth readings to the map. Each frame contributes one
+    Gauss-Newton step, with H and b the normal equations of the distances at the current offset:
+
+        information = v' H v / sigma^2,   evidence = information t - v' b / sigma^2,
+        t = sum(evidence) / (sum(information) + 1 / PRIOR_SIGMA^2),
+
+    summed with exponential forgetting and with a zero-mean Gaussian prior.
 
     Attributes:
-        seconds: The delay; negative where the depth is older.
+        seconds: The offset; negative where the depth image is older than the colour image.
     """
 
     def __init__(self) -> None:
@@ -41,15 +45,15 @@ class DepthTimeOffset:
     def depth_pose(
         self, level: Level, T_world_camera: NDArray[np.float64], velocity: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Pose (4, 4) from which the depth was taken.
+        """Pose (4, 4) at the time of the depth image.
 
         Args:
             level: The image.
-            T_world_camera: (4, 4), the pose of depth and colour together.
-            velocity: (6,) twist per second of the camera on its way to this pose, camera axes.
+            T_world_camera: (4, 4), the pose at which depth and colour agree best.
+            velocity: (6,) twist per second of the camera, camera axes.
         """
-        twist, speed = _seen_motion(level, T_world_camera, velocity)
-        if speed >= LARGEST or abs(self.seconds) * speed < NOISE:
+        twist, speed = _apparent_motion(level, T_world_camera, velocity)
+        if speed >= MAX_SPEED or abs(self.seconds) * speed < NEGLIGIBLE_SHIFT:
             return T_world_camera
         return retract(T_world_camera, self.seconds * twist)
 
@@ -62,33 +66,34 @@ class DepthTimeOffset:
         velocity: NDArray[np.float64],
         weights: NDArray[np.float32],
     ) -> None:
-        """Take in a frame whose pose is believed.
+        """Update the offset with a frame whose pose is accepted.
 
         Args:
-            tracker: Gives the normal equations.
-            volume: The map, which has been looked at from near the pose.
+            tracker: Computes the normal equations.
+            volume: The map; its window must cover the view.
             level: A coarse level of the image.
-            T_world_camera, velocity: As above.
+            T_world_camera, velocity: As for ``depth_pose``.
             weights: (h, w) float32 static weights in [0, 1].
         """
-        twist, speed = _seen_motion(level, T_world_camera, velocity)
-        if not 0 < speed < LARGEST:
+        twist, speed = _apparent_motion(level, T_world_camera, velocity)
+        if not 0 < speed < MAX_SPEED:
             return
-        variance = ALIKE * (tracker.sensor.sigma_base + tracker.sensor.sigma_scale) ** 2
+        variance = CORRELATED_READINGS * tracker.sensor.sigma(1.0) ** 2
         T_depth = retract(T_world_camera, self.seconds * twist)
         system = tracker.linearize(volume, level, T_depth, weights, color_weight=0.0)
         information = float(twist @ system.H @ twist) / variance
         evidence = information * self.seconds - float(twist @ system.b) / variance
-        self._information = MEMORY * self._information + information
-        self._evidence = MEMORY * self._evidence + evidence
-        self.seconds = float(np.clip(self._evidence / (self._information + USUAL**-2), -LONGEST, LONGEST))
+        self._information = FORGETTING * self._information + information
+        self._evidence = FORGETTING * self._evidence + evidence
+        offset = self._evidence / (self._information + PRIOR_SIGMA**-2)
+        self.seconds = float(np.clip(offset, -MAX_OFFSET, MAX_OFFSET))
 
 
-def _seen_motion(
+def _apparent_motion(
     level: Level, T_world_camera: NDArray[np.float64], velocity: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float]:
-    """Twist per second (6,) about the camera's centre, world axes, and how fast what is at the middle distance
-    moves in the image at most, m/s; 0 where there are no readings."""
+    """Twist per second (6,) about the camera centre in world axes, and the largest velocity, m/s, that it gives a point
+    at the median depth of the image; 0 without readings."""
     twist = (velocity.reshape(2, 3) @ T_world_camera[:3, :3].T).reshape(6)
     readings = level.depth[level.depth > 0]
     if len(readings) == 0:

@@ -1,0 +1,53 @@
+"""A frame on its way through the algorithm."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.dynamics.segments import Segmentation
+from dudmap.frames.observation import Level, Observation
+from dudmap.frames.pyramid import Pyramid
+from dudmap.stage_timer import StageTimer
+
+TEXTURELESS = 0.01
+"""Standard deviation of the intensities (0..1) below which an image carries no information: black or saturated."""
+
+
+@dataclass(frozen=True, eq=False)
+class FrameView:
+    """A preprocessed frame with everything that needs no other frame.
+
+    Attributes:
+        observation: Preprocessed images.
+        pyramid: Image pyramid of the observation.
+        segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them;
+            None where the labels do not need them.
+        timer: Collects the processing time of each stage.
+        known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
+        blind: The image is textureless although the first image of the map was not: the pose rests on the distances
+            alone, and the frame is not fused.
+    """
+
+    observation: Observation
+    pyramid: Pyramid
+    segmentation: Callable[[], Segmentation] | None
+    timer: StageTimer
+    known_dynamic: NDArray[np.bool_] | None = None
+    blind: bool = False
+
+    @property
+    def timestamp(self) -> float:
+        """Time of the depth image, seconds."""
+        return self.observation.timestamp
+
+    @property
+    def labelled(self) -> Level:
+        """Pyramid level whose pixels are labelled."""
+        return self.pyramid.labelled
+
+    @property
+    def textureless(self) -> bool:
+        """Whether the intensities carry no information."""
+        return bool(self.pyramid.coarse.intensity.std() < TEXTURELESS)
