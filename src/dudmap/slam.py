@@ -51,13 +51,13 @@ class Prepared:
     Attributes:
         observation: Its images, filtered.
         pyramid: They, reduced.
-        surface: Gives its pieces of surface, None where they are not asked; waits until they are cut.
+        segmentation: Waits for the segments of its surface.
         ms: How long that took.
     """
 
     observation: Observation
     pyramid: Pyramid
-    surface: Callable[[], Segmentation] | None
+    segmentation: Callable[[], Segmentation]
     ms: float
 
 
@@ -92,7 +92,7 @@ class Slam:
             self.atlas = Atlas(self._empty_volume, self.keyframes, None, main)
             self._prior_map = first_pass.atlas.volumes[main]
             seen = {p.timestamp: p.T_world_camera for p in first_pass.atlas.poses if p.submap == main}
-            self.detector.memory.import_from(first_pass.detector.memory, seen)
+            self.detector.import_from(first_pass.detector, seen)
         self.loops = LoopCloser(self.config, self.atlas, self.tracker)
         self.movers = ObjectTracker(self.config.movers)
         self.fusion = ObjectFusion(self.config) if self.config.movers.enabled and self.config.movers.meshes else None
@@ -142,10 +142,8 @@ class Slam:
         pyramid = Pyramid.of(observation, self.camera, self.config)
         if self.first_guess.parallax.active:
             _ = pyramid.corners  # kept there for the comparison with other images
-        surface = None
-        if self.config.dynamics.method == "em":
-            surface = self.detector.cut(pyramid.labelled, self.config.volume.voxel_size)
-        return Prepared(observation, pyramid, surface, 1000 * (time.perf_counter() - start))
+        segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
+        return Prepared(observation, pyramid, segmentation, 1000 * (time.perf_counter() - start))
 
     def process(self, frame: Frame | Prepared, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
         """Track one frame against the map, find what moves, fuse what does not.
@@ -159,20 +157,21 @@ class Slam:
             DatasetError: The images do not fit the camera or each other.
         """
         prepared = frame if isinstance(frame, Prepared) else self.prepare(frame)
-        observation, pyramid, clock = prepared.observation, prepared.pyramid, StageTimer({"preprocess": prepared.ms})
+        observation, pyramid, segmentation = prepared.observation, prepared.pyramid, prepared.segmentation
+        clock = StageTimer({"preprocess": prepared.ms})
         known = None if dynamic_mask is None else self.preprocess.mask(dynamic_mask)
         flat = bool(pyramid.coarse.intensity.std() < FLAT)
         if self.reference.is_empty:
             self._map_blind = flat
-            return self._to_raw_image(self._start(observation, pyramid, known, clock))
-        if prepared.surface is not None:
-            self.detector.set_segmentation(pyramid.labelled, prepared.surface)
-        guess = self.first_guess.predict(observation.timestamp, pyramid, self.reference, clock)
+            return self._to_raw_image(self._start(prepared, known, clock))
+        guess = self.first_guess.predict(observation.timestamp, pyramid, segmentation, self.reference, clock)
         if guess.moving_before is not None:
             self._start_again(guess.moving_before)
-        self.detector.begin(observation.timestamp, guess.moving)
         blind = flat and not self._map_blind
-        task = RegistrationInput(observation.timestamp, pyramid, known, self.first_guess.unverified_mask, blind, clock)
+        task = RegistrationInput(
+            observation.timestamp, pyramid, segmentation, known, guess.moving, self.first_guess.unverified_mask, blind,
+            clock,
+        )  # fmt: skip
         similar = self.redundant.ask(observation.rgb, guess.T_world_camera)
         tracked, labels = self._register(task, guess.T_world_camera)
         reason = self._rejection_reason(task, tracked, labels)
@@ -185,7 +184,7 @@ class Slam:
         if reason:
             self._lose(observation.timestamp)
             if self._start_submap(observation):
-                return self._to_raw_image(self._start(observation, pyramid, known, clock))
+                return self._to_raw_image(self._start(prepared, known, clock))
             return self._to_raw_image(self._result(observation, task, labels, tracked, reason, fused=False))
         self._keep(task, tracked, labels)
         result = self._result(observation, task, labels, tracked, "", fused=fused, relocalized=bool(recognised))
@@ -204,16 +203,15 @@ class Slam:
         if task.blind:
             self.first_guess.parallax.forget()
         else:
-            self.first_guess.keep(task.timestamp, task.pyramid, tracked.T_world_camera, self.volume)
+            self.first_guess.keep(task.timestamp, task.pyramid, task.segmentation, tracked.T_world_camera)
 
     def _to_raw_image(self, result: FrameResult) -> FrameResult:
         """The mask back in the image that came in, where the lens bends straight lines."""
         return replace(result, dynamic_mask=self.preprocess.distorted(result.dynamic_mask))
 
-    def _start(
-        self, observation: Observation, pyramid: Pyramid, known: NDArray[np.bool_] | None, clock: StageTimer
-    ) -> FrameResult:
+    def _start(self, prepared: Prepared, known: NDArray[np.bool_] | None, clock: StageTimer) -> FrameResult:
         """The first frame with readings is the world: identity pose, what is not known to move is taken as static."""
+        observation, pyramid = prepared.observation, prepared.pyramid
         nothing = np.zeros(observation.depth.shape, dtype=bool) if known is None else known
         readings = np.count_nonzero(observation.depth[~nothing])
         reason = "" if readings >= 0.02 * observation.depth.size else "the depth image holds hardly any readings"
@@ -233,11 +231,8 @@ class Slam:
         if self.config.dynamics.method == "em":
             self._first = observation, pyramid, nothing
             self.first_guess.begin(observation.timestamp)
-            self.detector.begin(observation.timestamp)
-            self.detector.memory.start()
-            small = pyramid.labelled
-            self.detector.memory.remember(small, T, np.zeros(small.depth.shape, dtype=bool), None)
-        self.first_guess.keep(observation.timestamp, pyramid, T, self.volume)
+            self.detector.start(observation.timestamp, pyramid.labelled, T)
+        self.first_guess.keep(observation.timestamp, pyramid, prepared.segmentation, T)
         return result
 
     def _start_again(self, moving: NDArray[np.bool_]) -> None:
@@ -264,7 +259,7 @@ class Slam:
         if arrived and not self.health.unusual(tracked):
             return tracked, labels
         with task.clock("parallax"):
-            seen = self.first_guess.see(task.timestamp, task.pyramid, self.volume)
+            seen = self.first_guess.see(task.timestamp, task.pyramid, task.segmentation)
         if seen is None or agree(seen[1], tracked.T_world_camera, *SAME_START):
             return tracked, labels
         again, labels_again = self.registration.register(self.reference, task, seen[1])

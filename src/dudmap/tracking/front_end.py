@@ -1,5 +1,6 @@
 """Register a frame, find what moves, register again without that (thesis algorithm 4)."""
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import Labels
+from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid, reduced
 from dudmap.mapping.volume import SURFACE, TsdfVolume
@@ -27,7 +29,9 @@ class RegistrationInput:
     Attributes:
         timestamp: Seconds.
         pyramid: The image.
+        segmentation: Waits for the segments of its surface.
         known: (H, W) bool, pixels that are known to move from elsewhere; None where nothing is.
+        moving: (h, w) bool, label resolution, what the last image and this one show to move; or None.
         unverified_mask: (h, w) bool, label resolution, pixels not verified as static while a crowd moves; or None.
         blind: The image shows nothing; the distances alone have to give the pose.
         clock: Takes the time of the stages.
@@ -35,7 +39,9 @@ class RegistrationInput:
 
     timestamp: float
     pyramid: Pyramid
+    segmentation: Callable[[], Segmentation]
     known: NDArray[np.bool_] | None
+    moving: NDArray[np.bool_] | None
     unverified_mask: NDArray[np.bool_] | None
     blind: bool
     clock: StageTimer
@@ -100,11 +106,11 @@ class FrontEnd:
         coarse = task.pyramid.coarse
         weights = static_weights(labels, [coarse], task.unverified_mask)[0]
         self.delay.learn(self.tracker, volume, coarse, tracked.T_world_camera, velocity, weights)
-        self.detector.remember(task.pyramid.labelled, tracked.T_world_camera, tracked.exposure, labels)
+        self.detector.update(task.timestamp, task.pyramid.labelled, tracked.T_world_camera, tracked.exposure, labels)
 
     def forget(self) -> None:
         """Tracking was lost."""
-        self.detector.forget()
+        self.detector.reset()
         self.moved = None
 
     def expected(
@@ -118,7 +124,7 @@ class FrontEnd:
 
     def _unmasked(self, task: RegistrationInput) -> list[NDArray[np.float32]] | None:
         """Weights of 0 for what is known to move, or seen to from image to image; None where nothing is."""
-        masks = [mask for mask in (task.known, self.detector.moving, task.unverified_mask) if mask is not None]
+        masks = [mask for mask in (task.known, task.moving, task.unverified_mask) if mask is not None]
         if not masks:
             return None
         levels = task.pyramid.tracked
@@ -138,7 +144,9 @@ class FrontEnd:
             if not task.blind:
                 velocity = self.motion.velocity_to(task.timestamp, T_depth)
                 T_depth = self.delay.depth_pose(task.pyramid.coarse, T_depth, velocity)
-            labels = self.detector.detect(volume, level, T_depth, tracked.exposure)
+            labels = self.detector.detect(
+                volume, level, T_depth, task.timestamp, task.segmentation, task.moving, tracked.exposure
+            )
             if task.blind:
                 labels = replace(labels, hidden=None)
             if task.known is None:

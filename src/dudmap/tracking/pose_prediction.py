@@ -1,6 +1,6 @@
 """Where the registration of a frame starts, and what moves in it as far as the last image and this one tell."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, exceeds_noise_share
+from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.geometry import se3
@@ -62,7 +63,14 @@ class PosePredictor:
         self.parallax.start(timestamp)
         self._alone = self._crowd = True
 
-    def predict(self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume, clock: StageTimer) -> PosePrediction:
+    def predict(
+        self,
+        timestamp: float,
+        pyramid: Pyramid,
+        segmentation: Callable[[], Segmentation],
+        volume: TsdfVolume,
+        clock: StageTimer,
+    ) -> PosePrediction:
         """First guess for a frame that is to be registered to a map."""
         if self._seen and not self.parallax.started:  # a second pass
             self.parallax.start(timestamp)
@@ -71,7 +79,7 @@ class PosePredictor:
         if not self.parallax.active:
             return PosePrediction(T_expected)
         with clock("parallax"):
-            seen = self.see(timestamp, pyramid, volume)
+            seen = self.see(timestamp, pyramid, segmentation)
             if seen is None:
                 return PosePrediction(T_expected)
             motion, T_seen = seen
@@ -83,8 +91,7 @@ class PosePredictor:
             self._alone = False
             moving, small = motion.moving_after, pyramid.labelled
             if not exceeds_noise_share(moving, small):  # else something slow hardly drags the camera on its own
-                surface = self.registration.detector.pieces(small, volume)
-                moving = moving | self.parallax.slow(timestamp, T_seen, pyramid, surface)
+                moving = moving | self.parallax.slow(timestamp, T_seen, pyramid, segmentation())
             self._crowd = self._crowd and self.parallax.young(timestamp) and is_majority_dynamic(moving, small)
             if self._crowd:
                 self.unverified_mask = ~motion.resting_after
@@ -93,20 +100,26 @@ class PosePredictor:
             return PosePrediction(T_seen, moving, moving_before)
 
     def see(
-        self, timestamp: float, pyramid: Pyramid, volume: TsdfVolume
+        self, timestamp: float, pyramid: Pyramid, segmentation: Callable[[], Segmentation]
     ) -> tuple[DominantMotion, NDArray[np.float64]] | None:
         """The static world's motion from the last image to this one, and the pose (4, 4) it leads to, if known."""
-        surface = self.registration.detector.pieces(pyramid.labelled, volume)
+        if self.parallax.seconds == 0:
+            return None
         model = self.registration.motion
         T_expected = se3.inverse(model.predict(timestamp)) @ model.T_world_camera
-        motion = self.parallax.compare(timestamp, pyramid, surface, T_expected)
+        motion = self.parallax.compare(timestamp, pyramid, segmentation(), T_expected)
         return None if motion is None else (motion, model.T_world_camera @ se3.inverse(motion.T_after_before))
 
-    def keep(self, timestamp: float, pyramid: Pyramid, T_world_camera: NDArray[np.float64], volume: TsdfVolume) -> None:
+    def keep(
+        self,
+        timestamp: float,
+        pyramid: Pyramid,
+        segmentation: Callable[[], Segmentation],
+        T_world_camera: NDArray[np.float64],
+    ) -> None:
         """Take over a tracked frame as the one to compare the next with."""
         if self.parallax.seconds > 0:
-            surface, moved = self.registration.detector.pieces(pyramid.labelled, volume), self.registration.moved
-            self.parallax.remember(timestamp, T_world_camera, pyramid, surface, moved)
+            self.parallax.remember(timestamp, T_world_camera, pyramid, segmentation(), self.registration.moved)
 
     def fits_better(
         self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
