@@ -34,7 +34,7 @@ class BackgroundModel:
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._known: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]] | None = None
+        self._known: splatting.PointImage | None = None
 
     def reset(self) -> None:
         """What was seen is in another world, or nobody knows where."""
@@ -54,7 +54,7 @@ class BackgroundModel:
         nothing = np.zeros(level.depth.shape, dtype=bool)
         if self._known is None:
             return nothing
-        _, shades, times = self._seen_from(timestamp, level, depth.shape, T_world_camera)
+        _, shades, times = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
         farthest = cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))
         hole = farthest[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE] <= 0
         missing = np.isnan(shades)
@@ -83,29 +83,19 @@ class BackgroundModel:
     ) -> None:
         """Take over the readings of an image that rest; ``moving`` (h, w) bool do not."""
         depth, intensity = _asked(level)
-        self._known = self._seen_from(timestamp, level, depth.shape, T_world_camera)
+        self._known = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
         splatting.overwrite(
-            depth, intensity, ~moving[::STRIDE, ::STRIDE], timestamp, T_world_camera[:3].astype(np.float32),
-            _intrinsics(level), *self._known,
-        )  # fmt: skip
+            self._known, depth, intensity, ~moving[::STRIDE, ::STRIDE], timestamp, T_world_camera, _intrinsics(level)
+        )
 
     def _seen_from(
-        self, timestamp: float, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-        """The known points, their intensities (NaN: none) and times as the image's camera sees them."""
-        points, shades, times = (
-            np.zeros((*shape, 3), np.float32),
-            np.full(shape, np.float32(np.nan)),
-            np.zeros((*shape, 2)),
-        )
-        if self._known is not None:
-            old_points, old_shades, old_times = self._known
-            splatting.splat(
-                old_points.reshape(-1, 3), old_shades.reshape(-1), old_times.reshape(-1, 2),
-                timestamp - self.config.settle_time, se3.inverse(T_world_camera)[:3].astype(np.float32),
-                _intrinsics(level), points, shades, times,
-            )  # fmt: skip
-        return points, shades, times
+        self, timestamp: float, level: Level, shape: tuple[int, int], T_world_camera: NDArray[np.float64]
+    ) -> splatting.PointImage:
+        """The known points as the image's camera sees them."""
+        if self._known is None:
+            return splatting.PointImage.empty(shape)
+        since = timestamp - self.config.settle_time
+        return splatting.splat(self._known, se3.inverse(T_world_camera), _intrinsics(level), since)
 
 
 def _asked(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

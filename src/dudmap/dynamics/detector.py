@@ -112,7 +112,7 @@ class DynamicDetector:
             reach = np.float32(1.5) * noise.astype(np.float32)
             seen_free, rested = self.memory.views(timestamp, level, T_world_camera, reach, unknown)
             evidence[(sample.place == FREE) | seen_free] = -6
-        probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
+        probability = labeling.mean_field(evidence, level.depth, tolerance, 4, 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None
         if self.config.regions:
@@ -163,8 +163,7 @@ class DynamicDetector:
         self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """Grow each moving spot over the surface it belongs to, up to what fits the map or a depth edge."""
-        labels = np.empty(seeds.shape, dtype=np.int32)
-        count = labeling.grow(seeds, evidence < 1, level.depth, tolerance, labels)
+        labels, count = labeling.grow_regions(seeds, evidence < 1, level.depth, tolerance)
         areas = np.bincount(labels.reshape(-1), minlength=count + 1)
         seeded = np.bincount(labels[seeds], minlength=count + 1)
         smallest = 0.0008 * seeds.size
@@ -216,7 +215,6 @@ class DynamicDetector:
         marked = (distance > min(self.config.threshold, 0.95 * volume.truncation)) | free
         scale = level.camera.width / 640
         core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(15 * scale)) > 0
-        labels = np.empty(marked.shape, dtype=np.int32)
         tolerance = np.float32(0.007 / scale) * level.depth
-        labeling.grow(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance, labels)
+        labels, _ = labeling.grow_regions(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(10 * scale)) > 0

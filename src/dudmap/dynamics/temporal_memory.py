@@ -1,6 +1,7 @@
 """Recent frames that tell what moved a moment ago and what has stood still since."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from dudmap.dynamics.segments import ORDINARY_MISMATCH, SMALLEST, Segmentation, 
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation
-from dudmap.kernels.threads import bands, run_bands
 
 MEMORIES = 4
 """Frames that are kept of the time in which a thing must stand still."""
@@ -110,7 +110,7 @@ class TemporalMemory:
         """What each pixel (h, w) was in the last frame, MOVED and BODY, if its point is nearer than ``reach`` (m)."""
         if self._last is None or not self._last.marks.any():
             return np.zeros(level.depth.shape, dtype=np.uint8)
-        gap, _, marks = reproject_difference(level, T_world_camera, self._last)
+        ((gap, _, marks),) = reproject_difference(level, T_world_camera, [self._last])
         marks[~(np.abs(gap) < reach)] = 0
         return marks
 
@@ -146,7 +146,7 @@ class TemporalMemory:
         else:
             views = self._recent if unknown >= YOUNG_UNKNOWN_SHARE else ()
         asked = [view for view in views if 0 < abs(timestamp - view.timestamp) <= self.config.start_seconds]
-        answers = run_bands(lambda n, _: reproject_difference(level, T_world_camera, asked[n]), bands(len(asked), 1))
+        answers = reproject_difference(level, T_world_camera, asked)
         for view, (gap, difference, _) in zip(asked, answers, strict=True):
             apart = abs(timestamp - view.timestamp)
             seen, close = ~np.isnan(gap), np.abs(gap) <= noise
@@ -181,7 +181,7 @@ class TemporalMemory:
         still = np.bincount(both.labels.reshape(-1), minlength=2 * count + 1) >= SMALLEST
         still[: count + 1] = False
         for memory in self._memories:
-            gap, difference, _ = reproject_difference(level, T_world_camera, memory)
+            ((gap, difference, _),) = reproject_difference(level, T_world_camera, [memory])
             known = ~np.isnan(gap)
             verdict = judge(both, known, known & (np.abs(np.nan_to_num(gap)) > 4 * sigma), gap, sigma, difference)
             counted = np.flatnonzero((verdict.known > 0.7) & (verdict.size >= SMALLEST))
@@ -194,19 +194,13 @@ class TemporalMemory:
 
 
 def reproject_difference(
-    level: Level, T_world_camera: NDArray[np.float64], memory: _Memory
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Difference of an image to a remembered frame, reprojected into it.
-
-    Returns:
-        Depth gap (h, w) float32, metres, and intensity difference (h, w) float32, NaN where the remembered frame does
-        not show the point, and its marks (h, w) uint8.
-    """
-    shape = level.depth.shape
-    out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-    T = (se3.inverse(memory.T_world_camera) @ T_world_camera)[:3].astype(np.float32)
-    segmentation.reproject_difference(  # in one piece: it takes no longer than waking a thread
-        0, shape[0], level.depth, level.intensity, level.camera.intrinsics, T, memory.level.depth,
-        memory.level.intensity, memory.marks, *out,
-    )  # fmt: skip
-    return out
+    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[_Memory]
+) -> list[segmentation.Reprojection]:
+    """Differences of an image to remembered frames, one for each."""
+    targets = [
+        segmentation.ReprojectionTarget(
+            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.marks
+        )
+        for frame in frames
+    ]
+    return segmentation.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)
