@@ -66,7 +66,7 @@ class Slam:
         else:
             known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
             submap = self.prior_map.submap
-            self.detector.memory.import_from(self.prior_map.memory, known_poses)
+            self.detector.import_from(self.prior_map.detector, known_poses)
         self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.bootstrap = Bootstrap()
@@ -104,7 +104,7 @@ class Slam:
         """The largest submap and what else a second pass over the same recording needs."""
         main = self.atlas.by_size()[0]
         poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
-        return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector.memory)
+        return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
@@ -124,9 +124,7 @@ class Slam:
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active:
                 _ = pyramid.corners  # cached there for the comparison with other images
-            segmentation = None
-            if self.config.dynamics.method == "em":
-                segmentation = self.detector.cut(pyramid.labelled, self.config.volume.voxel_size)
+            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:
@@ -188,10 +186,7 @@ class Slam:
         if self.config.dynamics.method == "em":
             self.bootstrap.start(view, mask)
             self.predictor.start(view)
-            self.detector.begin(view.timestamp)
-            self.detector.memory.start()
-            nothing = np.zeros(view.labelled.depth.shape, dtype=bool)
-            self.detector.memory.remember(view.labelled, estimate.T_world_camera, nothing, None)
+            self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 

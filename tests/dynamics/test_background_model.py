@@ -30,9 +30,8 @@ def pose(i: int) -> np.ndarray:
 def seen(frames: int) -> BackgroundModel:
     background = BackgroundModel(DynamicsConfig(settle_time=1.0))
     for i in range(frames):
-        background.begin(i / 30)
-        assert not background.hidden(wall(pose(i)), pose(i)).any()
-        background.update(wall(pose(i)), pose(i), STILL)
+        assert not background.hidden(i / 30, wall(pose(i)), pose(i)).any()
+        background.update(i / 30, wall(pose(i)), pose(i), STILL)
     return background
 
 
@@ -49,25 +48,21 @@ def test_a_hole_hides_the_wall_if_it_looks_unlike_it(shade):
     background = seen(15)
     for i in range(15, 35):
         level, disc = with_hole(i, shade)
-        background.begin(i / 30)
-        hidden = background.hidden(level, pose(i))
-        background.update(level, pose(i), STILL)
+        hidden = background.hidden(i / 30, level, pose(i))
+        background.update(i / 30, level, pose(i), STILL)
         assert not hidden[~disc].any()
         assert hidden[disc].mean() > 0.85 if shade else not hidden.any()
     # what has not been read for the settle time is not known any more
-    background.begin(3.0)
-    assert not background.hidden(level, pose(34)).any()
+    assert not background.hidden(3.0, level, pose(34)).any()
 
 
 def test_what_was_seen_for_a_moment_or_in_another_world_is_no_background():
     level, _ = with_hole(5, 0.05)
     passing = seen(5)
-    passing.begin(5 / 30)
-    assert not passing.hidden(level, pose(5)).any()
+    assert not passing.hidden(5 / 30, level, pose(5)).any()
     background = seen(15)
-    background.forget()
-    background.begin(0.5)
-    assert not background.hidden(level, pose(5)).any()
+    background.reset()
+    assert not background.hidden(0.5, level, pose(5)).any()
 
 
 def test_a_seam_is_not_hidden():
@@ -75,16 +70,13 @@ def test_a_seam_is_not_hidden():
     background = seen(15)
     level = wall(pose(15))
     seam = (V >= 50) & (V < 54)
-    background.begin(0.5)
     sky = Level(CAMERA, np.where(seam, np.float32(0), level.depth), np.where(seam, np.float32(1), level.intensity))
-    assert not background.hidden(sky, pose(15)).any()
+    assert not background.hidden(0.5, sky, pose(15)).any()
 
 
 def test_what_moved_is_no_background():
     background = BackgroundModel(DynamicsConfig())
     for i in range(15):
-        background.begin(i / 30)
-        background.hidden(wall(pose(i)), pose(i))
-        background.update(wall(pose(i)), pose(i), ~STILL)
-    background.begin(0.5)
-    assert not background.hidden(with_hole(15, 0.05)[0], pose(15)).any()
+        background.hidden(i / 30, wall(pose(i)), pose(i))
+        background.update(i / 30, wall(pose(i)), pose(i), ~STILL)
+    assert not background.hidden(0.5, with_hole(15, 0.05)[0], pose(15)).any()

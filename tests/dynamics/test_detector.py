@@ -74,8 +74,7 @@ def test_regions_grow_like_a_breadth_first_search():
         depth = rng.choice([0.0, 1.0, 1.02, 1.5], (20, 30), p=[0.1, 0.4, 0.3, 0.2]).astype(np.float32)
         seeds = (rng.random(depth.shape) < 0.05) & (depth > 0)
         open_pixels, tolerance = rng.random(depth.shape) < 0.7, np.full(depth.shape, 0.05, np.float32)
-        labels = np.empty(depth.shape, np.int32)
-        count = labeling.grow(seeds, open_pixels, depth, tolerance, labels)
+        labels, count = labeling.grow_regions(seeds, open_pixels, depth, tolerance)
         expected, expected_count = grown(seeds, open_pixels, depth, tolerance)
         assert count == expected_count
         assert np.array_equal(labels, expected)
@@ -86,20 +85,17 @@ def test_neighbours_pull_a_doubtful_pixel_over_but_not_across_a_depth_edge():
     evidence[2, 2] = -1.0
     flat = np.ones((5, 6), np.float32)
     near = np.full((5, 6), 0.05, np.float32)
-    assert labeling.smooth(evidence, flat, near, np.float32(4), 4)[2, 2] > 0.5
+    assert labeling.mean_field(evidence, flat, near, 4, 4)[2, 2] > 0.5
     apart = flat.copy()
     apart[2, 2] = 2.0
-    assert labeling.smooth(evidence, apart, near, np.float32(4), 4)[2, 2] == pytest.approx(1 / (1 + np.e), abs=1e-3)
+    assert labeling.mean_field(evidence, apart, near, 4, 4)[2, 2] == pytest.approx(1 / (1 + np.e), abs=1e-3)
 
 
 def test_full_size_labels_follow_the_depth_edge():
     depth = np.ones((16, 16), np.float32)
     depth[:, 9:] = 3.0  # the edge lies inside a low-size pixel
     low_depth = np.where(np.arange(4) < 2, 1.0, 3.0)[None, :].repeat(4, axis=0).astype(np.float32)
-    low = (low_depth < 2).astype(np.uint8)
-    out = np.empty(depth.shape, np.uint8)
-    labeling.upsample(0, 16, low, low_depth, depth, 4, out)
-    assert np.array_equal(out > 0, depth < 2)
+    assert np.array_equal(labeling.upsample_labels(low_depth < 2, low_depth, depth, 4), depth < 2)
 
 
 @pytest.fixture(scope="module")

@@ -300,10 +300,9 @@ def test_labels_at_full_size_take_after_the_low_pixel_most_alike_in_depth_else_t
     depth = rng.uniform(0.5, 4, (48, 64)).astype(np.float32)
     depth[rng.random(depth.shape) < 0.2] = 0
     low_depth = np.ascontiguousarray(depth[2::4, 2::4])
-    low = (rng.random(low_depth.shape) < 0.3).astype(np.uint8)
-    low[:4] = 0
-    out = np.empty(depth.shape, np.uint8)
-    labeling.upsample(0, 48, low, low_depth, depth, 4, out)
+    low = rng.random(low_depth.shape) < 0.3
+    low[:4] = False
+    out = labeling.upsample_labels(low, low_depth, depth, 4)
     for v in range(48):
         for u in range(64):
             y, x = (2 * v - 3) // 8, (2 * u - 3) // 8  # centre of low pixel k: 4 k + 1.5

@@ -86,19 +86,18 @@ def test_what_stood_still_for_the_settle_time_stands(speed, stands):
     for i in range(35):
         image, board = scene(speed * i / 30)
         surface = segment(image, TOLERANCE)
-        memory.begin(i / 30)
-        still = memory.standing(image, np.eye(4), surface, sigma, board)
+        still = memory.standing(i / 30, image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
         if i < 30:
             assert not still.any()
-        memory.remember(image, np.eye(4), board, surface)
+        memory.update(i / 30, image, np.eye(4), board, surface)
         marks = memory.marks(image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
         assert (marks[inner] == MOVED | BODY).mean() > 0.9
     assert (still[board].mean() > 0.9) == stands
-    memory.forget()
-    assert not memory.standing(image, np.eye(4), surface, sigma, board).any()
+    memory.reset()
+    assert not memory.standing(i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
 def test_single_frames_tell_who_stands_where_they_saw_farther():
@@ -118,12 +117,11 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
         seen, board, X = image(camera_x, board_x)
         T = np.eye(4)
         T[0, 3] = camera_x
-        memory.begin(i / 30)
         if i == 0:
-            memory.start()
-        free, rested = memory.views(seen, T, noise)
+            memory.start(0.0)
+        free, rested = memory.views(i / 30, seen, T, noise)
         assert not free[~board].any()
-        memory.remember(seen, T, np.zeros_like(board), None)
+        memory.update(i / 30, seen, T, np.zeros_like(board), None)
     new = board & (X > -0.3 + 0.2 + 0.03)  # where it was not in the first frame
     assert free[new].mean() > 0.9
     assert rested[new].mean() < 0.05
@@ -134,21 +132,18 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
     again.import_from(
         memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
     )
-    again.begin(0.0)
     seen, board, X = image(0.0, -0.3)
-    free, _ = again.views(seen, np.eye(4), noise)
+    free, _ = again.views(0.0, seen, np.eye(4), noise)
     assert free[board].mean() > 0.8
     assert not free[~board].any()
     # a grown map knows free space itself, unless the camera has turned to where it knows nothing
-    again.begin(10.0)
-    assert not np.any(again.views(seen, np.eye(4), noise, unknown=0.05))
-    assert not np.any(again.views(seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
+    assert not np.any(again.views(10.0, seen, np.eye(4), noise, unknown=0.05))
+    assert not np.any(again.views(10.0, seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
     for i in range(16):
         seen, board, X = image(0.0, -0.3 + 0.05 * i)
-        again.begin(10.0 + i / 30)
-        free, _ = again.views(seen, np.eye(4), noise, unknown=0.5)
-        assert not again.views(seen, np.eye(4), noise, unknown=0.05)[0].any()
-        again.remember(seen, np.eye(4), np.zeros_like(board), None)
+        free, _ = again.views(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.5)
+        assert not again.views(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.05)[0].any()
+        again.update(10.0 + i / 30, seen, np.eye(4), np.zeros_like(board), None)
     assert free[board & (X > -0.3 + 0.2 + 0.03)].mean() > 0.9
     assert not free[~board].any()
 

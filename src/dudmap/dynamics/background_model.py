@@ -34,21 +34,17 @@ class BackgroundModel:
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._now = 0.0
-        self._known: tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]] | None = None
+        self._known: splatting.PointImage | None = None
 
-    def begin(self, timestamp: float) -> None:
-        """A new frame, of this time in seconds."""
-        self._now = timestamp
-
-    def forget(self) -> None:
+    def reset(self) -> None:
         """What was seen is in another world, or nobody knows where."""
         self._known = None
 
-    def hidden(self, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
+    def hidden(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
         """Pixels (h, w) without a reading that look unlike the static world behind them.
 
         Args:
+            timestamp: Seconds.
             level: The image, its intensities as the map has them.
             T_world_camera: (4, 4).
         """
@@ -58,7 +54,7 @@ class BackgroundModel:
         nothing = np.zeros(level.depth.shape, dtype=bool)
         if self._known is None:
             return nothing
-        _, shades, times = self._seen_from(level, depth.shape, T_world_camera)
+        _, shades, times = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
         farthest = cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))
         hole = farthest[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE] <= 0
         missing = np.isnan(shades)
@@ -82,32 +78,24 @@ class BackgroundModel:
         found = cv2.resize(found, nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
         return (found > 0) & (level.depth <= 0)
 
-    def update(self, level: Level, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]) -> None:
+    def update(
+        self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
+    ) -> None:
         """Take over the readings of an image that rest; ``moving`` (h, w) bool do not."""
         depth, intensity = _asked(level)
-        self._known = self._seen_from(level, depth.shape, T_world_camera)
+        self._known = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
         splatting.overwrite(
-            depth, intensity, ~moving[::STRIDE, ::STRIDE], self._now, T_world_camera[:3].astype(np.float32),
-            _intrinsics(level), *self._known,
-        )  # fmt: skip
+            self._known, depth, intensity, ~moving[::STRIDE, ::STRIDE], timestamp, T_world_camera, _intrinsics(level)
+        )
 
     def _seen_from(
-        self, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.float64]]:
-        """The known points, their intensities (NaN: none) and times as the image's camera sees them."""
-        points, shades, times = (
-            np.zeros((*shape, 3), np.float32),
-            np.full(shape, np.float32(np.nan)),
-            np.zeros((*shape, 2)),
-        )
-        if self._known is not None:
-            old_points, old_shades, old_times = self._known
-            splatting.splat(
-                old_points.reshape(-1, 3), old_shades.reshape(-1), old_times.reshape(-1, 2),
-                self._now - self.config.settle_time, se3.inverse(T_world_camera)[:3].astype(np.float32),
-                _intrinsics(level), points, shades, times,
-            )  # fmt: skip
-        return points, shades, times
+        self, timestamp: float, level: Level, shape: tuple[int, int], T_world_camera: NDArray[np.float64]
+    ) -> splatting.PointImage:
+        """The known points as the image's camera sees them."""
+        if self._known is None:
+            return splatting.PointImage.empty(shape)
+        since = timestamp - self.config.settle_time
+        return splatting.splat(self._known, se3.inverse(T_world_camera), _intrinsics(level), since)
 
 
 def _asked(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:

@@ -1,6 +1,7 @@
 """Which pixels move: mixture of residual densities, known free space, regions (thesis section 4.6, algorithm 3)."""
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,37 +30,49 @@ class DynamicDetector:
         self.sensor = sensor
         self.memory = TemporalMemory(config)
         self.background = BackgroundModel(config)
-        self.moving: NDArray[np.bool_] | None = None
-        self.now = 0.0
-        self._cut: tuple[Level, Callable[[], Segmentation]] | None = None
 
-    def begin(self, timestamp: float, moving: NDArray[np.bool_] | None = None) -> None:
-        """A new frame, of this time in seconds, and what moves in it (h, w) as far as two images tell."""
-        self.now = timestamp
-        self.memory.begin(timestamp)
-        self.background.begin(timestamp)
-        self.moving = moving
+    def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
+        """Begin to segment the surface of an image, which needs no map.
 
-    def cut(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
-        """Begin to cut an image into pieces of surface, which needs no map; what is returned waits for them."""
-        tolerance = self._tolerance(self._sigma(level.depth, voxel_size), level.depth)
-        return submit(lambda: segment(level, tolerance))
+        Args:
+            level: The image, at the size of the labels.
+            voxel_size: Edge of the map's voxels, metres.
 
-    def set_segmentation(self, level: Level, surface: Callable[[], Segmentation]) -> None:
-        """Take over the pieces of the image that comes next, as ``cut`` gives them."""
-        self._cut = level, surface
+        Returns:
+            A function that waits for the segmentation. It is computed in another thread, or, where the configuration
+            does not need it, when the function is first called.
+        """
 
-    def pieces(self, level: Level, volume: TsdfVolume) -> Segmentation:
-        """Segmentation of surface of an image; cut only once for the image that was asked for last."""
-        if self._cut is None or self._cut[0] is not level:
-            self._cut = level, self.cut(level, volume.voxel_size)
-        return self._cut[1]()
+        def compute() -> Segmentation:
+            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level.depth))
+
+        config = self.config
+        needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
+        return submit(compute) if needed else cache(compute)
+
+    def start(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> None:
+        """Begin with the first frame of a map, of which no pixel is known to move.
+
+        Args:
+            timestamp: Seconds.
+            level: The image.
+            T_world_camera: (4, 4).
+        """
+        self.memory.start(timestamp)
+        self.memory.update(timestamp, level, T_world_camera, np.zeros(level.depth.shape, dtype=bool), None)
+
+    def import_from(self, other: "DynamicDetector", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
+        """Import what the detector of a first pass over the same frames remembers; see ``TemporalMemory``."""
+        self.memory.import_from(other.memory, Ts_world_camera)
 
     def detect(
         self,
         volume: TsdfVolume,
         level: Level,
         T_world_camera: NDArray[np.float64],
+        timestamp: float,
+        segmentation: Callable[[], Segmentation],
+        moving: NDArray[np.bool_] | None = None,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> Labels:
         """Labels of a frame that has been registered to ``volume`` at a pose.
@@ -68,6 +81,9 @@ class DynamicDetector:
             volume: The map.
             level: The image.
             T_world_camera: (4, 4).
+            timestamp: Seconds.
+            segmentation: Waits for the segments of the image, as ``segment`` returns it.
+            moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
@@ -94,9 +110,9 @@ class DynamicDetector:
         if self.config.free_space:
             unknown = float(np.mean(sample.place[level.depth > 0] == UNKNOWN)) if level.depth.any() else 0.0
             reach = np.float32(1.5) * noise.astype(np.float32)
-            seen_free, rested = self.memory.views(level, T_world_camera, reach, unknown)
+            seen_free, rested = self.memory.views(timestamp, level, T_world_camera, reach, unknown)
             evidence[(sample.place == FREE) | seen_free] = -6
-        probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
+        probability = labeling.mean_field(evidence, level.depth, tolerance, 4, 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None
         if self.config.regions:
@@ -104,27 +120,34 @@ class DynamicDetector:
             dynamic = self._regions(seeds, evidence, level, tolerance)
             if self.config.pieces:
                 dynamic, surface = self._whole(
-                    dynamic, seeds, sample, sigma, self.pieces(level, volume), level, T_world_camera, exposure
+                    dynamic, seeds, sample, sigma, segmentation(), level, T_world_camera, timestamp, exposure
                 )
-            if self.moving is not None:
-                dynamic = dynamic | (self.moving & ~rested)
+            if moving is not None:
+                dynamic = dynamic | (moving & ~rested)
             # what is no region fits the map badly for another reason: the robust weights deal with it
             probability = np.where(dynamic, np.float32(0), np.float32(1))
-        hidden = self.background.hidden(exposed(level, exposure), T_world_camera) if self.config.free_space else None
+        hidden = None
+        if self.config.free_space:
+            hidden = self.background.hidden(timestamp, exposed(level, exposure), T_world_camera)
         return Labels(probability, dynamic, mixture, histogram, sample, surface, hidden)
 
-    def remember(
-        self, level: Level, T_world_camera: NDArray[np.float64], exposure: tuple[float, float], labels: Labels
+    def update(
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float],
+        labels: Labels,
     ) -> None:
         """Take over a frame that was tracked: what the next one is compared with."""
-        self.memory.remember(level, T_world_camera, labels.dynamic, labels.surface)
+        self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.surface)
         if self.config.free_space:
-            self.background.update(exposed(level, exposure), T_world_camera, labels.dynamic)
+            self.background.update(timestamp, exposed(level, exposure), T_world_camera, labels.dynamic)
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
-        self.memory.forget()
-        self.background.forget()
+        self.memory.reset()
+        self.background.reset()
 
     def _sigma(self, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
         """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
@@ -140,8 +163,7 @@ class DynamicDetector:
         self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
         """Grow each moving spot over the surface it belongs to, up to what fits the map or a depth edge."""
-        labels = np.empty(seeds.shape, dtype=np.int32)
-        count = labeling.grow(seeds, evidence < 1, level.depth, tolerance, labels)
+        labels, count = labeling.grow_regions(seeds, evidence < 1, level.depth, tolerance)
         areas = np.bincount(labels.reshape(-1), minlength=count + 1)
         seeded = np.bincount(labels[seeds], minlength=count + 1)
         smallest = 0.0008 * seeds.size
@@ -159,6 +181,7 @@ class DynamicDetector:
         surface: Segmentation,
         level: Level,
         T_world_camera: NDArray[np.float64],
+        timestamp: float,
         exposure: tuple[float, float],
     ) -> tuple[NDArray[np.bool_], Segmentation]:
         """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
@@ -176,7 +199,7 @@ class DynamicDetector:
         noise = np.maximum(np.float32(self.config.noise_threshold / 3), sigma)
         verdict = judge(surface, sample.place == SURFACE, dynamic, sample.distance, noise, difference)
         moving = dynamic | classify_segments(verdict, surface.share(moved))[surface.labels]
-        return moving & ~self.memory.standing(level, T_world_camera, surface, noise, moving), surface
+        return moving & ~self.memory.standing(timestamp, level, T_world_camera, surface, noise, moving), surface
 
     def _threshold_and_flood(
         self, volume: TsdfVolume, level: Level, sample: MapSample, noise: NDArray[np.float32]
@@ -192,7 +215,6 @@ class DynamicDetector:
         marked = (distance > min(self.config.threshold, 0.95 * volume.truncation)) | free
         scale = level.camera.width / 640
         core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(15 * scale)) > 0
-        labels = np.empty(marked.shape, dtype=np.int32)
         tolerance = np.float32(0.007 / scale) * level.depth
-        labeling.grow(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance, labels)
+        labels, _ = labeling.grow_regions(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(10 * scale)) > 0

@@ -9,7 +9,6 @@ from dudmap.dynamics.mixture import Mixture
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.kernels import labeling
-from dudmap.kernels.threads import bands, run_bands
 from dudmap.mapping.volume import MapSample
 
 
@@ -56,13 +55,7 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     """Mask (h, w) at the size (H, W) of a depth image: a pixel takes after the nearby one whose depth is most alike."""
-    out = np.empty(depth.shape, dtype=np.uint8)
-    stride, marks = depth.shape[1] // low.shape[1], low.astype(np.uint8)
-    run_bands(
-        lambda start, stop: labeling.upsample(start, stop, marks, low_depth, depth, stride, out),
-        bands(depth.shape[0], 60),
-    )
-    return out > 0
+    return labeling.upsample_labels(low, low_depth, depth, depth.shape[1] // low.shape[1])
 
 
 def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:

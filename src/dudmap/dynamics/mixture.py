@@ -10,6 +10,14 @@ from dudmap.kernels import labeling
 BINS = 128
 LARGEST = 16.0
 """Normalised residuals are counted in BINS bins from 0 to LARGEST standard deviations."""
+START = 0.1, 1.0, 6.0
+"""Where the expectation maximisation starts: prior of the dynamic density, standard deviations of both."""
+PRIOR_BOUNDS = 0.02, 0.98
+"""Bounds of the prior of the dynamic density."""
+STATIC_BOUNDS = 0.5, 2.0
+"""Bounds of the standard deviation of the static density: 1 if the sensor model were exact."""
+SEPARATION = 3.0
+"""Least ratio of the standard deviations, dynamic : static."""
 
 
 @dataclass(frozen=True)
@@ -43,5 +51,7 @@ def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iter
     three times the static one, so that the names of the components cannot swap.
     """
     centers = (edges[:-1] + edges[1:]) / 2
-    prior, static, dynamic = labeling.fit_mixture(histogram.astype(np.float64), centers, iterations, LARGEST)
+    prior, static, dynamic = labeling.fit_mixture(
+        histogram.astype(np.float64), centers, iterations, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION, LARGEST
+    )
     return Mixture((1 - prior, prior), (static, dynamic))

@@ -78,12 +78,7 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
     """
     import cv2
 
-    edge = np.empty(level.depth.shape, dtype=np.bool_)
-    labels = np.empty(level.depth.shape, dtype=np.int32)
-    normals = np.empty((*level.depth.shape, 3), dtype=np.float32)
-    intrinsics = level.camera.intrinsics
-    segmentation.concave_edges(level.depth, intrinsics, tolerance, REACH, np.float32(CONCAVITY), normals, edge)
-    count = segmentation.segments(level.depth, intrinsics, tolerance, normals, edge, labels, REACH + 1)
+    labels, count = segmentation.segment_surface(level.depth, level.camera.intrinsics, tolerance, REACH, 2, CONCAVITY)
     du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=1 / 8)
     dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=1 / 8)
     gradient = cv2.blur(cv2.magnitude(du, dv), (3, 3))
@@ -133,15 +128,14 @@ def judge(
     mean = cv2.blur(np.where(used, difference, np.float32(0)), (3, 3)) / np.maximum(
         cv2.blur(ones, (3, 3)), np.float32(1e-3)
     )
-    out = np.empty((surface.count + 1, 8))
-    segmentation.sums(
-        surface.labels, used, moving, distance, sigma, np.asarray(mean, np.float32), surface.gradient, out
+    sums = segmentation.segment_sums(
+        surface.labels, surface.count, used, moving, distance, sigma, np.asarray(mean, np.float32), surface.gradient
     )
-    size, known = np.maximum(out[:, 0], 1), np.maximum(out[:, 3], 1)
-    texture = out[:, 6] / known
+    size, known = np.maximum(sums.pixels, 1), np.maximum(sums.static, 1)
+    texture = sums.gradient / known
     return SegmentEvidence(
-        out[:, 0], out[:, 1] / size, out[:, 2] / size, out[:, 3], out[:, 4] / known,
-        out[:, 7] / known * texture / (texture + FLOOR) ** 2, texture,
+        sums.pixels, sums.compared / size, sums.moving / size, sums.static, sums.distance / known,
+        sums.deviation / known * texture / (texture + FLOOR) ** 2, texture,
     )  # fmt: skip
 
 

@@ -1,6 +1,7 @@
 """Recent frames that tell what moved a moment ago and what has stood still since."""
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -11,7 +12,6 @@ from dudmap.dynamics.segments import ORDINARY_MISMATCH, SMALLEST, Segmentation, 
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation
-from dudmap.kernels.threads import bands, run_bands
 
 MEMORIES = 4
 """Frames that are kept of the time in which a thing must stand still."""
@@ -48,7 +48,6 @@ class TemporalMemory:
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._now = 0.0
         self._last: _Memory | None = None
         self._memories: deque[_Memory] = deque()
         self._young_until = -np.inf
@@ -56,9 +55,9 @@ class TemporalMemory:
         self._recent: deque[_Memory] = deque()  # of the last moments
         self._complete = False  # those of the first seconds come from another pass
 
-    def start(self) -> None:
-        """The frame that has begun is the first of a map."""
-        self._young_until = self._now + YOUTH * self.config.start_seconds
+    def start(self, timestamp: float) -> None:
+        """Begin with the first frame of a map, of this time in seconds."""
+        self._young_until = timestamp + YOUTH * self.config.start_seconds
         self._views = []
         self._recent.clear()
 
@@ -76,12 +75,9 @@ class TemporalMemory:
             if view.timestamp in Ts_world_camera
         ]
 
-    def begin(self, timestamp: float) -> None:
-        """A new frame, of this time in seconds, is going to be labelled."""
-        self._now = timestamp
-
-    def remember(
+    def update(
         self,
+        timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
         moving: NDArray[np.bool_],
@@ -91,19 +87,19 @@ class TemporalMemory:
         marks = moving.astype(np.uint8)
         if surface is not None:
             marks[((surface.share(moving) >= 0.2) & (np.arange(surface.count + 1) > 0))[surface.labels]] |= BODY
-        self._last = _Memory(self._now, level, T_world_camera, marks)
-        if not self._memories or self._now - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
+        self._last = _Memory(timestamp, level, T_world_camera, marks)
+        if not self._memories or timestamp - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
             self._memories.append(self._last)
-        if not self._recent or self._now - self._recent[-1].timestamp >= self.config.start_seconds / VIEWS:
+        if not self._recent or timestamp - self._recent[-1].timestamp >= self.config.start_seconds / VIEWS:
             self._recent.append(self._last)
-            if self._now < self._young_until and not self._complete:
+            if timestamp < self._young_until and not self._complete:
                 self._views.append(self._last)
-        while self._now - self._recent[0].timestamp > self.config.start_seconds:
+        while timestamp - self._recent[0].timestamp > self.config.start_seconds:
             self._recent.popleft()
-        while len(self._memories) > 1 and self._now - self._memories[1].timestamp >= self.config.settle_time:
+        while len(self._memories) > 1 and timestamp - self._memories[1].timestamp >= self.config.settle_time:
             self._memories.popleft()
 
-    def forget(self) -> None:
+    def reset(self) -> None:
         """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
         self._last = None
         self._memories.clear()
@@ -114,12 +110,17 @@ class TemporalMemory:
         """What each pixel (h, w) was in the last frame, MOVED and BODY, if its point is nearer than ``reach`` (m)."""
         if self._last is None or not self._last.marks.any():
             return np.zeros(level.depth.shape, dtype=np.uint8)
-        gap, _, marks = reproject_difference(level, T_world_camera, self._last)
+        ((gap, _, marks),) = reproject_difference(level, T_world_camera, [self._last])
         marks[~(np.abs(gap) < reach)] = 0
         return marks
 
     def views(
-        self, level: Level, T_world_camera: NDArray[np.float64], noise: NDArray[np.float32], unknown: float = 0.0
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        noise: NDArray[np.float32],
+        unknown: float = 0.0,
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """What single frames of the last moments say of each pixel, while the map is young, or knows little of what is
         in view; else nothing.
@@ -127,6 +128,7 @@ class TemporalMemory:
         In the first seconds a second pass also asks the frames of the next moments.
 
         Args:
+            timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest gap between two readings of one point, metres.
@@ -139,14 +141,14 @@ class TemporalMemory:
         import cv2
 
         free, there, alike, known, age = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(5))
-        if self._now < self._young_until:
+        if timestamp < self._young_until:
             views = self._views if self._complete else self._recent
         else:
             views = self._recent if unknown >= YOUNG_UNKNOWN_SHARE else ()
-        asked = [view for view in views if 0 < abs(self._now - view.timestamp) <= self.config.start_seconds]
-        answers = run_bands(lambda n, _: reproject_difference(level, T_world_camera, asked[n]), bands(len(asked), 1))
+        asked = [view for view in views if 0 < abs(timestamp - view.timestamp) <= self.config.start_seconds]
+        answers = reproject_difference(level, T_world_camera, asked)
         for view, (gap, difference, _) in zip(asked, answers, strict=True):
-            apart = abs(self._now - view.timestamp)
+            apart = abs(timestamp - view.timestamp)
             seen, close = ~np.isnan(gap), np.abs(gap) <= noise
             free += gap > noise
             there += close
@@ -161,6 +163,7 @@ class TemporalMemory:
 
     def standing(
         self,
+        timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
         surface: Segmentation,
@@ -169,7 +172,7 @@ class TemporalMemory:
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) of those called ``moving`` whose piece has been where it is for ``settle_time``."""
         nothing = np.zeros_like(moving)
-        if not self._memories or self._now - self._memories[0].timestamp < self.config.settle_time or not moving.any():
+        if not self._memories or timestamp - self._memories[0].timestamp < self.config.settle_time or not moving.any():
             return nothing
         count = surface.count
         both = Segmentation(
@@ -178,7 +181,7 @@ class TemporalMemory:
         still = np.bincount(both.labels.reshape(-1), minlength=2 * count + 1) >= SMALLEST
         still[: count + 1] = False
         for memory in self._memories:
-            gap, difference, _ = reproject_difference(level, T_world_camera, memory)
+            ((gap, difference, _),) = reproject_difference(level, T_world_camera, [memory])
             known = ~np.isnan(gap)
             verdict = judge(both, known, known & (np.abs(np.nan_to_num(gap)) > 4 * sigma), gap, sigma, difference)
             counted = np.flatnonzero((verdict.known > 0.7) & (verdict.size >= SMALLEST))
@@ -191,19 +194,13 @@ class TemporalMemory:
 
 
 def reproject_difference(
-    level: Level, T_world_camera: NDArray[np.float64], memory: _Memory
-) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """Difference of an image to a remembered frame, reprojected into it.
-
-    Returns:
-        Depth gap (h, w) float32, metres, and intensity difference (h, w) float32, NaN where the remembered frame does
-        not show the point, and its marks (h, w) uint8.
-    """
-    shape = level.depth.shape
-    out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-    T = (se3.inverse(memory.T_world_camera) @ T_world_camera)[:3].astype(np.float32)
-    segmentation.reproject_difference(  # in one piece: it takes no longer than waking a thread
-        0, shape[0], level.depth, level.intensity, level.camera.intrinsics, T, memory.level.depth,
-        memory.level.intensity, memory.marks, *out,
-    )  # fmt: skip
-    return out
+    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[_Memory]
+) -> list[segmentation.Reprojection]:
+    """Differences of an image to remembered frames, one for each."""
+    targets = [
+        segmentation.ReprojectionTarget(
+            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.marks
+        )
+        for frame in frames
+    ]
+    return segmentation.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)

@@ -1,51 +1,239 @@
-"""Loops that cut a depth image into surfaces: along depth edges and where two surfaces meet in a hollow."""
+"""Surface segmentation of a depth image, sums over segments, and the reprojection of one image into another.
+
+The segments are cut along depth edges and along concave edges. The scalar formulas stand in functions of their own.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import bands, kernel, run_bands
 
-STEP = np.float32(0.35)
-"""Largest step off the plane of the neighbour within one piece, as a share of the largest depth step."""
+PLANE_STEP = np.float32(0.35)
+"""Largest distance of a pixel from the plane through its neighbour in the same segment, as a share of the largest
+depth step."""
+NEAREST = np.float32(0.05)
+"""Points nearer to the camera plane than this, or behind it, are not projected, metres."""
+LEAST_WEIGHT = np.float32(0.25)
+"""Least sum of the bilinear weights of the pixels with a reading: a quarter, the weight of each at equal distance."""
 
 
-@kernel
-def concave_edges(depth, intrinsics, tolerance, reach, sine, normals, edge):
-    """Pixels in a hollow: those between whose neighbours the surface turns towards the camera.
+class SegmentSums(NamedTuple):
+    """Sums over the pixels of each segment, all (count + 1,) float64; entry 0 is meaningless.
 
-    With points a, b on either side of a pixel and their normals, (n_b - n_a) . (b - a) is negative in a hollow and
-    positive on a ridge (Stein et al. 2014): a thing on the floor is cut off along its foot, the faces of a box hang
-    together.
+    A pixel is compared where its distance to the map is known, and static where it is compared and not moving.
+
+    Attributes:
+        pixels, compared, moving, static: Numbers of pixels.
+        distance: Sum of distance / sigma over the static pixels.
+        difference: Sum of the intensity difference over the static pixels.
+        gradient: Sum of the intensity gradient over the static pixels.
+        deviation: Sum over the static pixels of the absolute deviation of the difference from its mean over them.
+    """
+
+    pixels: NDArray[np.float64]
+    compared: NDArray[np.float64]
+    moving: NDArray[np.float64]
+    static: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    difference: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    deviation: NDArray[np.float64]
+
+
+class ReprojectionTarget(NamedTuple):
+    """An older frame that an image is compared with.
+
+    Attributes:
+        T_target_camera: (4, 4), camera of the image to that of the older frame.
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        marks: (h, w) uint8.
+    """
+
+    T_target_camera: NDArray[np.float64]
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    marks: NDArray[np.uint8]
+
+
+class Reprojection(NamedTuple):
+    """Difference of an image to an older frame, at the pixels of the image.
+
+    Attributes:
+        gap: (h, w) float32, metres: older reading minus depth of this image's point in the older camera, the smallest
+            in magnitude among the four readings around its projection; NaN where there is none.
+        difference: (h, w) float32, older minus this intensity, NaN likewise.
+        marks: (h, w) uint8, mark of that reading, 0 where the point projects outside of the older frame.
+    """
+
+    gap: NDArray[np.float32]
+    difference: NDArray[np.float32]
+    marks: NDArray[np.uint8]
+
+
+def segment_surface(
+    depth: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    tolerance: NDArray[np.float32],
+    reach: int,
+    normal_reach: int,
+    sine: float,
+) -> tuple[NDArray[np.int32], int]:
+    """Connected segments of surface, cut along depth edges and concave edges.
 
     Args:
         depth: (h, w) float32, metres, 0 = none.
-        intrinsics: (4,) float32.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-        reach: Pixels from the middle to either side.
-        sine: Least turn of the normals, as the sine of half the angle.
+        reach: Pixels from a concave edge to the normals compared on either side.
+        normal_reach: Pixels to either side over which a normal is estimated.
+        sine: Sine of half the smallest angle between the normals across a concave edge.
+
+    Returns:
+        (h, w) int32 number of each pixel's segment from 1, 0 = no reading, and the number of segments.
+    """
+    normals = np.empty((*depth.shape, 3), dtype=np.float32)
+    edge = np.empty(depth.shape, dtype=np.bool_)
+    labels = np.empty(depth.shape, dtype=np.int32)
+    concave_edges(depth, intrinsics, tolerance, reach, normal_reach, np.float32(sine), normals, edge)
+    count = connected_segments(depth, intrinsics, tolerance, normals, edge, labels, reach + 1)
+    return labels, count
+
+
+def segment_sums(
+    labels: NDArray[np.int32],
+    count: int,
+    compared: NDArray[np.bool_],
+    moving: NDArray[np.bool_],
+    distance: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    difference: NDArray[np.float32],
+    gradient: NDArray[np.float32],
+) -> SegmentSums:
+    """Sums over the pixels of each segment.
+
+    Args:
+        labels: (h, w) int32 numbers from 1, 0 = none.
+        count: Number of segments.
+        compared: (h, w) bool, pixels whose distance and difference are known.
+        moving: (h, w) bool.
+        distance, sigma: (h, w) float32, metres.
+        difference: (h, w) float32, of intensities.
+        gradient: (h, w) float32, intensity per pixel.
+    """
+    out = np.zeros((count + 1, len(SegmentSums._fields)))
+    add_segment_sums(labels, compared, moving, distance, sigma, difference, gradient, out)
+    return SegmentSums(*out.T)
+
+
+def reproject(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    targets: Sequence[ReprojectionTarget],
+) -> list[Reprojection]:
+    """Differences of an image to older frames of the same camera, one for each.
+
+    Args:
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        targets: The older frames.
+    """
+
+    def reproject_into(n: int, _: int) -> Reprojection:
+        target, shape = targets[n], depth.shape
+        out = Reprojection(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
+        T = target.T_target_camera[:3].astype(np.float32)
+        reproject_difference(depth, intensity, intrinsics, T, target.depth, target.intensity, target.marks, *out)
+        return out
+
+    return run_bands(reproject_into, bands(len(targets), 1))
+
+
+@kernel
+def surface_end(depth, tolerance, v, u, dv, du, reach):
+    """Pixels (0 to ``reach``) that one can go in a direction without leaving the surface."""
+    z = depth[v, u]
+    for step in range(1, reach + 1):
+        vn, un = v + dv * step, u + du * step
+        if vn < 0 or un < 0 or vn >= depth.shape[0] or un >= depth.shape[1]:
+            return step - 1
+        if depth[vn, un] <= 0 or abs(depth[vn, un] - z) > tolerance[v, u]:
+            return step - 1
+        z = depth[vn, un]
+    return reach
+
+
+@kernel
+def normal_of_gradient(x, y, z, zu, zv):
+    """Unit normal, towards the camera, of a surface at the normalised image point (x, y) and depth z, whose gradient
+    over normalised image coordinates is (zu, zv)."""
+    nx, ny, nz = zu, zv, -(z + x * zu + y * zv)
+    length = np.sqrt(nx * nx + ny * ny + nz * nz)
+    return nx / length, ny / length, nz / length
+
+
+@kernel
+def is_concave(turn, length, sine):
+    """Whether two surface points lie on either side of a concave edge.
+
+    Args:
+        turn: (n_b - n_a) . (b - a) of points a, b and their unit normals: negative across a concave edge, positive
+            across a ridge (Stein et al. 2014).
+        length: |b - a|.
+        sine: Sine of half the smallest angle between the normals.
+    """
+    return turn < -np.float32(2) * sine * length
+
+
+@kernel
+def plane_distance(nx, ny, nz, ex, ey, ez):
+    """Distance of a point from the plane with unit normal n, when the point lies at e from a point of the plane."""
+    return abs(nx * ex + ny * ey + nz * ez)
+
+
+@kernel
+def plane_step(depth, intrinsics, normals, v, u, vn, un):
+    """Smaller one of the distances of two neighbouring pixels' points from each other's plane, metres."""
+    z, zn = depth[v, u], depth[vn, un]
+    ex = ((np.float32(un) - intrinsics[2]) * zn - (np.float32(u) - intrinsics[2]) * z) / intrinsics[0]
+    ey = ((np.float32(vn) - intrinsics[3]) * zn - (np.float32(v) - intrinsics[3]) * z) / intrinsics[1]
+    ez = zn - z
+    a = plane_distance(normals[v, u, 0], normals[v, u, 1], normals[v, u, 2], ex, ey, ez)
+    b = plane_distance(normals[vn, un, 0], normals[vn, un, 1], normals[vn, un, 2], ex, ey, ez)
+    return min(a, b)
+
+
+@kernel
+def concave_edges(depth, intrinsics, tolerance, reach, normal_reach, sine, normals, edge):
+    """Normals, and pixels on concave edges: a thing on the floor is cut off along its foot, the faces of a box are not.
+
+    Args:
+        depth, intrinsics, tolerance, reach, normal_reach, sine: See ``segment_surface``.
         normals: (h, w, 3) float32 out, camera frame, towards the camera; 0 = unknown.
         edge: (h, w) bool out.
     """
     h, w = depth.shape
     normals[:] = 0
     by_x, by_y = np.float32(1) / intrinsics[0], np.float32(1) / intrinsics[1]
-    two = np.float32(2)
     for v in range(h):
         y = (np.float32(v) - intrinsics[3]) * by_y
         for u in range(w):
             z = depth[v, u]
             if z <= 0:
                 continue
-            left, right = _end(depth, tolerance, v, u, 0, -1), _end(depth, tolerance, v, u, 0, 1)
-            up, down = _end(depth, tolerance, v, u, -1, 0), _end(depth, tolerance, v, u, 1, 0)
+            left = surface_end(depth, tolerance, v, u, 0, -1, normal_reach)
+            right = surface_end(depth, tolerance, v, u, 0, 1, normal_reach)
+            up = surface_end(depth, tolerance, v, u, -1, 0, normal_reach)
+            down = surface_end(depth, tolerance, v, u, 1, 0, normal_reach)
             if left + right == 0 or up + down == 0:
                 continue
             x = (np.float32(u) - intrinsics[2]) * by_x
             zu = (depth[v, u + right] - depth[v, u - left]) / np.float32(left + right) * intrinsics[0]
             zv = (depth[v + down, u] - depth[v - up, u]) / np.float32(up + down) * intrinsics[1]
-            # gradient of z over the image plane; towards the camera
-            nx, ny, nz = zu, zv, -(z + x * zu + y * zv)
-            length = np.sqrt(nx * nx + ny * ny + nz * nz)
-            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = nx / length, ny / length, nz / length
+            normals[v, u, 0], normals[v, u, 1], normals[v, u, 2] = normal_of_gradient(x, y, z, zu, zv)
     for v in range(h):
         for u in range(w):
             edge[v, u] = False
@@ -68,47 +256,21 @@ def concave_edges(depth, intrinsics, tolerance, reach, sine, normals, edge):
                     + (normals[vb, ub, 1] - normals[va, ua, 1]) * ey
                     + (normals[vb, ub, 2] - normals[va, ua, 2]) * ez
                 )
-                if turn < -two * sine * np.sqrt(ex * ex + ey * ey + ez * ez):
+                if is_concave(turn, np.sqrt(ex * ex + ey * ey + ez * ez), sine):
                     edge[v, u] = True
 
 
 @kernel
-def _step(depth, intrinsics, normals, v, u, vn, un):
-    """Height of a step between two pixels, metres: how far each lies off the other's plane, the smaller of both."""
-    z, zn = depth[v, u], depth[vn, un]
-    ex = ((np.float32(un) - intrinsics[2]) * zn - (np.float32(u) - intrinsics[2]) * z) / intrinsics[0]
-    ey = ((np.float32(vn) - intrinsics[3]) * zn - (np.float32(v) - intrinsics[3]) * z) / intrinsics[1]
-    ez = zn - z
-    a = abs(normals[v, u, 0] * ex + normals[v, u, 1] * ey + normals[v, u, 2] * ez)
-    b = abs(normals[vn, un, 0] * ex + normals[vn, un, 1] * ey + normals[vn, un, 2] * ez)
-    return min(a, b)
-
-
-@kernel
-def _end(depth, tolerance, v, u, dv, du):
-    """Pixels (0 to 2) that one can go in a direction without leaving the surface."""
-    z = depth[v, u]
-    for step in range(1, 3):
-        vn, un = v + dv * step, u + du * step
-        if vn < 0 or un < 0 or vn >= depth.shape[0] or un >= depth.shape[1]:
-            return step - 1
-        if depth[vn, un] <= 0 or abs(depth[vn, un] - z) > tolerance[v, u]:
-            return step - 1
-        z = depth[vn, un]
-    return 2
-
-
-@kernel
-def segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
-    """Connected pieces of surface, cut along depth and concave edges; pixels on a concave edge join their neighbour.
+def connected_segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
+    """Connected components between the edges; pixels on a concave edge then join the neighbour nearest in depth.
 
     Args:
         depth, intrinsics, tolerance, normals, edge: See ``concave_edges``.
         labels: (h, w) int32 out: number from 1, 0 = no reading.
-        passes: Pixels that a piece may reach into a hollow.
+        passes: Pixels by which a segment may grow over the pixels of an edge.
 
     Returns:
-        Number of pieces.
+        Number of segments.
     """
     h, w = depth.shape
     stack = np.empty(h * w, np.int32)
@@ -133,13 +295,13 @@ def segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
                         continue
                     if edge[vn, un] or depth[vn, un] <= 0 or abs(depth[vn, un] - z) > tolerance[v, u]:
                         continue
-                    if _step(depth, intrinsics, normals, v, u, vn, un) > STEP * tolerance[v, u]:
+                    if plane_step(depth, intrinsics, normals, v, u, vn, un) > PLANE_STEP * tolerance[v, u]:
                         continue
                     labels[vn, un] = count
                     stack[top] = vn * w + un
                     top += 1
     for _ in range(passes):
-        # pixels that join do so all at once: the result does not depend on the order of the scan
+        # pixels join all at once, so that the result does not depend on the order of the scan
         for v in range(h):
             for u in range(w):
                 if labels[v, u] != 0 or depth[v, u] <= 0:
@@ -161,22 +323,8 @@ def segments(depth, intrinsics, tolerance, normals, edge, labels, passes):
 
 
 @kernel
-def sums(labels, used, moving, distance, sigma, difference, gradient, out):
-    """Sums over the pixels of each piece.
-
-    Args:
-        labels: (h, w) int32 numbers from 1, 0 = none.
-        used: (h, w) bool, pixels whose distance and difference are known.
-        moving: (h, w) bool.
-        distance: (h, w) float32, metres.
-        sigma: (h, w) float32, metres.
-        difference: (h, w) float32, of intensities.
-        gradient: (h, w) float32, intensity per pixel.
-        out: (count + 1, 8) float64 out: pixels, used pixels, moving pixels, and over the used pixels that do not move
-            the number, and the sums of distance / sigma, difference and gradient; last the sum over those of the
-            difference's distance from its mean.
-    """
-    out[:] = 0.0
+def add_segment_sums(labels, compared, moving, distance, sigma, difference, gradient, out):
+    """Loop of ``segment_sums``; out is (count + 1, 8) float64, zeros before, columns as in ``SegmentSums``."""
     h, w = labels.shape
     for v in range(h):
         for u in range(w):
@@ -184,9 +332,9 @@ def sums(labels, used, moving, distance, sigma, difference, gradient, out):
             if n == 0:
                 continue
             out[n, 0] += 1
-            if used[v, u]:
+            if compared[v, u]:
                 out[n, 1] += 1
-            if used[v, u] and not moving[v, u]:
+            if compared[v, u] and not moving[v, u]:
                 out[n, 3] += 1
                 out[n, 4] += distance[v, u] / sigma[v, u]
                 out[n, 5] += difference[v, u]
@@ -196,37 +344,25 @@ def sums(labels, used, moving, distance, sigma, difference, gradient, out):
     for v in range(h):
         for u in range(w):
             n = labels[v, u]
-            if n > 0 and used[v, u] and not moving[v, u]:
+            if n > 0 and compared[v, u] and not moving[v, u]:
                 out[n, 7] += abs(difference[v, u] - out[n, 5] / out[n, 3])
 
 
 @kernel
 def reproject_difference(
-    row_start, row_stop, depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
-):
-    """A depth image against an older one of the same camera, seen from where the older one was.
-
-    Args:
-        row_start, row_stop: Rows of the band.
-        depth, intensity: (h, w) float32.
-        intrinsics: (4,) float32.
-        T: (3, 4) float32, this camera to the older one.
-        old_depth, old_intensity: (h, w) float32.
-        old_marks: (h, w) uint8.
-        gap: (h, w) float32 out: older reading minus this point's depth there, metres; the smallest among the four
-            readings around it; NaN where there is none.
-        difference: (h, w) float32 out: older minus this intensity, NaN likewise.
-        marks: (h, w) uint8 out: that reading's mark.
-    """
+    depth, intensity, intrinsics, T, old_depth, old_intensity, old_marks, gap, difference, marks
+):  # fmt: skip
+    """Loop of ``reproject``: ``T`` is (3, 4) float32, the last three arguments are written."""
     h, w = depth.shape
     zero, one, nan, far = np.float32(0), np.float32(1), np.float32(np.nan), np.float32(1e9)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
-    place = np.empty(w, np.int32)
-    seen = np.empty((4, w), np.float32)  # between the older pixels (2), depth there, inside
-    readings, greys, old = np.empty((4, w), np.float32), np.empty((4, w), np.float32), np.empty((4, w), np.float32)
+    first = np.empty(w, np.int32)  # index of the upper left of the four older pixels around the point
+    projected = np.empty((4, w), np.float32)  # position between the four (2), depth in the older camera, inside
+    readings, old_greys = np.empty((4, w), np.float32), np.empty((4, w), np.float32)
+    stored = np.empty((4, w), np.float32)
     last_u, last_v = np.float32(w - 1), np.float32(h - 1)
     flat_depth, flat_intensity, flat_marks = old_depth.reshape(-1), old_intensity.reshape(-1), old_marks.reshape(-1)
-    for v in range(row_start, row_stop):
+    for v in range(h):
         row_y = (np.float32(v) - intrinsics[3]) * by_fy
         row = depth[v]
         for u in range(w):
@@ -235,32 +371,38 @@ def reproject_difference(
             qx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
             qy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
             qz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-            by_z = one / max(qz, np.float32(0.05))
+            by_z = one / max(qz, NEAREST)
             pu = qx * by_z * intrinsics[0] + intrinsics[2]
             pv = qy * by_z * intrinsics[1] + intrinsics[3]
             fu, fv = np.floor(pu), np.floor(pv)
-            ok = (z > zero) & (qz > np.float32(0.05)) & (fu >= zero) & (fv >= zero) & (fu < last_u) & (fv < last_v)
-            place[u] = np.int32(fv * np.float32(w) + fu if ok else zero)
-            seen[0, u], seen[1, u], seen[2, u], seen[3, u] = pu - fu, pv - fv, qz, one if ok else zero
+            ok = (z > zero) & (qz > NEAREST) & (fu >= zero) & (fv >= zero) & (fu < last_u) & (fv < last_v)
+            first[u] = np.int32(fv * np.float32(w) + fu if ok else zero)
+            projected[0, u], projected[1, u], projected[2, u], projected[3, u] = (
+                pu - fu,
+                pv - fv,
+                qz,
+                one if ok else zero,
+            )
         for u in range(w):
-            first = np.int64(place[u])
+            start = np.int64(first[u])
             for k in range(4):
-                n = np.uintp(first + (k >> 1) * w + (k & 1))
-                readings[k, u], greys[k, u], old[k, u] = flat_depth[n], flat_intensity[n], np.float32(flat_marks[n])
+                n = np.uintp(start + (k >> 1) * w + (k & 1))
+                readings[k, u], old_greys[k, u] = flat_depth[n], flat_intensity[n]
+                stored[k, u] = np.float32(flat_marks[n])
         for u in range(w):
-            au, av, qz, inside = seen[0, u], seen[1, u], seen[2, u], seen[3, u]
+            au, av, qz, inside = projected[0, u], projected[1, u], projected[2, u], projected[3, u]
             best, mark, grey, total = far, zero, zero, zero
             for k in range(4):
                 reading = readings[k, u]
                 part = (au if k & 1 else one - au) * (av if k >> 1 else one - av)
                 part = part if reading > zero else zero
-                grey += part * greys[k, u]
+                grey += part * old_greys[k, u]
                 total += part
                 step = reading - qz if reading > zero else far
                 nearer = abs(step) < abs(best)
                 best = step if nearer else best
-                mark = old[k, u] if nearer else mark
-            known = (inside > zero) & (total > np.float32(0.25))
+                mark = stored[k, u] if nearer else mark
+            known = (inside > zero) & (total > LEAST_WEIGHT)
             gap[v, u] = best if known else nan
-            difference[v, u] = grey / max(total, np.float32(0.25)) - intensity[v, u] if known else nan
+            difference[v, u] = grey / max(total, LEAST_WEIGHT) - intensity[v, u] if known else nan
             marks[v, u] = np.int32(mark if inside > zero else zero)

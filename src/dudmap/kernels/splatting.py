@@ -1,37 +1,93 @@
-"""Loops that carry points seen in earlier images over to a new one."""
+"""Point splatting: points seen in earlier images, carried over into the image of a new pose."""
+
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.kernels.threads import kernel
 
-SAME = np.float32(0.05)
-"""Farthest that two readings of a pixel lie apart if they are of the same thing, as a share of the depth."""
+SAME_SURFACE = np.float32(0.05)
+"""Largest distance of two readings of a pixel on the same surface, as a share of the depth."""
+NEAREST = np.float32(0.05)
+"""Points nearer to the camera plane than this, or behind it, are not projected, metres."""
+
+
+class PointImage(NamedTuple):
+    """One point of the world per pixel.
+
+    Attributes:
+        points: (h, w, 3) float32, world frame, metres.
+        intensities: (h, w) float32, NaN = no point; the other two are then arbitrary.
+        times: (h, w, 2) float64, seconds: when the point's surface was first seen, and last.
+    """
+
+    points: NDArray[np.float32]
+    intensities: NDArray[np.float32]
+    times: NDArray[np.float64]
+
+    @classmethod
+    def empty(cls, shape: tuple[int, int]) -> "PointImage":
+        """No points."""
+        return cls(np.zeros((*shape, 3), np.float32), np.full(shape, np.float32(np.nan)), np.zeros((*shape, 2)))
+
+
+def splat(
+    image: PointImage, T_camera_world: NDArray[np.float64], intrinsics: NDArray[np.float32], since: float
+) -> PointImage:
+    """The points as a camera sees them: the nearest in each pixel.
+
+    Args:
+        image: Points in the world.
+        T_camera_world: (4, 4).
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        since: Points last seen before this time are left out, seconds.
+    """
+    out = PointImage.empty(image.intensities.shape)
+    points, intensities, times = image
+    splat_points(
+        points.reshape(-1, 3), intensities.reshape(-1), times.reshape(-1, 2), since,
+        T_camera_world[:3].astype(np.float32), intrinsics, *out,
+    )  # fmt: skip
+    return out
+
+
+def overwrite(
+    image: PointImage,
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    used: NDArray[np.bool_],
+    time: float,
+    T_world_camera: NDArray[np.float64],
+    intrinsics: NDArray[np.float32],
+) -> None:
+    """Replace the points of the pixels ``used`` by the readings of an image.
+
+    The time a point was first seen is kept where the reading lies on the same surface.
+
+    Args:
+        image: Points by pixel of the same camera pose; changed.
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        used: (h, w) bool.
+        time: Seconds.
+        T_world_camera: (4, 4).
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+    """
+    overwrite_points(depth, intensity, used, time, T_world_camera[:3].astype(np.float32), intrinsics, *image)
 
 
 @kernel
-def splat(points, shades, times, since, T, intrinsics, new_points, new_shades, new_times):
-    """What a camera sees of points in the world: the nearest in each pixel.
-
-    Args:
-        points: (n, 3) float32, world frame.
-        shades: (n,) float32, intensities; NaN = no point.
-        times: (n, 2) float64, when they were first and last seen.
-        since: Points seen earlier are left out.
-        T: (3, 4) float32, world to camera.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
-        new_points: (h, w, 3) float32 out, anything where there is none.
-        new_shades: (h, w) float32 out, NaN where there is none.
-        new_times: (h, w, 2) float64 out, anything where there is none.
-    """
-    h, w = new_shades.shape
+def splat_points(points, intensities, times, since, T, intrinsics, new_points, new_intensities, new_times):
+    """Loop of ``splat`` over n points; ``T`` is (3, 4) float32, the last three arguments are written."""
+    h, w = new_intensities.shape
     nearest = np.full((h, w), np.float32(1e9))
-    new_shades[:] = np.nan
-    for n in range(len(shades)):
-        if np.isnan(shades[n]) or times[n, 1] < since:
+    new_intensities[:] = np.nan
+    for n in range(len(intensities)):
+        if np.isnan(intensities[n]) or times[n, 1] < since:
             continue
         x, y, z = points[n, 0], points[n, 1], points[n, 2]
         qz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-        if qz < np.float32(0.05):
+        if qz < NEAREST:
             continue
         by_z = np.float32(1) / qz
         qu = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) * by_z * intrinsics[0] + intrinsics[2]
@@ -41,24 +97,13 @@ def splat(points, shades, times, since, T, intrinsics, new_points, new_shades, n
             continue
         nearest[v, u] = qz
         new_points[v, u, 0], new_points[v, u, 1], new_points[v, u, 2] = x, y, z
-        new_shades[v, u] = shades[n]
+        new_intensities[v, u] = intensities[n]
         new_times[v, u, 0], new_times[v, u, 1] = times[n, 0], times[n, 1]
 
 
 @kernel
-def overwrite(depth, intensity, used, time, T, intrinsics, points, shades, times):
-    """Put the readings of an image in place of what was known of their pixels.
-
-    Args:
-        depth, intensity: (h, w) float32.
-        used: (h, w) bool, pixels to put.
-        time: When they were seen.
-        T: (3, 4) float32, camera to world.
-        intrinsics: (4,) float32 fx, fy, cx, cy.
-        points: (h, w, 3) float32 in and out, world frame.
-        shades: (h, w) float32 in and out.
-        times: (h, w, 2) float64 in and out.
-    """
+def overwrite_points(depth, intensity, used, time, T, intrinsics, points, intensities, times):
+    """Loop of ``overwrite``; ``T`` is (3, 4) float32, the last three arguments are changed."""
     h, w = depth.shape
     for v in range(h):
         for u in range(w):
@@ -67,11 +112,11 @@ def overwrite(depth, intensity, used, time, T, intrinsics, points, shades, times
                 continue
             x = (np.float32(u) - intrinsics[2]) / intrinsics[0] * z
             y = (np.float32(v) - intrinsics[3]) / intrinsics[1] * z
-            apart = np.float32(0)
+            square = np.float32(0)
             for axis in range(3):
-                here = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
-                apart += (here - points[v, u, axis]) ** 2
-                points[v, u, axis] = here
-            if np.isnan(shades[v, u]) or apart > (SAME * z) ** 2:
+                coordinate = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2] * z + T[axis, 3]
+                square += (coordinate - points[v, u, axis]) ** 2
+                points[v, u, axis] = coordinate
+            if np.isnan(intensities[v, u]) or square > (SAME_SURFACE * z) ** 2:
                 times[v, u, 0] = time
-            shades[v, u], times[v, u, 1] = intensity[v, u], time
+            intensities[v, u], times[v, u, 1] = intensity[v, u], time

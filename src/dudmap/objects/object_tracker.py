@@ -176,8 +176,8 @@ class ObjectTracker:
     ) -> _Pixels | None:
         """The moving pixels by connected region, None if there is no region of some size."""
         moving = dynamic & (level.depth > 0)
-        regions = np.empty(moving.shape, dtype=np.int32)
-        count = labeling.grow(moving, moving, level.depth, np.float32(0.02) + np.float32(0.02) * level.depth, regions)
+        tolerance = np.float32(0.02) + np.float32(0.02) * level.depth
+        regions, count = labeling.grow_regions(moving, moving, level.depth, tolerance)
         number = regions.reshape(-1)
         sizes = np.bincount(number, minlength=count + 1)
         sizes[0] = 0

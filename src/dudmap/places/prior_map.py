@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.temporal_memory import TemporalMemory
+from dudmap.dynamics.detector import DynamicDetector
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.place_recognition import KeyframeDatabase
 
@@ -19,11 +19,11 @@ class PriorMap:
         submap: Number of that submap.
         Ts_world_camera: Poses (4, 4) of the frames tracked in it, by timestamp.
         keyframes: Keyframes of all submaps.
-        memory: Remembered frames of the first seconds.
+        detector: Holds the remembered frames of the first seconds.
     """
 
     volume: TsdfVolume
     submap: int
     Ts_world_camera: dict[float, NDArray[np.float64]]
     keyframes: KeyframeDatabase
-    memory: TemporalMemory
+    detector: DynamicDetector

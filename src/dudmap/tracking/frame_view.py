@@ -22,8 +22,7 @@ class FrameView:
     Attributes:
         observation: Preprocessed images.
         pyramid: Image pyramid of the observation.
-        segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them;
-            None where the labels do not need them.
+        segmentation: Returns the surface segments of ``pyramid.labelled``, waiting for the thread that computes them.
         timer: Collects the processing time of each stage.
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
         blind: The image is textureless although the first image of the map was not: the pose rests on the distances
@@ -32,7 +31,7 @@ class FrameView:
 
     observation: Observation
     pyramid: Pyramid
-    segmentation: Callable[[], Segmentation] | None
+    segmentation: Callable[[], Segmentation]
     timer: StageTimer
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False

@@ -122,13 +122,13 @@ class FrontEnd:
         coarse = view.pyramid.coarse
         weights = static_weights(labels, [coarse], estimate.unverified_mask)[0]
         self.time_offset.learn(self.tracker, volume, coarse, tracking.T_world_camera, velocity, weights)
-        self.detector.remember(view.labelled, tracking.T_world_camera, tracking.exposure, labels)
+        self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
     def lose(self, timestamp: float) -> None:
         """A frame was not tracked; after some time what the previous frames showed is no longer used."""
         self.monitor.lose()
         if self.motion.lost(timestamp):
-            self.detector.forget()
+            self.detector.reset()
             self.last_dynamic = None
 
     def _labels_unchanged(self, labels: Labels) -> bool:
@@ -147,10 +147,9 @@ class FrontEnd:
             if not view.blind:
                 velocity = self.motion.velocity_to(view.timestamp, T_depth)
                 T_depth = self.time_offset.depth_pose(view.pyramid.coarse, T_depth, velocity)
-            self.detector.begin(view.timestamp, prediction.moving)
-            if view.segmentation is not None:
-                self.detector.set_segmentation(view.labelled, view.segmentation)
-            labels = self.detector.detect(volume, view.labelled, T_depth, tracking.exposure)
+            labels = self.detector.detect(
+                volume, view.labelled, T_depth, view.timestamp, view.segmentation, prediction.moving, tracking.exposure
+            )
             if view.blind:
                 labels = replace(labels, hidden=None)
             if view.known_dynamic is None:

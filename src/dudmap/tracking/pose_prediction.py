@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, exceeds_noise_share
-from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry import se3
@@ -98,7 +97,7 @@ class PosePredictor:
             self._single_frame_map = False
             moving = motion.moving_after
             if not exceeds_noise_share(moving, view.labelled):  # else the pose is too uncertain for slow motion
-                moving = moving | self.ego_motion.slow(timestamp, T_image, pyramid, _segments(view))
+                moving = moving | self.ego_motion.slow(timestamp, T_image, pyramid, view.segmentation())
             young = self.ego_motion.young(timestamp)
             self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
             unverified = ~motion.resting_after if self._crowded_start else None
@@ -115,14 +114,14 @@ class PosePredictor:
             return
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
         T = estimate.T_world_camera
-        self.ego_motion.remember(view.timestamp, T, view.pyramid, _segments(view), dynamic)
+        self.ego_motion.remember(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
         """Motion of the static world from the previous image to this one."""
         if self.ego_motion.seconds == 0:
             return None
         T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
-        return self.ego_motion.compare(view.timestamp, view.pyramid, _segments(view), T_expected)
+        return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
 
     def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
         return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)
@@ -140,11 +139,6 @@ class PosePredictor:
         static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
         cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
         return cost < CLEARLY_BETTER * other
-
-
-def _segments(view: FrameView) -> Segmentation:
-    assert view.segmentation is not None
-    return view.segmentation()
 
 
 def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
