@@ -194,7 +194,12 @@ def test_motion_is_decided_per_segment(moved, mismatch, whole):
     """A segment half of which goes on moving is dynamic if its static half fits less well than static segments do."""
     one, many = np.array([0.0, 500.0]), np.array([0.0, 20000.0])
     evidence = SegmentEvidence(
-        size=np.append(one, many[1]), compared=np.ones(3), dynamic=np.array([0, 0.5, 0]),
-        static=np.array([0, 250.0, 20000]), distance=np.array([0, 0.3, 0.1]), mismatch=np.array([0, mismatch, 0.05]), texture=np.array([0, 0.07, 0.07]),
-    )  # fmt: skip
+        size=np.append(one, many[1]),
+        compared=np.ones(3),
+        dynamic=np.array([0, 0.5, 0]),
+        static=np.array([0, 250.0, 20000]),
+        distance=np.array([0, 0.3, 0.1]),
+        mismatch=np.array([0, mismatch, 0.05]),
+        texture=np.array([0, 0.07, 0.07]),
+    )
     assert classify_segments(evidence, np.array([0, moved, 0])).tolist() == [False, whole, False]
