@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
+from dudmap.dynamics.label_scale import scaled_length
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels.splatting import PointImage, overwrite, splat
@@ -17,7 +18,7 @@ VOTING_SIDE = 7
 MIN_KNOWN = 0.2
 """Share of that square behind which the background must be known."""
 STRIDE = 2
-"""Pixels of the label image per subsampled pixel, across and down."""
+"""Pixels of the label image per subsampled pixel, across and down, at REFERENCE_WIDTH."""
 MIN_AREA = 0.005
 """Smallest region without readings that is examined, as a share of the image."""
 
@@ -59,8 +60,8 @@ class BackgroundModel:
         if self._background is None:
             return none
         _, background, times = self._seen_from(timestamp, level, depth.shape, T_world_camera)
-        farthest = cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))
-        hole = farthest[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE] <= 0
+        rows, columns = (np.arange(0, size, _stride(level)) for size in level.depth.shape)
+        hole = np.maximum.reduceat(np.maximum.reduceat(level.depth, rows, axis=0), columns, axis=1) <= 0
         missing = np.isnan(background)
         square = np.ones((3, 3), np.uint8)
         darkest = cv2.erode(np.where(missing, np.float32(9), background), square)
@@ -95,7 +96,8 @@ class BackgroundModel:
         """
         depth, intensity = _subsampled(level)
         self._background = self._seen_from(timestamp, level, depth.shape, T_world_camera)
-        static = ~dynamic[::STRIDE, ::STRIDE]
+        stride = _stride(level)
+        static = ~dynamic[::stride, ::stride]
         overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, _intrinsics(level))
 
     def _seen_from(
@@ -109,12 +111,17 @@ class BackgroundModel:
 
 
 def _subsampled(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth of every STRIDE-th pixel across and down, and mean intensity around it."""
+    """Depth of one pixel per stride across and down, and mean intensity around it."""
     import cv2
 
-    depth = level.depth[::STRIDE, ::STRIDE]
+    depth = level.depth[:: _stride(level), :: _stride(level)]
     return depth, np.asarray(cv2.resize(level.intensity, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _intrinsics(level: Level) -> NDArray[np.float32]:
-    return level.camera.intrinsics / np.float32(STRIDE)
+    return level.camera.intrinsics / np.float32(_stride(level))
+
+
+def _stride(level: Level) -> int:
+    """Pixels of the label image per subsampled pixel: subsampled images are about 80 pixels wide."""
+    return scaled_length(STRIDE, level)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.dynamics.background_model import BackgroundModel
+from dudmap.dynamics.label_scale import pixel_scale
 from dudmap.dynamics.masks import Labels, elliptical_kernel, opened_mask
 from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture, residual_histogram
 from dudmap.dynamics.segments import (
@@ -31,7 +32,8 @@ MAP_ROUGHNESS = 0.4
 """Standard deviation of the map's surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
 """Largest depth step to a neighbour of the same surface: standard deviations of a reading, plus a share of the depth
-(a surface inclined by 69 degrees to the image plane, 160 pixels wide)."""
+per
+pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
 MAX_LOG_ODDS = 6
 """Log odds static : dynamic of a pixel that is certain: a probability of 0.25 %."""
 COUPLING = 4
@@ -115,7 +117,7 @@ class DynamicDetector:
         """
 
         def compute() -> Segmentation:
-            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level.depth))
+            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
@@ -160,7 +162,7 @@ class DynamicDetector:
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume.voxel_size)
         noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
-        tolerance = self._tolerance(sigma, level.depth)
+        tolerance = self._tolerance(sigma, level)
         frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise, tolerance)
         residual = np.asarray(np.abs(sample.distance) / sigma, np.float32)
         histogram = residual_histogram(residual[frame.surface])
@@ -173,7 +175,7 @@ class DynamicDetector:
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
         if self.config.regions:
-            seeds = opened_mask(dynamic) | (dynamic & frame.free)
+            seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
             dynamic = self._regions(frame, seeds, evidence)
             if self.config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
@@ -217,9 +219,10 @@ class DynamicDetector:
         return np.hypot(self.sensor.sigma(depth), MAP_ROUGHNESS * voxel_size).astype(np.float32)
 
     @staticmethod
-    def _tolerance(sigma: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
         """Largest depth step (h, w) to a neighbour of the same surface, metres."""
-        return np.asarray(DEPTH_EDGE_SIGMAS * sigma + np.float32(DEPTH_EDGE_SLOPE) * depth, np.float32)
+        slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
+        return np.asarray(DEPTH_EDGE_SIGMAS * sigma + slope * level.depth, np.float32)
 
     def _evidence(
         self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture

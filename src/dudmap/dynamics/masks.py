@@ -5,6 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.dynamics.label_scale import pixel_scale, scaled_side
 from dudmap.dynamics.mixture import Mixture
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
@@ -35,11 +36,18 @@ class Labels:
     hidden: NDArray[np.bool_] | None = None
 
 
-def opened_mask(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask (h, w) without parts thinner than three pixels: seams along depth edges, where readings fit no map."""
+SEAM = 1
+"""Half width of the seams along depth edges where readings fit no map, pixels at REFERENCE_WIDTH."""
+CLOSING_RADIUS = 2
+"""Half width of the holes in the depth that belong to the dynamic region around them, pixels at REFERENCE_WIDTH."""
+
+
+def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
+    """Mask (h, w) of an image without parts as thin as the seams along its depth edges."""
     import cv2
 
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    side = scaled_side(SEAM, level)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
@@ -52,7 +60,8 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     """
     import cv2
 
-    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, elliptical_kernel(2))
+    element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
+    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
     if labels.hidden is not None:
         low[labels.hidden] = 1
@@ -60,14 +69,15 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (h, w) at the resolution (H, W) of a depth image; see ``labeling.upsample_labels``.
+    """Mask (h, w) of a pyramid level at the resolution (H, W) of its depth image; see ``labeling.upsample_labels``.
 
     Args:
-        low: (h, w) bool.
+        low: (h, w) bool; a level is made by halvings, which round odd sizes down.
         low_depth: (h, w) float32, metres, 0 = none.
         depth: (H, W) float32, metres, 0 = none.
     """
-    return labeling.upsample_labels(low, low_depth, depth, depth.shape[1] // low.shape[1])
+    halvings = round(np.log2(depth.shape[1] / low.shape[1]))
+    return labeling.upsample_labels(low, low_depth, depth, 1 << halvings)
 
 
 def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:

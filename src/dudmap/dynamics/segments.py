@@ -1,33 +1,34 @@
 """Surface segments of an image, and the decision whether a whole segment moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.frames.observation import Level
 from dudmap.kernels import segmentation as kernels
 
 EDGE_REACH = 3
-"""Pixels from a concave edge to the normals that are compared on either side."""
+"""Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
 NORMAL_REACH = 2
-"""Pixels to either side over which a normal is estimated."""
+"""Pixels to either side over which a normal is estimated, at REFERENCE_WIDTH."""
 CONCAVITY = 0.2
 """Sine of half the smallest angle between the normals across a concave edge: 23 degrees."""
 MIN_PIXELS = 60
-"""Segments of fewer pixels are not classified as a whole."""
+"""Segments of fewer pixels are not classified as a whole, at REFERENCE_WIDTH: 0.3 % of an image of 4:3."""
 MAX_SHARE = 0.15
 """Segments that cover more than this share of the readings belong to the room: they are dynamic only if nearly all of
 their pixels are."""
 DISTANCE_SCALE = 2.8
 """Mean distance to the map of a segment that surely moved, standard deviations of a reading."""
 MISMATCH_SCALE = 0.48
-"""Intensity mismatch of a segment that surely moved, pixels of motion."""
+"""Intensity mismatch of a segment that surely moved, pixels of motion at REFERENCE_WIDTH."""
 COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
 """Upper quartiles of both over the static segments of a well registered frame; where the quartiles of a frame are
 larger, the scales grow in proportion."""
 GRADIENT_NOISE = 0.03
-"""Intensity gradient of noise, per pixel: smaller ones give no evidence."""
+"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH: smaller ones give no evidence."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -37,12 +38,16 @@ class Segmentation:
     Attributes:
         labels: (h, w) int32 segment numbers from 1, 0 = no reading.
         count: Number of segments.
-        gradient: (h, w) float32, magnitude of the intensity gradient per pixel, mean over 3x3.
+        gradient: (h, w) float32, local mean of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        window: Side of the window for local means of intensities, pixels.
     """
 
     labels: NDArray[np.int32]
     count: int
     gradient: NDArray[np.float32]
+    min_pixels: float = MIN_PIXELS
+    window: int = 3
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""
@@ -52,7 +57,8 @@ class Segmentation:
 
 @dataclass(frozen=True, eq=False)
 class SegmentEvidence:
-    """Evidence of motion per segment, gathered over its pixels; all (count + 1,) float64, entry 0 is meaningless.
+    """Evidence of motion per segment, gathered over its pixels; all arrays (count + 1,) float64, entry 0 is
+    meaningless.
 
     A pixel of a segment is compared where the map (or an older frame) has a surface near it, and counts as static
     where it is compared and is not dynamic by itself.
@@ -67,6 +73,7 @@ class SegmentEvidence:
             intensity difference from its mean, over their mean gradient G, damped where G is no larger than noise:
             D G / (G + GRADIENT_NOISE)^2.
         texture: Mean intensity gradient G of the static pixels.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
     """
 
     size: NDArray[np.float64]
@@ -76,6 +83,7 @@ class SegmentEvidence:
     distance: NDArray[np.float64]
     mismatch: NDArray[np.float64]
     texture: NDArray[np.float64]
+    min_pixels: float = MIN_PIXELS
 
 
 def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
@@ -87,13 +95,15 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
     """
     import cv2
 
+    edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
     labels, count = kernels.segment_surface(
-        level.depth, level.camera.intrinsics, tolerance, EDGE_REACH, NORMAL_REACH, CONCAVITY
+        level.depth, level.camera.intrinsics, tolerance, edge_reach, normal_reach, CONCAVITY
     )
-    du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=1 / 8)
-    dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=1 / 8)
-    gradient = cv2.blur(cv2.magnitude(du, dv), (3, 3))
-    return Segmentation(labels, count, np.asarray(gradient, dtype=np.float32))
+    scale, window = pixel_scale(level), scaled_side(1, level)
+    du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=scale / 8)
+    dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=scale / 8)
+    gradient = np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
+    return Segmentation(labels, count, gradient, scaled_area(MIN_PIXELS, level), window)
 
 
 def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.bool_]) -> Segmentation:
@@ -107,7 +117,7 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     """
     total = np.bincount(segmentation.labels.reshape(-1), minlength=segmentation.count + 1)
     part = np.bincount(segmentation.labels[dynamic_before], minlength=segmentation.count + 1)
-    mixed = np.minimum(part, total - part) >= np.maximum(MIN_PIXELS, 0.2 * total)
+    mixed = np.minimum(part, total - part) >= np.maximum(segmentation.min_pixels, 0.2 * total)
     mixed[0] = False
     if not mixed.any():
         return segmentation
@@ -116,7 +126,7 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     number[mixed] = np.arange(segmentation.count + 1, count + 1)
     split = dynamic_before & mixed[segmentation.labels]
     labels = np.where(split, number[segmentation.labels], segmentation.labels)
-    return Segmentation(labels, count, segmentation.gradient)
+    return replace(segmentation, labels=labels, count=count)
 
 
 def segment_evidence(
@@ -140,8 +150,9 @@ def segment_evidence(
     import cv2
 
     ones = compared.astype(np.float32)
-    mean_difference = cv2.blur(np.where(compared, difference, np.float32(0)), (3, 3)) / np.maximum(
-        cv2.blur(ones, (3, 3)), np.float32(1e-3)
+    window = segmentation.window, segmentation.window
+    mean_difference = cv2.blur(np.where(compared, difference, np.float32(0)), window) / np.maximum(
+        cv2.blur(ones, window), np.float32(1e-3)
     )
     sums = kernels.segment_sums(
         segmentation.labels, segmentation.count, compared, dynamic, distance, sigma,
@@ -157,6 +168,7 @@ def segment_evidence(
         distance=sums.distance / static,
         mismatch=sums.deviation / static * texture / (texture + GRADIENT_NOISE) ** 2,
         texture=texture,
+        min_pixels=segmentation.min_pixels,
     )
 
 
@@ -169,7 +181,7 @@ def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.floa
 
         strong = (max(s, 0) / S)^2 + (m / M)^2    and    weak = (s / (0.35 S))^2 + (m / (0.7 M))^2
 
-    a segment of at least MIN_PIXELS is dynamic if d >= 0.8, or if it covers at most MAX_SHARE of the readings and
+    a segment of at least ``min_pixels`` is dynamic if d >= 0.8, or if it covers at most MAX_SHARE of the readings and
 
     - d >= 0.1 and strong >= 1, where at least half of it is compared, or
     - d >= 0.2 and weak >= 1, or d >= 0.6 where it has too little texture or too few static pixels for evidence, or
@@ -180,7 +192,7 @@ def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.floa
         evidence: Evidence of each segment.
         dynamic_before: (count + 1,) share of the pixels that were dynamic in the last frame.
     """
-    counted = np.flatnonzero((evidence.compared > 0.5) & (evidence.size >= MIN_PIXELS))
+    counted = np.flatnonzero((evidence.compared > 0.5) & (evidence.size >= evidence.min_pixels))
     static = counted[evidence.dynamic[counted] < 0.5]
     distance_scale = DISTANCE_SCALE * max(1.0, upper_quartile(np.abs(evidence.distance[static])) / COMMON_DISTANCE)
     mismatch_scale = MISMATCH_SCALE * max(1.0, upper_quartile(evidence.mismatch[static]) / COMMON_MISMATCH)
@@ -189,14 +201,14 @@ def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.floa
         (np.maximum(evidence.distance, 0) / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2
     )[counted]
     weak = (evidence.distance / (0.35 * distance_scale)) ** 2 + (evidence.mismatch / (0.7 * mismatch_scale)) ** 2
-    informative = (evidence.texture > GRADIENT_NOISE) & (evidence.static >= 0.5 * MIN_PIXELS)
+    informative = (evidence.texture > GRADIENT_NOISE) & (evidence.static >= 0.5 * evidence.min_pixels)
     dynamic = (strong >= 1) & (evidence.dynamic >= 0.1)
     dynamic |= np.where(informative, (evidence.dynamic >= 0.2) & (weak >= 1), evidence.dynamic >= 0.6)
     dynamic |= (dynamic_before >= 0.7) & (evidence.dynamic >= 0.2) & (weak >= 0.4)
     dynamic |= (dynamic_before >= 0.4) & (evidence.dynamic >= 0.4) & (weak >= 0.5)
     dynamic &= evidence.size <= MAX_SHARE * evidence.size[1:].sum()
     dynamic |= evidence.dynamic >= 0.8
-    dynamic &= evidence.size >= MIN_PIXELS
+    dynamic &= evidence.size >= evidence.min_pixels
     dynamic[0] = False
     return dynamic
 

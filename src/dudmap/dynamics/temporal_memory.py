@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.segments import COMMON_MISMATCH, MIN_PIXELS, Segmentation, segment_evidence, upper_quartile
+from dudmap.dynamics.label_scale import scaled_side
+from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, segment_evidence, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation as kernels
@@ -25,9 +26,10 @@ SAME_INTENSITY = 0.08
 """Largest intensity difference of two readings of one static point."""
 STATIC_PERIOD = 0.3
 """Time, in units of ``start_seconds``, over which a point must have been seen in place to count as static."""
-SEAM = 3
-"""Side, pixels, of the structuring element that removes thin free regions: a slightly wrong pose along a depth edge
-makes them."""
+SEAM = 1
+"""Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+STATIC_RADIUS = 2
+"""Radius of the median filter of static pixels, pixels at REFERENCE_WIDTH."""
 DYNAMIC_PIXEL, DYNAMIC_SEGMENT = 1, 2
 """Bits of a pixel's mark in a remembered frame: it was dynamic; it belonged to a segment with dynamic pixels."""
 
@@ -187,9 +189,10 @@ class TemporalMemory:
             num_seen += seen
             age[seen] = np.maximum(age[seen], abs(timestamp - frame.timestamp))
         static = (num_seen >= 2) & (num_same == num_seen) & (age >= STATIC_PERIOD * self.config.start_seconds)
-        static = cv2.medianBlur(static.astype(np.uint8), 5) > 0
+        static = cv2.medianBlur(static.astype(np.uint8), scaled_side(STATIC_RADIUS, level)) > 0
         free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
-        free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((SEAM, SEAM), np.uint8)) > 0
+        side = scaled_side(SEAM, level)
+        free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
         return free, static
 
     def settled(
@@ -220,10 +223,9 @@ class TemporalMemory:
         if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
             return none
         count = segmentation.count
-        parts = Segmentation(  # the dynamic part of segment n is n + count
-            segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0)), 2 * count, segmentation.gradient
-        )
-        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= MIN_PIXELS
+        labels = segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0))
+        parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
+        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
         settled[: count + 1] = False
         for frame in frames:
             ((gap, difference, _),) = reproject(level, T_world_camera, [frame])
@@ -231,7 +233,7 @@ class TemporalMemory:
             displaced = compared & (np.abs(np.nan_to_num(gap)) > 4 * sigma)
             evidence = segment_evidence(parts, compared, displaced, gap, sigma, difference)
             visible = evidence.compared > 0.7
-            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= MIN_PIXELS)])
+            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
             settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
             settled &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
             if not settled.any():
