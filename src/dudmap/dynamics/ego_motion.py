@@ -14,7 +14,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ransac import NOISE_PX, projected, rigid_motion
+from dudmap.dynamics.ransac import NOISE_PX, reproject, rigid_motion
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.optical_flow import consistent_with_static, track_forward_backward
@@ -28,7 +28,7 @@ MOVES_SIGMAS = 5.0
 MOVES_SHARE = 0.08
 """and by this share of its own path besides (motion blur, rolling shutter), moves."""
 FAR_PX = 3.0
-"""Corners farther off than this say nothing of that deviation."""
+"""Corners farther off than this weights nothing of that deviation."""
 RAYLEIGH = 1.1774
 """Median length of a vector of two normally distributed coordinates of deviation 1."""
 FEWEST = 15
@@ -198,7 +198,7 @@ def dominant_motion(
     Args:
         before, after: Both images; corners are followed in the finest levels.
         surfaces: Segmentation of surface of both, at the size of the labels.
-        moved: (h, w) bool at that size, what is known to move in the first image; it has little say in what the
+        moved: (h, w) bool at that size, what is known to move in the first image; it has little weights in what the
             static world is.
         T_expected: (4, 4) what the motion should be: where corners are looked for first, and what decides between
             two motions that explain much. None: no motion.
@@ -206,19 +206,19 @@ def dominant_motion(
     """
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
     T_expected = np.eye(4) if T_expected is None else T_expected
-    expected = projected(T_expected, _points(fine, before.corners), fine.camera)
+    expected = reproject(T_expected, _points(fine, before.corners), fine.camera)
     pixels, targets, unlike = track_forward_backward(first, second, before.corners, expected)
     if len(pixels) < FEWEST:
         return None
     points = _points(fine, pixels)
     z, (columns, rows) = points[:, 2], pixels.T
-    say, rests = np.ones(len(z)), np.ones(len(z), dtype=bool)
+    weights, rests = np.ones(len(z)), np.ones(len(z), dtype=bool)
     if moved is not None:
         factor = fine.depth.shape[1] // moved.shape[1]
         rests = ~moved[rows // factor, columns // factor]
-        say[~rests] = MOVED_SAY
-    T, surface = rigid_motion(points, targets, say, fine.camera, T_expected), say * z**2
-    error = np.linalg.norm(projected(T, points, fine.camera) - targets, axis=1)
+        weights[~rests] = MOVED_SAY
+    T, surface = rigid_motion(points, targets, weights, fine.camera, T_expected), weights * z**2
+    error = np.linalg.norm(reproject(T, points, fine.camera) - targets, axis=1)
     if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
         return None
     share = float(surface[error < NOISE_PX].sum() / surface.sum())
@@ -230,7 +230,7 @@ def dominant_motion(
     moves = error > allowed
     certain = ~moves
     certain[moves] = ~consistent_with_static(
-        first, second, pixels[moves], projected(T, points[moves], fine.camera), allowed[moves], unlike[moves]
+        first, second, pixels[moves], reproject(T, points[moves], fine.camera), allowed[moves], unlike[moves]
     )
     pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
     depth_after = fine_after.depth[
