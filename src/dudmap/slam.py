@@ -202,7 +202,7 @@ class Slam:
         self._lost_since = None
         self.atlas.add_pose(task.timestamp, tracked.T_world_camera)
         if task.blind:
-            self.first_guess.parallax.forget()
+            self.first_guess.parallax.reset()
         else:
             self.first_guess.keep(task.timestamp, task.pyramid, tracked.T_world_camera, self.volume)
 

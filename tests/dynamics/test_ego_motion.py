@@ -60,9 +60,7 @@ def test_the_refining_step_is_that_of_least_squares():
     assert 20 < np.count_nonzero(near) < 180
     weights = rng.uniform(0.1, 1, 200)
     J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
-    H, gradient, count = consensus.normal_equations(
-        points, targets, weights, guess, CAMERA.intrinsics, 2 * NOISE_PX
-    )
+    H, gradient, count = consensus.normal_equations(points, targets, weights, guess, CAMERA.intrinsics, 2 * NOISE_PX)
     assert count == np.count_nonzero(near)
     root = np.sqrt(np.repeat(weights[near], 2))
     expected = np.linalg.lstsq(root[:, None] * J, root * residual[near].reshape(-1), rcond=None)[0]
@@ -146,12 +144,12 @@ def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd)
     known, before, after = parallax.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
     assert known.compare(0.0, *before) is None
-    known.remember(0.0, np.eye(4), *before)
+    known.update(0.0, np.eye(4), *before)
     motion = known.compare(0.1, *after)
     assert motion is not None
     assert known.compare(0.1, *after) is motion
     assert known.compare(0.2, *after) is not motion
-    known.forget()
+    known.reset()
     assert known.compare(0.1, *after) is None
     assert not known.active
 

@@ -1,4 +1,4 @@
-"""Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, and their Gauss-Newton refinement."""
+"""Consensus of point correspondences on a rigid motion: MSAC scores of hypotheses, Gauss-Newton on the inliers."""
 
 from typing import NamedTuple
 

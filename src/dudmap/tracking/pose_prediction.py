@@ -84,11 +84,11 @@ class PosePredictor:
             moving, small = motion.moving_after, pyramid.labelled
             if not exceeds_noise_share(moving, small):  # else something slow hardly drags the camera on its own
                 surface = self.registration.detector.pieces(small, volume)
-                moving = moving | self.parallax.slow(timestamp, T_seen, pyramid, surface)
-            self._crowd = self._crowd and self.parallax.young(timestamp) and is_majority_dynamic(moving, small)
+                moving = moving | self.parallax.slow_movers(timestamp, T_seen, pyramid, surface)
+            self._crowd = self._crowd and self.parallax.map_is_young(timestamp) and is_majority_dynamic(moving, small)
             if self._crowd:
-                self.unverified_mask = ~motion.resting_after
-            if not self.parallax.young(timestamp):  # elsewhere the map knows better what moves
+                self.unverified_mask = ~motion.static_after
+            if not self.parallax.map_is_young(timestamp):  # elsewhere the map knows better what moves
                 moving = moving & (_place(volume, small, T_seen) == UNKNOWN)
             return PosePrediction(T_seen, moving, moving_before)
 
@@ -106,7 +106,7 @@ class PosePredictor:
         """Take over a tracked frame as the one to compare the next with."""
         if self.parallax.seconds > 0:
             surface, moved = self.registration.detector.pieces(pyramid.labelled, volume), self.registration.moved
-            self.parallax.remember(timestamp, T_world_camera, pyramid, surface, moved)
+            self.parallax.update(timestamp, T_world_camera, pyramid, surface, moved)
 
     def fits_better(
         self, volume: TsdfVolume, T: NDArray[np.float64], T_other: NDArray[np.float64], level: Level
