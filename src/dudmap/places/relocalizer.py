@@ -1,0 +1,133 @@
+"""Relocalization: the pose of a lost frame from recognised keyframes, and the decision to start a new submap."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.dynamics.masks import Labels
+from dudmap.frames.observation import Level, Observation
+from dudmap.geometry.alignment import agree
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.atlas import Atlas
+from dudmap.stage_timer import StageTimer
+from dudmap.tracking.tracker import TrackingResult
+
+Register = Callable[[TsdfVolume, NDArray[np.float64]], tuple[TrackingResult, Labels | None]]
+"""Registers and labels the lost frame against a map, starting from a pose (4, 4) in the world of that map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relocalization:
+    """Verified pose of a frame after tracking was lost.
+
+    Attributes:
+        tracking: Registration against the map of ``submap``.
+        labels: Dynamic labels of the frame, None if dynamics are not estimated.
+        submap: Number of the submap that the frame was recognised in. It may differ from the current one.
+    """
+
+    tracking: TrackingResult
+    labels: Labels | None
+    submap: int
+
+
+class Relocalizer:
+    """Recovers the camera pose after tracking was lost.
+
+    A lost frame is compared with all keyframes of the atlas. Each candidate pose is verified by registering the frame
+    against the map of the candidate's submap. The atlas is read only: switching it to the submap in which the frame
+    was found, and starting a new submap, are left to the caller.
+
+    Args:
+        config: All parameters; used are ``relocalization`` and ``submaps``.
+        atlas: Submaps and keyframes.
+        prior_map: Map of a first pass. If given, candidates are verified against it instead of the submap's own map.
+    """
+
+    def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
+        self.config = config
+        self.atlas = atlas
+        self.prior_map = prior_map
+        self._lost_since: float | None = None
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether no frame has been tracked since the last call of ``lost``."""
+        return self._lost_since is not None
+
+    def lost(self, timestamp: float) -> None:
+        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized."""
+        if self._lost_since is None:
+            self._lost_since = timestamp
+
+    def found(self) -> None:
+        """Record that the camera is tracked again or that a new submap was started."""
+        self._lost_since = None
+
+    def recover(
+        self,
+        observation: Observation,
+        level: Level,
+        register: Register,
+        accept: Callable[[TrackingResult], bool],
+        timer: StageTimer,
+        static_mask: NDArray[np.bool_] | None = None,
+    ) -> Relocalization | None:
+        """Pose of a lost frame, verified by the registration against the map.
+
+        Candidates in the current submap are tried first, those with more matching features before others. The first
+        is taken whose registration converges, is accepted, has at least ``relocalization.min_on_map`` of the frame's
+        readings static and on the map, and stays within ``relocalization.max_distance`` and ``max_angle_deg`` of the
+        pose given by the features.
+
+        Args:
+            observation: The lost frame.
+            level: Its pyramid level at label resolution (h, w).
+            register: Registers and labels this frame against a map.
+            accept: Whether the residuals of a registration are plausible.
+            timer: Receives the time of feature matching as stage ``recognise``.
+            static_mask: (H, W) bool, pixels not known to be dynamic; None = all.
+
+        Returns:
+            None if relocalization is switched off or no candidate passes.
+        """
+        limits = self.config.relocalization
+        if not limits.enabled:
+            return None
+        with timer("recognise"):
+            candidates = self.atlas.keyframes.find(observation, static_mask)
+        candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
+        candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
+        num_readings = max(np.count_nonzero(level.depth), 1)
+        for candidate in candidates:
+            submap, T_features = candidate.keyframe.submap, candidate.T_world_camera
+            volume = self.atlas.volumes[submap] if self.prior_map is None else self.prior_map
+            tracking, labels = register(volume, T_features)
+            static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
+            if (
+                tracking.converged
+                and accept(tracking)
+                and static_share * tracking.inlier_share >= limits.min_on_map
+                and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)
+            ):
+                return Relocalization(tracking, labels, submap)
+        return None
+
+    def wants_new_submap(self, observation: Observation) -> bool:
+        """Whether tracking should go on in a new, empty submap that starts with this frame.
+
+        That is the case if the camera has been lost for ``submaps.patience`` seconds, and the frame has enough depth
+        readings for a map and enough features for a keyframe.
+        """
+        config = self.config.submaps
+        if not config.enabled or self.atlas.history is None or self._lost_since is None:
+            return False
+        if observation.timestamp - self._lost_since < config.patience:
+            return False
+        if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
+            return False
+        num_features = len(self.atlas.keyframes.features(observation).points)
+        return num_features >= self.config.relocalization.min_inliers

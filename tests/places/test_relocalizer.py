@@ -1,0 +1,156 @@
+"""The relocalizer against stand-ins: order and verification of candidates, and when a new submap is wanted."""
+
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dudmap.config import Config
+from dudmap.frames.observation import Level, Observation
+from dudmap.geometry.camera import Camera
+from dudmap.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
+from dudmap.places.relocalizer import Relocalizer
+from dudmap.stage_timer import StageTimer
+from dudmap.tracking.tracker import TrackingResult
+
+CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)
+GOOD = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
+
+
+def shifted(x):
+    T = np.eye(4)
+    T[0, 3] = x
+    return T
+
+
+def frame(timestamp, depth=1.0):
+    image = np.full(CAMERA.shape, depth, np.float32)
+    return Observation(timestamp, CAMERA, image, image, image, np.zeros((*CAMERA.shape, 3), np.uint8))
+
+
+def features(count):
+    return PlacedFeatures(np.zeros((count, 128), np.float32), np.zeros((count, 3)))
+
+
+def match(submap, x, support=20):
+    return PlaceMatch(Keyframe(0.0, np.eye(4), features(0), submap), shifted(x), support)
+
+
+class Places:
+    """A keyframe database with fixed answers."""
+
+    def __init__(self, candidates, num_features):
+        self.candidates, self.num_features, self.masks = candidates, num_features, []
+
+    def find(self, observation, static_mask=None):
+        self.masks.append(static_mask)
+        return list(self.candidates)
+
+    def features(self, observation, static_mask=None):
+        return features(self.num_features)
+
+
+def relocalizer(candidates=(), *, current=1, prior_map=None, num_features=100, history=True, overrides=()):
+    atlas = SimpleNamespace(
+        keyframes=Places(candidates, num_features),
+        volumes={0: "map 0", 1: "map 1"},
+        current=current,
+        history=object() if history else None,
+    )
+    return Relocalizer(Config().override(overrides), atlas, prior_map)
+
+
+class Registration:
+    """Registers at the pose it starts from, and records what it was called with."""
+
+    def __init__(self, tracking=GOOD, labels=None, moved=0.0):
+        self.tracking, self.labels, self.moved, self.calls = tracking, labels, moved, []
+
+    def __call__(self, volume, T_init):
+        self.calls.append((volume, T_init[0, 3]))
+        return replace(self.tracking, T_world_camera=shifted(self.moved) @ T_init), self.labels
+
+
+def recover(subject, register, accept=lambda tracking: True, static_mask=None):
+    level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
+    return subject.recover(frame(5.0), level, register, accept, StageTimer(), static_mask)
+
+
+def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
+    subject, register = relocalizer([match(0, 0.1), match(1, 0.2), match(0, 0.3), match(1, 0.4)]), Registration()
+    assert recover(subject, register, accept=lambda tracking: False) is None
+    assert register.calls == [("map 1", 0.2), ("map 1", 0.4), ("map 0", 0.1), ("map 0", 0.3)]
+    assert subject.atlas.current == 1
+
+
+def test_the_first_verified_candidate_is_returned_with_its_submap():
+    subject, register = relocalizer([match(1, 0.2), match(0, 0.1), match(0, 0.3)]), Registration(labels=None)
+    result = recover(subject, register, accept=lambda tracking: tracking.T_world_camera[0, 3] < 0.15)
+    assert (result.submap, result.tracking.T_world_camera[0, 3], result.labels) == (0, 0.1, None)
+    assert len(register.calls) == 2
+    assert subject.atlas.current == 1
+
+
+@pytest.mark.parametrize(
+    ("register", "passes"),
+    [
+        (Registration(), True),
+        (Registration(replace(GOOD, converged=False)), False),
+        (Registration(replace(GOOD, inlier_share=0.39)), False),
+        (Registration(replace(GOOD, inlier_share=0.41)), True),
+        (Registration(moved=0.05), True),
+        (Registration(moved=0.07), False),
+        (Registration(labels=SimpleNamespace(dynamic=np.arange(768).reshape(24, 32) < 384)), True),  # 0.5 * 0.9 on the map
+        (Registration(labels=SimpleNamespace(dynamic=np.arange(768).reshape(24, 32) < 480)), False),
+    ],
+)
+def test_registration_must_confirm_the_features(register, passes):
+    assert (recover(relocalizer([match(1, 0.2)]), register) is not None) == passes
+
+
+def test_the_static_mask_reaches_the_features():
+    subject, mask = relocalizer(), np.ones(CAMERA.shape, dtype=bool)
+    assert recover(subject, Registration(), static_mask=mask) is None
+    assert subject.atlas.keyframes.masks == [mask]
+
+
+def test_switched_off():
+    subject = relocalizer([match(1, 0.2)], overrides=["relocalization.enabled=false"])
+    assert recover(subject, Registration()) is None
+
+
+def test_a_second_pass_verifies_against_the_map_of_the_first():
+    """Keyframes of other submaps of the first pass have poses in other worlds: they are no candidates."""
+    subject, register = relocalizer([match(7, 0.1), match(1, 0.2)], prior_map="prior map"), Registration()
+    assert recover(subject, register).submap == 1
+    assert register.calls == [("prior map", 0.2)]
+
+
+def test_a_new_submap_is_wanted_after_a_while():
+    subject = relocalizer()
+    assert not subject.wants_new_submap(frame(100.0))  # not lost
+    subject.lost(1.0)
+    subject.lost(1.5)  # lost since 1.0 still
+    assert subject.is_lost
+    assert not subject.wants_new_submap(frame(1.9))
+    assert subject.wants_new_submap(frame(2.1))
+    subject.found()
+    assert not subject.is_lost
+    assert not subject.wants_new_submap(frame(2.1))
+
+
+@pytest.mark.parametrize(
+    "options",
+    [{"num_features": 14}, {"history": False}, {"overrides": ["submaps.enabled=false"]}],
+)
+def test_reasons_against_a_new_submap(options):
+    subject = relocalizer(**options)
+    subject.lost(0.0)
+    assert not subject.wants_new_submap(frame(10.0))
+
+
+def test_a_frame_without_depth_starts_no_submap():
+    subject = relocalizer()
+    subject.lost(0.0)
+    assert not subject.wants_new_submap(frame(10.0, depth=0.0))
