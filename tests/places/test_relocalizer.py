@@ -101,7 +101,7 @@ def test_the_first_verified_candidate_is_returned_with_its_submap():
         (Registration(replace(GOOD, inlier_share=0.41)), True),
         (Registration(moved=0.05), True),
         (Registration(moved=0.07), False),
-        (Registration(labels=SimpleNamespace(dynamic=np.arange(768).reshape(24, 32) < 384)), True),  # 0.5 * 0.9 on the map
+        (Registration(labels=SimpleNamespace(dynamic=np.arange(768).reshape(24, 32) < 384)), True),  # 0.45 on the map
         (Registration(labels=SimpleNamespace(dynamic=np.arange(768).reshape(24, 32) < 480)), False),
     ],
 )
