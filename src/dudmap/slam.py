@@ -315,7 +315,8 @@ class Slam:
         self.health.lost()
         readings = max(np.count_nonzero(task.pyramid.labelled.depth), 1)
         with task.clock("recognise"):
-            candidates = self.keyframes.find(observation, None if task.known is None else ~task.known)
+            found = self.keyframes.extract(observation, None if task.known is None else ~task.known)
+            candidates = self.keyframes.match(found)
         lost_in = self.atlas.current
         candidates.sort(key=lambda place: place.keyframe.submap != lost_in)  # rather stay than change the map
         for place in candidates:
@@ -347,7 +348,7 @@ class Slam:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
-        if len(self.keyframes.features(observation).points) < self.config.relocalization.min_inliers:
+        if len(self.keyframes.extract(observation)) < self.config.relocalization.min_inliers:
             return False
         self.atlas.start_submap()
         self.health, self._lost_since = QualityMonitor(), None

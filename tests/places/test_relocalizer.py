@@ -43,12 +43,12 @@ class Places:
     def __init__(self, candidates, num_features):
         self.candidates, self.num_features, self.masks = candidates, num_features, []
 
-    def find(self, observation, static_mask=None):
+    def extract(self, observation, static_mask=None):
         self.masks.append(static_mask)
-        return list(self.candidates)
-
-    def features(self, observation, static_mask=None):
         return features(self.num_features)
+
+    def match(self, features):
+        return list(self.candidates)
 
 
 def relocalizer(candidates=(), *, current=1, prior_map=None, num_features=100, history=True, overrides=()):
