@@ -15,7 +15,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.run import run
-from dudmap.places.atlas import Atlas, at_time
+from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
 from dudmap.slam import Slam
@@ -29,12 +29,6 @@ def shifted(x, y=0.0):
     T = np.eye(4)
     T[:2, 3] = x, y
     return T
-
-
-def test_motions_between_those_known():
-    stamps, Ts = np.array([1.0, 3.0]), np.stack([shifted(0.0), shifted(0.2)])
-    for time, x in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.05), (3.0, 0.2), (9.0, 0.2)):
-        np.testing.assert_allclose(at_time(stamps, Ts, time), shifted(x), atol=1e-12)
 
 
 def wall(timestamp):
