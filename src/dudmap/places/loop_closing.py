@@ -267,14 +267,15 @@ class LoopCloser:
             if edge.a in number and edge.b in number:
                 edges.append(Edge(number[edge.a], number[edge.b], edge.T_a_b, edge.sigma_distance, edge.sigma_angle))
         Ts_new = optimize(Ts, edges)
+        if not np.all(np.isfinite(Ts_new)):
+            return None
         volume = self.atlas.make_volume()
         history.reintegrate(volume, nodes, list(Ts_new))
-        correction = Ts_new[-1] @ se3.inverse(Ts[-1])
         if self._worse(volume, nodes, Ts, Ts_new):
             return None
         self._edges += loop
         self.closed += 1
-        return self.atlas.correct(nodes, Ts_new, volume) if np.all(np.isfinite(correction)) else None
+        return self.atlas.correct(nodes, Ts_new, volume)
 
     def _worse(
         self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], Ts_new: NDArray[np.float64]
