@@ -10,16 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.evaluation.segmentation import SCORED_COVERAGE
 from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
     from dudmap.objects.object_tracker import Mover
     from dudmap.result import FrameResult
-
-SCORED_COVERAGE = 0.05
-"""Masks are scored in frames where more than this share of the image truly moves."""
 
 
 @dataclass
@@ -158,24 +154,6 @@ class RunRecord:
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }
         return out
-
-
-def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
-    """Absolute and relative trajectory error against the ground truth; the reason where they cannot be computed."""
-    from dudmap.evaluation.trajectory import ate, rpe
-
-    keys = ("ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s")
-    out: dict[str, Any] = dict.fromkeys(keys)
-    try:
-        absolute = ate(estimate, reference)
-        out["ate_rmse_m"] = _number(absolute.rmse, 6)
-        out["ate_rot_rmse_deg"] = _number(absolute.rot_rmse_deg, 6)
-        relative = rpe(estimate, reference, delta=1.0)
-        out["rpe_trans_rmse_m_per_s"] = _number(relative.trans_rmse, 6)
-        out["rpe_rot_rmse_deg_per_s"] = _number(relative.rot_rmse_deg, 6)
-    except DatasetError as error:
-        out["accuracy_missing"] = str(error)
-    return out
 
 
 def _row(mover: "Mover") -> dict[str, Any]:

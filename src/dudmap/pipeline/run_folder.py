@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
-from dudmap.pipeline.metrics import RunRecord, accuracy
+from dudmap.pipeline.metrics import RunRecord
 
 if TYPE_CHECKING:
     from dudmap.objects.object_map import RigidObject
