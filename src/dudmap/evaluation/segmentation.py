@@ -66,6 +66,11 @@ class MaskResult:
     num_missing: int
 
 
+def mask_iou(estimate: Mask, reference: Mask) -> float:
+    """Intersection over union of two masks (H, W), of which at least one is not empty."""
+    return np.count_nonzero(estimate & reference) / np.count_nonzero(estimate | reference)
+
+
 def compare_masks(
     pairs: Iterable[MaskPair], *, scored_coverage: float = SCORED_COVERAGE, num_missing: int = 0
 ) -> MaskResult:

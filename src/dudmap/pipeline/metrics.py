@@ -1,4 +1,4 @@
-"""The figures of a run: counted frame by frame, summed up once."""
+"""Metrics of a run, collected frame by frame."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.evaluation.segmentation import SCORED_COVERAGE
+from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
@@ -20,17 +20,18 @@ if TYPE_CHECKING:
 
 @dataclass
 class RunRecord:
-    """What is counted while the frames pass.
+    """Metrics of the frames processed so far.
 
     Attributes:
-        rows: Per processed frame: timestamp, state, total and reading time and every stage's time, ms.
-        lost: Timestamp and reason of every frame that was not tracked.
+        rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
+        lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read.
-        mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
-        masked: Frames that had a mask from outside, None if none were given.
-        dropped: Frames of a live run that there was no time for, None if the frames waited.
-        movers: One object per frame with moving bodies, as written to movers.jsonl.
-        residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
+        mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
+        movers: Per frame with moving objects, the JSON object of movers.jsonl.
+        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
+        fused, skipped_similar, relocalized, corrected, blind: Numbers of frames, as in ``FrameResult``.
+        masked: Number of frames with an external mask, None without external masks.
+        dropped: Number of frames dropped by a live run, None otherwise.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -57,9 +58,15 @@ class RunRecord:
         mask: NDArray[np.bool_] | None,
         **delays: float,
     ) -> None:
-        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known.
+        """Add one processed frame.
 
-        ``delays`` of a live run: frames ``dropped`` before this one, ``latency`` from its arrival to the result, ms.
+        Args:
+            result: Result of the frame.
+            total_ms: Processing time.
+            reading_ms: Reading time.
+            mask: True dynamic mask (H, W), if known.
+            delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
+                arrival to the result, ms.
         """
         self.rows.append(
             {
@@ -85,11 +92,10 @@ class RunRecord:
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
-            union = np.count_nonzero(mask | result.dynamic_mask)
-            self.mask_ious.append(np.count_nonzero(mask & result.dynamic_mask) / union)
+            self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
     def save_timings(self, path: Path) -> None:
-        """CSV with one row per processed frame and one column per stage, milliseconds."""
+        """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, restval=0)
@@ -97,11 +103,11 @@ class RunRecord:
             writer.writerows(self.rows)
 
     def save_movers(self, path: Path) -> None:
-        """JSON lines, one per frame with moving bodies."""
+        """Write JSON lines, one per frame with moving objects."""
         path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
 
     def save_residuals(self, path: Path) -> None:
-        """NPZ with the histogram of all residuals and the mixture fitted to it; nothing if there are none.
+        """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
 
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
@@ -115,7 +121,7 @@ class RunRecord:
         np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
-        """Counts and times of the whole run."""
+        """Counts and times of all frames, under the keys of metrics.json."""
         totals = np.array([row["total"] for row in self.rows] or [np.nan])
         readings = np.array([row["reading"] for row in self.rows] or [np.nan])
         return {
@@ -140,7 +146,7 @@ class RunRecord:
         } | self._occasional()
 
     def _occasional(self) -> dict[str, Any]:
-        """What only runs with masks and live runs have."""
+        """Metrics of runs with masks and of live runs."""
         out: dict[str, Any] = {}
         if self.masked is not None:
             out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
@@ -157,7 +163,7 @@ class RunRecord:
 
 
 def _row(mover: "Mover") -> dict[str, Any]:
-    """A moving body as JSON can hold it: metres, m/s, world frame."""
+    """JSON object of a moving object: metres, m/s, world frame."""
     return {
         "id": mover.id,
         "centroid": mover.centroid.round(4).tolist(),
@@ -170,5 +176,5 @@ def _row(mover: "Mover") -> dict[str, Any]:
 
 
 def _number(value: float | np.floating, digits: int = 3) -> float | None:
-    """A number JSON can hold; None for NaN."""
+    """Rounded number for JSON; None for NaN."""
     return round(float(value), digits) if np.isfinite(value) else None
