@@ -7,7 +7,6 @@ from dudmap.synthetic.scene import Material, Primitive, box, capsule, cylinder, 
 WOOD = Material("wood", (0.9, 0.9))
 DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
 METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
-BLACK = Material("denim", (1.0, 1.0), tint=(0.2, 0.2, 0.22))
 CARDBOARD = Material("cardboard", (1.6, 1.6))
 
 
