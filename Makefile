@@ -11,16 +11,19 @@ SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
 	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
 
+# tests of one file share what is dear to make; four processes are as fast as more, the longest file decides
+PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
 .PHONY: demo test test-all check lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
 
 test: .venv/developed check
-	$(BIN)/pytest
+	$(PYTEST)
 
 test-all: .venv/developed check
-	$(BIN)/pytest -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow"
 
 check: .venv/developed
 	$(BIN)/ruff check
@@ -33,7 +36,7 @@ lock: $(BIN)/python
 	$(COMPILE) --constraint requirements/dev.txt --output-file requirements/run.txt
 
 clean:
-	rm -rf .venv
+	rm -rf .venv .numba_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
