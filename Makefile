@@ -11,10 +11,11 @@ SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
 	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
 
-# tests of one file share what is dear to make; four processes are as fast as more, the longest file decides
+# tests of one file share fixtures, so they stay in one process; the longest file takes a sixth of the time, so more
+# than a few processes gain nothing
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all check lock clean
+.PHONY: demo test test-all check processors lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -29,6 +30,9 @@ check: .venv/developed
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
+
+processors: .venv/developed
+	$(BIN)/python benchmarks/processors.py
 
 lock: $(BIN)/python
 	$(PIP) install --quiet --upgrade uv

@@ -1,4 +1,4 @@
-"""Settings of the test processes: those of pytest-xdist's workers."""
+"""Settings of the test processes: those of pytest-xdist's workers, and OpenCV's for benchmarks/processors.py."""
 
 import os
 from pathlib import Path
@@ -13,3 +13,8 @@ if worker is not None:
     # The cores are shared by the workers; at least two threads, so that the code for several threads is tested.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     os.environ.setdefault("DUDMAP_THREADS", str(max(2, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))))
+
+if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
+    import cv2
+
+    cv2.setUseOptimized(False)
