@@ -8,7 +8,7 @@ import pytest
 
 from dudmap import parallax, se3, synthetic
 from dudmap.camera import Camera
-from dudmap.config import Config
+from dudmap.config import Config, SensorConfig
 from dudmap.consensus import NOISE_PX, flow_jacobian, projected, rigid_motion
 from dudmap.corners import rests_as_well
 from dudmap.health import TrackingHealth
@@ -234,7 +234,7 @@ def test_a_crowd_that_hides_most_of_the_first_frames_has_no_say():
 
 def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
     good = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.002, 0.01, 3, 0.01)
-    health = TrackingHealth()
+    health = TrackingHealth(SensorConfig())
     for _ in range(6):
         health.tracked(good)
     dragged = replace(good, residual=0.0045)

@@ -4,12 +4,13 @@ from collections import deque
 
 import numpy as np
 
+from dudmap.config import SensorConfig
 from dudmap.tracker import TrackingResult
 
 MEMORY = 30
 """Tracked frames that are remembered."""
-SENSOR = 0.0015
-"""Residuals of this, metres at one metre depth, are good with any sensor."""
+GOOD_SIGMAS = 0.5
+"""A root mean square residual of this many standard deviations of the sensor, at one metre depth, is good."""
 DARK = 0.005
 """Intensity differences below this are as good as none."""
 UNUSUAL_RESIDUAL, UNUSUAL_COLOR = 1.5, 1.8
@@ -22,9 +23,14 @@ class TrackingHealth:
     A registration that slid into a wrong minimum explains the frame much worse than its predecessors were explained,
     though still well enough for any fixed threshold. After a loss the first guess is poor and such minima are common,
     so that the comparison is stricter until tracking has been found again.
+
+    Args:
+        sensor: Noise of the depth sensor. Residuals are compared with it at one metre depth, as the tracker gives them
+            (``TrackingResult.residual``) whether or not it weighs readings by their noise.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, sensor: SensorConfig) -> None:
+        self._good = GOOD_SIGMAS * (sensor.sigma_base + sensor.sigma_scale)
         self._residuals: deque[float] = deque(maxlen=MEMORY)
         self._shares: deque[float] = deque(maxlen=MEMORY)
         self._colors: deque[float] = deque(maxlen=MEMORY)
@@ -46,7 +52,7 @@ class TrackingHealth:
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
         worst = 2.5 if recognised else 1.6 if self.recovering else 4.0
         if crowded and not strict:
-            worst, residual = 2.0, max(residual, SENSOR)
+            worst, residual = 2.0, max(residual, self._good)
         if tracked.residual > worst * residual:
             return f"readings lie {1000 * tracked.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
         if self.recovering and not recognised and tracked.inlier_share < 0.6 * share:

@@ -76,7 +76,7 @@ class Slam:
         self.redundant = RedundantViews(self.config.similarity)
         self.motion = MotionModel(self.config.tracker)
         self.registration = Registration(self.config, self.tracker, self.detector, self.motion)
-        self.health = TrackingHealth()
+        self.health = TrackingHealth(self.config.sensor)
         self.keyframes = Keyframes(self.config.relocalization, self.camera, self.config.sensor)
         self.atlas = Atlas(self._empty_volume, self.keyframes, self._history())
         self._knowledge: TsdfVolume | None = None  # the map of a first pass, and where it saw the frames
@@ -343,7 +343,7 @@ class Slam:
         if len(self.keyframes.features(observation).points) < self.config.relocalization.min_inliers:
             return False
         self.atlas.start_submap()
-        self.health, self._lost_since = TrackingHealth(), None
+        self.health, self._lost_since = TrackingHealth(self.config.sensor), None
         self.redundant.forget()
         return True
 
