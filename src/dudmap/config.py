@@ -139,7 +139,9 @@ class TrackerConfig(Part):
     widths: tuple[int, ...] = (80, 160, 320)
     """Image width per level, coarse to fine, pixels; the nearest halving of the camera's image is taken."""
     stop: float = Field(default=5e-4, gt=0)
-    """A level ends when the step's norm falls below this."""
+    """The finest level ends when the step's norm (m and rad) falls below this."""
+    stop_coarse: float = Field(default=1e-3, gt=0)
+    """A coarser level, which only leads to the next, ends when the step's norm falls below this."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
     """A level also ends when a short step changes the cost by less than this share; 0 turns it off."""
     second_pass: bool = True
@@ -149,7 +151,8 @@ class TrackerConfig(Part):
     min_inliers: float = Field(default=0.15, ge=0, le=1)
     """Share of the readings that must fall on the map for a frame to count as tracked."""
     max_residual: float = Field(default=4.0, gt=0)
-    """Largest median residual of a tracked frame, in standard deviations of the reading."""
+    """Largest root mean square of the robust distance residual of a tracked frame, in standard deviations sigma(z) of
+    the reading, whether or not the registration weighs by them."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the extreme eigenvalues of the scaled J^T J of a tracked frame."""
     max_speed: float = Field(default=5.0, gt=0)
@@ -370,6 +373,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "thesis": {
         "volume": {
             "voxel_size": 0.01,
+            # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on
+            # (Palazzolo et al. 2019), three standard deviations of the sensor at 4 m, and wider than the 3 cm from
+            # which on eq. 4.57 calls a distance motion: in a narrower band nothing far could be called dynamic.
+            "truncation_voxels": 10.0,
+            "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
             "weighting": "constant",
@@ -382,12 +390,14 @@ PRESETS: dict[str, dict[str, Any]] = {
             "color_huber": 0.1,
             "noise_weighting": False,
             "exposure": False,
-            "stop": 1e-3,
+            "stop": 1e-3,  # one tolerance for all levels (algorithm 2)
+            "stop_coarse": 1e-3,
             "stop_gain": 0.0,
         },
         "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
-        "dynamics": {"method": "em", "free_space": False, "regions": False, "start_seconds": 0.0},
+        # Algorithm 1 gives all voxels the distance d_max: a point in seen empty space has the largest residual.
+        "dynamics": {"method": "em", "free_space": True, "regions": False, "start_seconds": 0.0},
         "relocalization": {"enabled": False},
         "loops": {"enabled": False},
         "submaps": {"enabled": False},
