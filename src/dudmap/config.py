@@ -140,7 +140,7 @@ class TrackerConfig(ConfigSection):
     color_huber: float = Field(default=0.07, gt=0)
     """Huber threshold of the intensity residual, intensity in [0, 1]."""
     exposure: bool = True
-    """Fit gain and offset of the image intensities to those of the map before each pyramid level."""
+    """Fit gain and offset of the image intensities to those of the map on the coarsest pyramid level."""
     noise_weighting: bool = True
     """Weight each distance residual by the sensor noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 3)
@@ -148,7 +148,9 @@ class TrackerConfig(ConfigSection):
     widths: tuple[int, ...] = (80, 160, 320)
     """Image width per pyramid level, coarse to fine, pixels; rounded to a halving of the camera image."""
     stop: float = Field(default=5e-4, gt=0)
-    """Norm of the twist update below which a level has converged (thesis: 1e-3)."""
+    """Norm of the twist update (m, rad) below which the finest level has converged (thesis: 1e-3)."""
+    stop_coarse: float = Field(default=1e-3, gt=0)
+    """The same for the coarser levels, which only lead to the next."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
     """Relative decrease of the cost below which a short step also ends a level; 0 disables this criterion."""
     second_pass: bool = True
@@ -158,7 +160,8 @@ class TrackerConfig(ConfigSection):
     min_inliers: float = Field(default=0.15, ge=0, le=1)
     """Smallest share of the readings that lie on the map in a tracked frame."""
     max_residual: float = Field(default=4.0, gt=0)
-    """Largest root mean square of the distance residuals of a tracked frame, in standard deviations of the reading."""
+    """Largest root mean square of the robust distance residual of a tracked frame, in standard deviations sigma(z) of
+    the reading, whether or not the registration weighs by them."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
     max_speed: float = Field(default=5.0, gt=0)
@@ -382,6 +385,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "thesis": {
         "volume": {
             "voxel_size": 0.01,
+            # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on
+            # (Palazzolo et al. 2019), three standard deviations of the sensor at 4 m, and wider than the 3 cm from
+            # which on eq. 4.57 calls a distance motion: in a narrower band nothing far could be called dynamic.
+            "truncation_voxels": 10.0,
+            "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
             "weighting": "constant",
@@ -394,12 +402,14 @@ PRESETS: dict[str, dict[str, Any]] = {
             "color_huber": 0.1,
             "noise_weighting": False,
             "exposure": False,
-            "stop": 1e-3,
+            "stop": 1e-3,  # one tolerance for all levels (algorithm 2)
+            "stop_coarse": 1e-3,
             "stop_gain": 0.0,
         },
         "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
-        "dynamics": {"method": "em", "free_space": False, "regions": False, "start_seconds": 0.0},
+        # Algorithm 1 gives all voxels the distance d_max: a point in seen empty space has the largest residual.
+        "dynamics": {"method": "em", "free_space": True, "regions": False, "start_seconds": 0.0},
         "relocalization": {"enabled": False},
         "loops": {"enabled": False},
         "submaps": {"enabled": False},
