@@ -1,28 +1,46 @@
 # Needs Python 3.11 to 3.13 as python3, with pip, and nothing else: "make demo" and "make test" set up .venv themselves.
 # The environment is made without its own pip and filled by the system's, since Debian keeps ensurepip in another package.
+# It gets the versions in requirements/, with their hashes; "make lock" brings these up to date with pyproject.toml and
+# with what has been published since.
 
 PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check
+# uses only what the lock file has installed, and fails where pyproject.toml asks for more
+SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
+COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
+	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
 
-.PHONY: demo test test-all check clean
+# tests of one file share fixtures, so they stay in one process; the longest file takes a sixth of the time, so more
+# than a few processes gain nothing
+PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
+
+.PHONY: demo test test-all check processors lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
 
 test: .venv/developed check
-	$(BIN)/pytest
+	$(PYTEST)
 
 test-all: .venv/developed check
-	$(BIN)/pytest -m "slow or not slow"
+	$(PYTEST) -m "slow or not slow"
 
 check: .venv/developed
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+processors: .venv/developed
+	$(BIN)/python benchmarks/processors.py
+
+lock: $(BIN)/python
+	$(PIP) install --quiet --upgrade uv
+	$(COMPILE) --extra dev --output-file requirements/dev.txt
+	$(COMPILE) --constraint requirements/dev.txt --output-file requirements/run.txt
+
 clean:
-	rm -rf .venv
+	rm -rf .venv .numba_cache
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \
@@ -31,10 +49,12 @@ $(BIN)/python:
 		{ echo "$(PYTHON) has no pip; on Debian: apt install python3-pip" >&2; exit 1; }
 	$(PYTHON) -m venv --without-pip .venv
 
-.venv/installed: $(BIN)/python pyproject.toml
-	$(PIP) install --quiet --editable .
+.venv/installed: $(BIN)/python pyproject.toml requirements/run.txt
+	$(PIP) install --quiet --requirement requirements/run.txt
+	$(SELF) .
 	@touch $@
 
-.venv/developed: $(BIN)/python pyproject.toml
-	$(PIP) install --quiet --editable '.[dev]'
+.venv/developed: $(BIN)/python pyproject.toml requirements/dev.txt
+	$(PIP) install --quiet --requirement requirements/dev.txt
+	$(SELF) '.[dev]'
 	@touch $@ .venv/installed

@@ -1,11 +1,29 @@
-"""Fixtures that several wings share."""
+"""Settings of the test processes (pytest-xdist's workers; OpenCV's for benchmarks/processors.py), shared fixtures."""
 
+import os
 import sys
 import types
+from pathlib import Path
 
 import pytest
 
 from fake_slam import StandIn
+
+worker = os.environ.get("PYTEST_XDIST_WORKER")
+if worker is not None:
+    # One Numba cache per worker. Numba's index of a function is read, changed and written without a lock: two
+    # processes that compile one function for different argument types can give both results the same file name,
+    # and a changed function's old machine code stays readable between the writes of the index and of the new file.
+    caches = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".numba_cache"
+    os.environ["NUMBA_CACHE_DIR"] = str(Path(caches) / worker)
+    # The cores are shared by the workers; at least two threads, so that the code for several threads is tested.
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    os.environ.setdefault("DUDMAP_THREADS", str(max(2, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))))
+
+if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
+    import cv2
+
+    cv2.setUseOptimized(False)
 
 
 @pytest.fixture

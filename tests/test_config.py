@@ -25,7 +25,12 @@ def test_the_thesis_preset_has_the_thesis_values():
     assert (config.tracker.huber, config.tracker.damping, config.tracker.color_weight) == (0.01, 0.02, 0.1325)
     assert config.similarity.threshold == 0.84
     assert (config.preprocess.filter_alpha, config.preprocess.filter_sigma_px) == (0.012, 4.0)
+    assert config.tracker.stop == config.tracker.stop_coarse == 1e-3
     assert (config.volume.weighting, config.dynamics.method) == ("constant", "em")
+    # eq. 4.57 needs distances beyond its threshold, and the band must hold the noise at the far end of the sensor
+    band, sensor = config.volume.truncation_voxels * config.volume.voxel_size, config.sensor
+    assert band > config.dynamics.noise_threshold
+    assert band >= 3 * (sensor.sigma_base + sensor.sigma_scale * 4.0**2)
     assert not config.relocalization.enabled
 
 

@@ -1,64 +1,59 @@
-"""Every parameter once: unit, default, meaning.
+"""All parameters with their defaults, bounds, units and meanings.
 
-The tree is frozen, unknown keys are errors, and it reads and writes TOML. Keys are dotted by part:
-``volume.voxel_size``, ``tracker.huber``, ``dynamics.method``.
+The configuration is immutable, rejects unknown keys, and reads and writes TOML. Dotted keys name section and
+parameter: ``volume.voxel_size``, ``tracker.huber``, ``dynamics.method``. A default without a stated source was tuned on
+the recordings of docs/benchmarks.md.
 """
 
 import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal, TypeVar, overload
+from typing import Any, Literal
 
-import numpy as np
-from numpy.typing import NDArray
+import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dudmap.errors import ConfigError
 
-Scalar = TypeVar("Scalar", bound=np.floating)
 
-
-class Part(BaseModel):
-    """Base of all parts: frozen, strict about unknown keys, documented by the strings under the fields."""
+class ConfigSection(BaseModel):
+    """Base class of all sections: immutable, rejects unknown keys, documented by the docstrings of its fields."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
 
-class SensorConfig(Part):
-    """Noise of the depth sensor: sigma(z) = sigma_base + sigma_scale z^2 (thesis eq. 3.91)."""
+class SensorConfig(ConfigSection):
+    """Noise model of the depth sensor: sigma(z) = sigma_base + sigma_scale z^2 (thesis eq. 3.91)."""
 
     sigma_base: float = Field(default=0.001, ge=0, le=0.1)
-    """Standard deviation at the lens, metres."""
+    """Standard deviation at depth zero, metres."""
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
-    """Growth of the standard deviation with the square of the depth, 1/m."""
+    """Growth of the standard deviation with the square of the depth, 1/m; the default is the
+    coefficient that Nguyen et al. (2012) measured on a Kinect."""
 
-    @overload
-    def sigma(self, z: float) -> float: ...
-    @overload
-    def sigma(self, z: NDArray[Scalar]) -> NDArray[Scalar]: ...
-    def sigma(self, z: Any) -> Any:
-        """Standard deviation of a depth reading at depth ``z``, metres; it has the shape and precision of ``z``."""
+    def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
+        """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
         return self.sigma_base + self.sigma_scale * z**2
 
 
-class PreprocessConfig(Part):
-    """Depth limits, hole filling and smoothing (thesis section 4.3)."""
+class PreprocessConfig(ConfigSection):
+    """Depth range, hole filling and smoothing of the depth image (thesis section 4.3)."""
 
     depth_min: float = Field(default=0.2, ge=0)
-    """Readings nearer than this are ignored, metres."""
+    """Smallest valid depth, metres; nearer readings are ignored."""
     depth_max: float = Field(default=6.0, gt=0)
-    """Readings farther than this are ignored, metres."""
+    """Largest valid depth, metres; farther readings are ignored."""
     fill_holes: bool = True
-    """Give pixels without a reading the mean of their 5x5 neighbours where those lie on one surface."""
+    """Fill pixels without a reading with the mean of their 5x5 neighbours, where these lie on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
-    """Depth-adaptive bilateral filter (eq. 4.8-4.11) or none."""
+    """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11) or no filter."""
     filter_alpha: float = Field(default=0.012, gt=0)
-    """sigma_c = filter_alpha z^2, 1/m (the thesis' 12 is in millimetres at one metre)."""
+    """Range standard deviation sigma_c = filter_alpha z^2, 1/m (alpha = 12 of the thesis is in millimetres at 1 m)."""
     filter_sigma_px: float = Field(default=4.0, gt=0)
-    """Spatial standard deviation sigma_s, pixels."""
+    """Spatial standard deviation sigma_s, pixels (thesis section 4.3)."""
     filter_radius: int = Field(default=6, ge=1, le=16)
-    """Half width of the filter window, pixels."""
+    """Radius of the filter window, pixels."""
 
     @model_validator(mode="after")
     def _ordered(self) -> "PreprocessConfig":
@@ -67,55 +62,56 @@ class PreprocessConfig(Part):
         return self
 
 
-class SimilarityConfig(Part):
-    """Redundant-view test (thesis section 4.3)."""
+class SimilarityConfig(ConfigSection):
+    """Detection of redundant views, which are not fused (thesis section 4.3)."""
 
     enabled: bool = True
-    """Leave frames out of the fusion that show what the last fused one showed; they still get a pose."""
+    """Do not fuse frames that show the same as the last fused frame; they are still tracked."""
     threshold: float = Field(default=0.84, gt=0, le=1)
-    """Share of SIFT features of the last fused frame found again above which a view is redundant."""
+    """Share of matched SIFT features of the last fused frame above which a view is redundant (thesis section 4.3)."""
     ratio: float = Field(default=0.7, gt=0, lt=1)
-    """Lowe's ratio test: best over second best descriptor distance."""
+    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance."""
     image_width: int = Field(default=320, ge=80)
-    """Width of the image the features are found in, pixels."""
+    """Width of the image in which features are detected, pixels."""
     max_features: int = Field(default=500, ge=50)
-    """Most features a frame may have."""
+    """Largest number of features per frame."""
     max_translation: float = Field(default=0.005, ge=0)
-    """A camera that moved more than this since the last fused frame is not tested, metres; 0 tests all frames."""
+    """Translation since the last fused frame above which a view counts as new without the test, metres; 0 tests all."""
     max_rotation_deg: float = Field(default=0.3, ge=0)
-    """A camera that turned more than this since the last fused frame is not tested, degrees."""
+    """Rotation since the last fused frame above which a view counts as new without the test, degrees."""
     patience: int = Field(default=5, ge=0)
-    """Frames that are fused untested after a test that found nothing redundant: the test costs as much as the rest.
-    Twice, then four, then eight times as many where the next ones find nothing either."""
+    """Number of frames without a test after a test that found no redundant view, since the test takes as long as the
+    rest of a frame. Doubles with every further such test, at most to eightfold (exponential back-off)."""
 
 
-class VolumeConfig(Part):
+class VolumeConfig(ConfigSection):
     """Voxel-hashed truncated signed distance field (thesis section 4.5)."""
 
     voxel_size: float = Field(default=0.01, gt=0, le=1)
-    """Edge of a voxel, metres."""
+    """Edge length of a voxel, metres."""
     truncation_voxels: float = Field(default=4.0, ge=1, le=64)
-    """Band in front of a surface that is stored, voxels; grows with the sensor's noise."""
+    """Truncation distance in front of a surface, voxels; grows with the noise, see ``truncation_noise``."""
     truncation_behind_voxels: float = Field(default=4.0, ge=1, le=64)
-    """Band behind a surface that is stored, voxels."""
+    """Truncation distance behind a surface, voxels."""
     truncation_noise: float = Field(default=3.0, ge=0)
-    """The band is at least this many standard deviations of the depth reading wide; 0 keeps it fixed."""
+    """Smallest truncation distance in standard deviations of the depth reading; 0 keeps it fixed."""
     take_turns: bool = True
-    """Fuse into a block only in every second frame, with double weight, where the noise is coarser than the voxels."""
+    """Integrate into a block only every second frame, with double weight, where the noise exceeds the voxel size."""
     max_weight: int = Field(default=255, ge=1, le=255)
-    """Cap of the running average (eq. 4.19)."""
+    """Largest weight of the running average (thesis eq. 4.19)."""
     max_readings: int = Field(default=48, ge=1, le=255)
-    """A reading adds to the average up to the weight of so many like it: poor ones give way soon to better ones."""
+    """Largest weight to which a reading can raise a voxel, in multiples of its own weight, so that the influence of
+    readings of low weight fades once there are better ones."""
     weighting: Literal["constant", "angle"] = "angle"
-    """Weight of one observation: 1, or cos(theta) / err(z) (eq. 4.20)."""
+    """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
-    """Observations a voxel needs before the mesh and the views trust it."""
+    """Smallest weight of a voxel that the mesh and rendered views use."""
     carving: bool = True
-    """Remove what is seen to be empty (thesis section 7.1)."""
+    """Remove surfaces that are observed to be free space (thesis section 7.1)."""
     carve_rate: int = Field(default=4, ge=1, le=64)
-    """Weight of an observation of emptiness in a voxel that holds a surface."""
+    """Weight of a free-space observation in a voxel that holds a surface."""
     free_after: int = Field(default=4, ge=1, le=200)
-    """Frames a block must be seen empty before it counts as free space."""
+    """Number of free-space observations after which a block counts as free space."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":
@@ -127,47 +123,51 @@ class VolumeConfig(Part):
         return self
 
 
-class TrackerConfig(Part):
-    """Direct SDF and intensity registration (thesis section 4.4)."""
+class TrackerConfig(ConfigSection):
+    """Direct registration to the TSDF by distance and intensity residuals (thesis section 4.4)."""
 
     robust: Literal["huber", "tukey"] = "huber"
-    """Weight function (eq. 4.44, 4.45)."""
+    """Robust weight function (thesis eq. 4.44, 4.45)."""
     huber: float = Field(default=0.01, gt=0)
-    """Huber constant of the distance residual, metres at one metre depth."""
+    """Huber threshold of the distance residual, metres at 1 m depth (thesis table 6.1)."""
     tukey: float = Field(default=0.05, gt=0)
-    """Tukey constant of the distance residual, metres at one metre depth."""
+    """Tukey threshold of the distance residual, metres at 1 m depth."""
     damping: float = Field(default=0.02, gt=0)
-    """First Levenberg-Marquardt damping, relative to the diagonal of J^T J (eq. 4.42)."""
+    """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1)."""
     color_weight: float = Field(default=0.1325, ge=0)
-    """Weight of the squared intensity residual (0..1) against the squared distance residual (m), eq. 4.32."""
+    """Weight of the squared intensity residual (intensity in [0, 1]) relative to the squared distance residual
+    (metres); thesis eq. 4.32, table 6.2."""
     color_huber: float = Field(default=0.07, gt=0)
-    """Huber constant of the intensity residual."""
+    """Huber threshold of the intensity residual, intensity in [0, 1]."""
     exposure: bool = True
-    """Fit gain and offset of the image's intensities to the map's before each level."""
+    """Fit gain and offset of the image intensities to those of the map on the coarsest pyramid level."""
     noise_weighting: bool = True
-    """Weight each distance residual by the sensor's noise at its depth."""
+    """Weight each distance residual by the sensor noise at its depth."""
     iterations: tuple[int, ...] = (8, 6, 3)
-    """Most iterations per level, coarse to fine; 0 leaves the level out."""
+    """Largest number of iterations per pyramid level, coarse to fine; 0 skips the level."""
     widths: tuple[int, ...] = (80, 160, 320)
-    """Image width per level, coarse to fine, pixels; the nearest halving of the camera's image is taken."""
+    """Image width per pyramid level, coarse to fine, pixels; rounded to a halving of the camera image."""
     stop: float = Field(default=5e-4, gt=0)
-    """A level ends when the step's norm falls below this."""
+    """Norm of the twist update (m, rad) below which the finest level has converged (thesis: 1e-3)."""
+    stop_coarse: float = Field(default=1e-3, gt=0)
+    """The same for the coarser levels, which only lead to the next."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
-    """A level also ends when a short step changes the cost by less than this share; 0 turns it off."""
+    """Relative decrease of the cost below which a short step also ends a level; 0 disables this criterion."""
     second_pass: bool = True
-    """Register again with the dynamic labels (algorithm 4)."""
+    """Register a second time with the dynamic labels (thesis algorithm 4)."""
     constant_velocity: bool = True
-    """Start from the motion of the last frame."""
+    """Predict the pose with a constant-velocity model; otherwise start from the last pose."""
     min_inliers: float = Field(default=0.15, ge=0, le=1)
-    """Share of the readings that must fall on the map for a frame to count as tracked."""
+    """Smallest share of the readings that lie on the map in a tracked frame."""
     max_residual: float = Field(default=4.0, gt=0)
-    """Largest median residual of a tracked frame, in standard deviations of the reading."""
+    """Largest root mean square of the robust distance residual of a tracked frame, in standard deviations sigma(z) of
+    the reading, whether or not the registration weighs by them."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
-    """Smallest ratio of the extreme eigenvalues of the scaled J^T J of a tracked frame."""
+    """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
     max_speed: float = Field(default=5.0, gt=0)
-    """Fastest believable camera, m/s."""
+    """Largest plausible speed of the camera, m/s."""
     max_turn_deg: float = Field(default=360.0, gt=0)
-    """Fastest believable turn, degrees per second."""
+    """Largest plausible rotation rate of the camera, degrees per second."""
 
     @model_validator(mode="after")
     def _levels(self) -> "TrackerConfig":
@@ -180,128 +180,129 @@ class TrackerConfig(Part):
         return self
 
 
-class DynamicsConfig(Part):
-    """Which pixels move (thesis section 4.6)."""
+class DynamicsConfig(ConfigSection):
+    """Detection of dynamic pixels (thesis section 4.6)."""
 
     method: Literal["em", "threshold", "none"] = "em"
-    """EM on the residuals, the threshold-and-flood rule of the ancestor, or no dynamic handling."""
+    """EM on the residuals (em), threshold and flood fill as in ReFusion (threshold), or no detection (none)."""
     free_space: bool = True
-    """Points that appear in space the map knows to be free are dynamic (EM only)."""
+    """Label points inside known free space as dynamic (em only)."""
     regions: bool = True
-    """Decide per depth-connected region, not per pixel (EM only)."""
+    """Classify depth-connected regions instead of pixels (em only)."""
     width: int = Field(default=160, ge=40, le=1280)
-    """Width of the label image, pixels; the nearest halving of the camera's image is taken."""
+    """Width of the label image, pixels; rounded to a halving of the camera image."""
     threshold: float = Field(default=0.07, gt=0)
-    """Distance to the map from which on the threshold rule calls a reading moving, metres (10 cm / sqrt 2 in the
-    ancestor's published code); with a stored band narrower than that, the rim of the band."""
+    """Distance to the map above which method ``threshold`` labels a reading as dynamic, metres (10 cm / sqrt 2 in the
+    published code of ReFusion); limited to the truncation distance."""
     noise_threshold: float = Field(default=0.03, gt=0)
-    """Smallest distance to the static map that may be called motion, metres (theta in eq. 4.57)."""
+    """Smallest distance to the static map of a dynamic reading, metres (theta in thesis eq. 4.57)."""
     noise_sigmas: float = Field(default=3.0, ge=0)
-    """The same in standard deviations of the reading; the larger of both counts."""
+    """The same distance in standard deviations of the reading; the larger of the two applies."""
     pieces: bool = True
-    """Decide for whole pieces of surface, and remember what moved until it has settled (with regions only)."""
+    """Classify whole surface segments, and remember dynamic ones until they have settled (with regions only)."""
     settle_time: float = Field(default=1.5, gt=0, le=60)
-    """What moved and has stood still for this long is no longer called moving, and becomes map, seconds."""
+    """Time for which an object must be at rest before it counts as static again and is fused, seconds."""
     max_share: float = Field(default=0.9, gt=0, le=1)
-    """A frame of whose readings more than this share seems to move is not believed, but reported as lost."""
+    """Largest share of dynamic readings in a tracked frame; above it the frame is lost."""
     start_seconds: float = Field(default=1.0, ge=0)
-    """Time from the first frame on in which movers are also found from image to image (parallax), since the map does
-    not know free space yet; prolonged while that finds what the map does not. 0 turns it off. EM only."""
+    """Time after the first frame in which moving objects are also detected by ego-motion compensation between images,
+    since the map has no free space yet, seconds. It is extended while this finds objects that the map does not reveal;
+    0 disables it (em only)."""
     margin_px: int = Field(default=5, ge=0, le=50)
-    """Pixels around a moving region that are not fused either."""
+    """Margin around dynamic regions that is not fused, pixels of an image 640 wide."""
 
 
-class RelocalizationConfig(Part):
-    """Finding a known place again after tracking was lost: keyframes, SIFT features, 3D-3D RANSAC."""
+class RelocalizationConfig(ConfigSection):
+    """Relocalisation after tracking was lost: keyframes, SIFT features, 3D-3D RANSAC."""
 
     enabled: bool = True
-    """Remember keyframes, and try to recognise one of them in every lost frame."""
+    """Store keyframes, and match every lost frame against them."""
     keyframe_distance: float = Field(default=0.25, gt=0)
-    """A keyframe is made where the camera is farther than this from all others, metres,"""
+    """A frame becomes a keyframe if it is farther than this from all other keyframes, metres,"""
     keyframe_angle_deg: float = Field(default=15.0, gt=0)
-    """or turned by more than this, degrees."""
+    """or rotated by more than this, degrees."""
     keyframe_gap: int = Field(default=10, ge=0)
-    """Tracked frames between two keyframes at least."""
+    """Smallest number of tracked frames between two keyframes."""
     max_keyframes: int = Field(default=200, ge=2)
-    """Most keyframes that are kept; the one nearest to another goes first."""
+    """Largest number of keyframes; the one nearest to another is removed first."""
     max_features: int = Field(default=400, ge=50)
-    """Most features of a keyframe."""
+    """Largest number of features per keyframe."""
     image_width: int = Field(default=320, ge=80)
-    """Width of the image the features are found in, pixels."""
+    """Width of the image in which features are detected, pixels."""
     ratio: float = Field(default=0.85, gt=0, lt=1)
-    """Lowe's ratio test: best over second best descriptor distance."""
+    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance."""
     min_inliers: int = Field(default=15, ge=4)
-    """Matches that must agree on a pose."""
+    """Smallest number of RANSAC inliers of a match."""
     min_share: float = Field(default=0.25, ge=0, le=1)
-    """Share of all matches with the keyframe that must agree on it."""
+    """Smallest share of RANSAC inliers among the matches with a keyframe."""
     min_on_map: float = Field(default=0.4, ge=0, le=1)
-    """Share of a frame's readings that must be static and fall on the map for the pose to be believed."""
+    """Smallest share of the readings that are static and lie on the map at an accepted pose."""
     max_distance: float = Field(default=0.06, gt=0)
-    """Farthest that the registration may move the pose of the features, metres,"""
+    """Largest correction of the feature-based pose by the registration, metres,"""
     max_angle_deg: float = Field(default=3.0, gt=0)
-    """or turn it, degrees."""
+    """and degrees."""
 
 
-class LoopsConfig(Part):
-    """Correcting the map when a known place is seen again after drift."""
+class LoopsConfig(ConfigSection):
+    """Loop closing: correction of trajectory and map when a known place is seen again."""
 
     enabled: bool = True
-    """Compare new views with places not seen for a while, and correct the trajectory and the map."""
+    """Detect and close loops."""
     min_age: float = Field(default=5.0, gt=0)
-    """A place counts as seen again if the camera has not been near for this long, seconds."""
+    """Smallest time since the camera was last near a place for it to close a loop, seconds."""
     gap: int = Field(default=15, ge=1)
-    """Frames between two attempts at least."""
+    """Smallest number of frames between two attempts."""
     min_distance: float = Field(default=0.02, ge=0)
-    """Smaller corrections than this, metres,"""
+    """Corrections below this, metres,"""
     min_angle_deg: float = Field(default=0.7, ge=0)
-    """and than this, degrees, are noise: nothing is done."""
+    """and below this, degrees, are within the noise and not applied."""
     max_drift: float = Field(default=0.1, gt=0)
-    """Largest believable drift: share of the path since the place was last seen, a turn by one radian counting 1 m."""
+    """Largest plausible drift as a share of the path since the place was last seen; 1 rad of rotation counts as 1 m."""
     keep_distance: float = Field(default=0.08, gt=0)
-    """A fused frame this far from the last kept one is kept on disk, metres,"""
+    """A fused frame is stored on disk if it is this far from the last stored one, metres,"""
     keep_angle_deg: float = Field(default=5.0, gt=0)
-    """or turned by this, degrees,"""
+    """or rotated by this, degrees,"""
     keep_gap: int = Field(default=15, ge=1)
     """or this many fused frames after it."""
 
 
-class SubmapsConfig(Part):
-    """Going on in a new map where the camera is lost and recognises nothing."""
+class SubmapsConfig(ConfigSection):
+    """Submaps: a new map is started where the camera is lost and cannot be relocalised."""
 
     enabled: bool = True
-    """Start a new submap after a while without a known place; join it with the others when one is recognised."""
+    """Start a new submap when relocalisation fails, and merge it when a known place is recognised."""
     patience: float = Field(default=1.0, ge=0)
-    """Time without a recognised place before a new submap is started, seconds."""
+    """Time since tracking was lost before a new submap is started, seconds."""
     min_readings: float = Field(default=0.2, ge=0, le=1)
-    """Share of the pixels of its first frame that must have a reading."""
+    """Smallest share of valid depth readings in the first frame of a submap."""
 
 
-class MoversConfig(Part):
-    """Moving bodies with identity and velocity, as a result; they never influence the pose."""
+class MoversConfig(ConfigSection):
+    """Tracking of moving objects; it does not influence the camera pose."""
 
     enabled: bool = True
-    """Report the bodies that move."""
+    """Track moving objects and report their identity and velocity."""
     min_area: float = Field(default=0.015, ge=0)
-    """Smallest visible surface of a body, square metres."""
+    """Smallest visible surface area of an object, square metres."""
     merge_distance: float = Field(default=0.3, ge=0)
-    """A small region nearer than this to a larger one is a part of it, metres."""
+    """Distance below which a small region is merged with a larger one, metres."""
     max_jump: float = Field(default=0.4, gt=0)
-    """Farthest from where it was expected that a body is still the same, metres; overlapping boxes count too."""
+    """Largest distance from the predicted position in data association, metres; overlapping boxes also match."""
     memory: float = Field(default=0.7, ge=0)
-    """A body that comes back into view within this time keeps its number, seconds."""
+    """Time for which an object out of view keeps its identity, seconds."""
     velocity_window: float = Field(default=0.2, gt=0)
-    """The velocity is the mean over this time, seconds."""
+    """Time over which the velocity is averaged, seconds."""
     meshes: bool = False
-    """Also fuse each rigid body into a mesh of its own and follow its pose (movers/<id>.ply and .txt of a run)."""
+    """Also reconstruct each rigid object and estimate its pose (movers/<id>.ply and .txt of a run)."""
     mesh_voxel_size: float = Field(default=0.005, ge=0.004, le=0.1)
-    """Edge of a voxel of these meshes, metres."""
+    """Edge length of the voxels of these objects, metres."""
 
 
-class Config(Part):
-    """All parameters of the system."""
+class Config(ConfigSection):
+    """All parameters."""
 
     preset: Literal["default", "thesis"] = "default"
-    """The values that all others start from."""
+    """Set of values from which the configuration starts."""
     sensor: SensorConfig = SensorConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     similarity: SimilarityConfig = SimilarityConfig()
@@ -315,10 +316,10 @@ class Config(Part):
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":
-        """Read a TOML file; what it leaves out keeps its preset's value.
+        """Configuration of a TOML file; parameters it does not set keep the value of its preset.
 
         Raises:
-            ConfigError: The file is missing, not TOML, or holds an unknown key or a value out of range.
+            ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
         """
         try:
             tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
@@ -330,7 +331,11 @@ class Config(Part):
 
     @classmethod
     def from_tree(cls, tree: Mapping[str, Any]) -> "Config":
-        """Configuration from nested dictionaries over the values of the preset they name."""
+        """Configuration of nested dictionaries; parameters they do not set keep the value of their preset.
+
+        Raises:
+            ConfigError: A key is unknown or a value invalid.
+        """
         _check_keys(tree)
         preset = tree.get("preset", "default")
         if preset not in PRESETS:
@@ -343,9 +348,12 @@ class Config(Part):
             raise ConfigError(f"{key} = {first['input']!r} is not acceptable: {first['msg']}") from None
 
     def override(self, assignments: Iterable[str]) -> "Config":
-        """Configuration with ``key=value`` assignments applied, e.g. ``tracker.huber=0.02``; values are TOML or words.
+        """Configuration with assignments ``key=value`` applied, e.g. ``tracker.huber=0.02``.
 
-        Assigning ``preset`` starts anew from that preset's values.
+        Values are TOML or plain words. An assignment of ``preset`` discards all present values.
+
+        Raises:
+            ConfigError: An assignment is malformed, its key unknown or its value invalid.
         """
         tree: dict[str, Any] = {}
         for assignment in assignments:
@@ -364,16 +372,11 @@ class Config(Part):
         return self.from_tree(_merged(base, tree))
 
     def to_toml(self) -> str:
-        """TOML text with every value."""
-        lines = [f'preset = "{self.preset}"']
-        for part, values in self.model_dump().items():
-            if isinstance(values, dict):
-                lines += ["", f"[{part}]"]
-                lines += [f"{key} = {_toml(value)}" for key, value in values.items()]
-        return "\n".join(lines) + "\n"
+        """TOML text of all values."""
+        return tomli_w.dumps(self.model_dump())
 
     def save(self, path: str | Path) -> None:
-        """Write every value as TOML."""
+        """Write all values as TOML."""
         Path(path).write_text(self.to_toml(), encoding="utf-8")
 
 
@@ -382,6 +385,11 @@ PRESETS: dict[str, dict[str, Any]] = {
     "thesis": {
         "volume": {
             "voxel_size": 0.01,
+            # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on
+            # (Palazzolo et al. 2019), three standard deviations of the sensor at 4 m, and wider than the 3 cm from
+            # which on eq. 4.57 calls a distance motion: in a narrower band nothing far could be called dynamic.
+            "truncation_voxels": 10.0,
+            "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
             "weighting": "constant",
@@ -394,12 +402,14 @@ PRESETS: dict[str, dict[str, Any]] = {
             "color_huber": 0.1,
             "noise_weighting": False,
             "exposure": False,
-            "stop": 1e-3,
+            "stop": 1e-3,  # one tolerance for all levels (algorithm 2)
+            "stop_coarse": 1e-3,
             "stop_gain": 0.0,
         },
         "similarity": {"threshold": 0.84, "patience": 0},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
-        "dynamics": {"method": "em", "free_space": False, "regions": False, "start_seconds": 0.0},
+        # Algorithm 1 gives all voxels the distance d_max: a point in seen empty space has the largest residual.
+        "dynamics": {"method": "em", "free_space": True, "regions": False, "start_seconds": 0.0},
         "relocalization": {"enabled": False},
         "loops": {"enabled": False},
         "submaps": {"enabled": False},
@@ -409,10 +419,10 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 def keys() -> list[str]:
-    """Every dotted key."""
+    """All dotted keys."""
     out = ["preset"]
     for part, field in Config.model_fields.items():
-        if isinstance(field.default, Part):
+        if isinstance(field.default, ConfigSection):
             out += [f"{part}.{key}" for key in type(field.default).model_fields]
     return out
 
@@ -440,13 +450,3 @@ def _value(text: str) -> Any:  # noqa: ANN401 - TOML values have many types
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text
-
-
-def _toml(value: Any) -> str:  # noqa: ANN401
-    if isinstance(value, bool):
-        return "true" if value else "false"
-    if isinstance(value, str):
-        return f'"{value}"'
-    if isinstance(value, tuple | list):
-        return "[" + ", ".join(_toml(item) for item in value) + "]"
-    return repr(value)

@@ -1,28 +1,24 @@
-"""Every error a user can cause or meet, under one root.
+"""Exceptions of dudmap, with one common base class.
 
-Messages say what was found, what was expected and how to mend it, in one sentence.
+A message is one sentence that states what was found, what was expected and how to correct it.
 """
 
 
 class DudmapError(Exception):
-    """Root of all errors that dudmap raises on purpose; the command line prints them without a traceback."""
+    """Base class of all errors of dudmap; the command line prints them without a traceback."""
 
 
 class ConfigError(DudmapError):
-    """A configuration key or value is not acceptable."""
+    """A configuration key, a configuration value or another argument is invalid."""
 
 
 class DatasetError(DudmapError):
-    """A recording, trajectory, mask folder or reference cannot be used."""
+    """A recording, trajectory, mask folder or reference is missing or invalid."""
 
 
 class FrameError(DatasetError):
-    """One frame of a recording cannot be read; the frames around it can."""
+    """One frame of a recording cannot be read; the other frames may be valid."""
 
 
 class MapError(DudmapError):
-    """A map or mesh cannot be built, loaded or used."""
-
-
-class DeviceError(DudmapError):
-    """The requested compute device is not available."""
+    """A map or mesh is invalid, or cannot be loaded or saved."""

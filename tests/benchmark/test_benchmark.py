@@ -2,6 +2,7 @@
 
 import csv
 import json
+import os
 
 import numpy as np
 import pytest
@@ -137,6 +138,21 @@ def test_a_run_in_its_own_process_reports_an_unusable_recording(tmp_path):
     (row,) = measure.measure_all([job], 1)
     assert row["sequence"] == "empty"
     assert "is empty" in row["error"]
+
+
+def dies(_):
+    os._exit(3)
+
+
+def raises(_):
+    raise ValueError("a defect")
+
+
+def test_a_process_that_dies_or_fails_is_an_error_of_its_row(capfd):
+    assert "died" in measure.in_own_process(dies, None)["error"]
+    assert measure.in_own_process(raises, None)["error"] == "ValueError: a defect"
+    assert "a defect" in capfd.readouterr().err
+    assert measure.in_own_process(dict, [("lost", 0)]) == {"lost": 0}
 
 
 # -- the limit of dynamics --------------------------------------------------------------------------------------------

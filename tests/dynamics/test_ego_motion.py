@@ -10,7 +10,7 @@ from dudmap import synthetic
 from dudmap.config import Config, TrackerConfig
 from dudmap.dynamics import ego_motion as parallax
 from dudmap.dynamics.ego_motion import dominant_motion
-from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, projected, rigid_motion
+from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
 from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
@@ -47,7 +47,7 @@ def test_the_flow_jacobian_is_the_derivative_of_the_projection():
     J = flow_jacobian(points, CAMERA)
     for axis in range(6):
         step = 1e-6 * np.eye(6)[axis]
-        numeric = (projected(se3.exp(step), points, CAMERA) - projected(se3.exp(-step), points, CAMERA)) / 2e-6
+        numeric = (reproject(se3.exp(step), points, CAMERA) - reproject(se3.exp(-step), points, CAMERA)) / 2e-6
         np.testing.assert_allclose(J[:, :, axis], numeric, rtol=1e-5, atol=1e-4)
 
 
@@ -55,17 +55,16 @@ def test_the_refining_step_is_that_of_least_squares():
     rng = np.random.default_rng(5)
     points = rng.uniform([-1, -1, 0.5], [1, 1, 5], (200, 3))
     T = se3.exp(np.array([0.02, -0.01, 0.03, 0.01, 0.02, -0.01]))
-    targets = projected(T, points, CAMERA) + rng.normal(0, 1, (200, 2))
+    targets = reproject(T, points, CAMERA) + rng.normal(0, 1, (200, 2))
     guess = se3.exp(np.array([0.018, -0.01, 0.028, 0.011, 0.019, -0.01]))
-    residual = targets - projected(guess, points, CAMERA)
+    residual = targets - reproject(guess, points, CAMERA)
     near = np.linalg.norm(residual, axis=1) < 2 * NOISE_PX
     assert 20 < np.count_nonzero(near) < 180
-    say = rng.uniform(0.1, 1, 200)
+    weights = rng.uniform(0.1, 1, 200)
     J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
-    H, gradient = np.ones((6, 6)), np.ones(6)
-    count = consensus.refinement(points, targets, say, guess, CAMERA.intrinsics, 2 * NOISE_PX, H, gradient)
+    H, gradient, count = consensus.normal_equations(points, targets, weights, guess, CAMERA.intrinsics, 2 * NOISE_PX)
     assert count == np.count_nonzero(near)
-    root = np.sqrt(np.repeat(say[near], 2))
+    root = np.sqrt(np.repeat(weights[near], 2))
     expected = np.linalg.lstsq(root[:, None] * J, root * residual[near].reshape(-1), rcond=None)[0]
     np.testing.assert_allclose(np.linalg.solve(H, gradient), expected, rtol=1e-5, atol=1e-9)
 
@@ -87,9 +86,9 @@ def test_the_motion_of_most_surface_is_found_or_the_expected_one_of_two(share, e
     rng = np.random.default_rng(7)
     points = rng.uniform([-1, -1, 1], [1, 1, 5], (400, 3))
     slow = int(share * 400)
-    targets = np.concatenate([projected(SLOW, points[:slow], CAMERA), projected(FAST, points[slow:], CAMERA)])
-    say = 1 / points[:, 2] ** 2  # so that all count alike
-    np.testing.assert_allclose(rigid_motion(points, targets, say, CAMERA, expected), found, atol=1e-6)
+    targets = np.concatenate([reproject(SLOW, points[:slow], CAMERA), reproject(FAST, points[slow:], CAMERA)])
+    weights = 1 / points[:, 2] ** 2  # so that all count alike
+    np.testing.assert_allclose(rigid_motion(points, targets, weights, CAMERA, expected), found, atol=1e-6)
 
 
 @pytest.mark.parametrize("index", [0, 6, 20])
@@ -147,12 +146,12 @@ def test_a_pair_of_images_is_compared_once_and_never_with_a_forgotten_one(crowd)
     known, before, after = parallax.EgoMotionSegmenter(1.0), image(crowd, 6), image(crowd, 7)
     known.start(0.0)
     assert known.compare(0.0, *before) is None
-    known.remember(0.0, np.eye(4), *before)
+    known.update(0.0, np.eye(4), *before)
     motion = known.compare(0.1, *after)
     assert motion is not None
     assert known.compare(0.1, *after) is motion
     assert known.compare(0.2, *after) is not motion
-    known.forget()
+    known.reset()
     assert known.compare(0.1, *after) is None
     assert not known.active
 

@@ -81,3 +81,19 @@ def test_nearest_rotation_is_orthonormal():
 def test_exp_rotation_is_the_rotation_of_exp(xi):
     turn = np.concatenate([np.zeros(3), xi[3:]])
     assert np.allclose(se3.exp_rotation(xi[3:]), se3.exp(turn)[:3, :3], atol=1e-12)
+
+
+def test_adjoints():
+    rng = np.random.default_rng(1)
+    T = se3.exp(np.concatenate([rng.uniform(-1, 1, 3), rng.uniform(-1.5, 1.5, 3)]))
+    xi = rng.normal(size=6)
+    np.testing.assert_allclose(T @ se3.exp(xi) @ se3.inverse(T), se3.exp(se3.adjoint(T) @ xi), atol=1e-12)
+    np.testing.assert_allclose(expm(se3.small_adjoint(xi)), se3.adjoint(se3.exp(xi)), atol=1e-12)
+
+
+def test_interpolation_in_time_and_beyond_its_ends():
+    Ts = np.tile(np.eye(4), (2, 1, 1))
+    Ts[1, 0, 3] = 0.2
+    for time, x in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.05), (3.0, 0.2), (9.0, 0.2)):
+        T = se3.interpolate_in_time(np.array([1.0, 3.0]), Ts, time)
+        np.testing.assert_allclose(T[:3, 3], [x, 0, 0], atol=1e-12)

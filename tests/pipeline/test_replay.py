@@ -10,7 +10,7 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.pipeline.replay import Arrival, Newest, live, replay
+from dudmap.pipeline.replay import Arrival, LatestSlot, live, replay
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from fake_slam import StandIn
@@ -63,7 +63,7 @@ def test_a_replay_ends_when_told():
 
 
 def test_only_the_newest_is_held():
-    newest = Newest()
+    newest = LatestSlot()
     for number in range(5):
         newest.put(number)
     assert newest.take() == 4
@@ -75,7 +75,7 @@ def test_only_the_newest_is_held():
 
 
 def test_a_consumer_waits_for_the_next():
-    newest, taken = Newest(), []
+    newest, taken = LatestSlot(), []
     thread = threading.Thread(target=lambda: taken.append(newest.take()))
     thread.start()
     newest.put("late")
@@ -145,7 +145,7 @@ def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, mo
     assert rows[0]["timestamp"] == "100.000000"
     assert rows[-1]["timestamp"] == "100.350000"
     assert all(float(row["latency"]) >= float(row["total"]) for row in rows)
-    assert f"live: {metrics['dropped']} of 8 frames dropped" in capsys.readouterr().err
+    assert f"live: {metrics['dropped']} of 8 frames were dropped" in capsys.readouterr().err
 
 
 def test_a_live_run_in_time_drops_nothing(slam, recording, tmp_path, capsys):

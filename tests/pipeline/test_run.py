@@ -156,7 +156,7 @@ def test_a_second_pass_that_is_interrupted_costs_nothing(slam, recording, tmp_pa
 
 @pytest.mark.parametrize("options", [{"passes": 0}, {"passes": 3}, {"passes": 2, "live": True}])
 def test_only_one_or_two_passes(slam, recording, tmp_path, options):
-    with pytest.raises(ConfigError, match="expected 1, or 2 for a recording at rest"):
+    with pytest.raises(ConfigError, match="expected 1, or 2 without live replay"):
         go(recording, tmp_path / "out", **options)
 
 

@@ -6,23 +6,26 @@ import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap.config import Config, RelocalizationConfig
+from dudmap.config import Config, RelocalizationConfig, SensorConfig, TrackerConfig
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import moved
 from dudmap.frames.frame import Frame
+from dudmap.frames.observation import Observation
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.run import run
-from dudmap.places.atlas import Atlas, at_time
+from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
-from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
+from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
+from dudmap.tracking.tracker import Tracker, TrackingResult
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
-TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=29.5, width=80, height=60)
+TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=31.5, width=80, height=64)
 
 
 def shifted(x, y=0.0):
@@ -31,23 +34,17 @@ def shifted(x, y=0.0):
     return T
 
 
-def test_motions_between_those_known():
-    stamps, Ts = np.array([1.0, 3.0]), np.stack([shifted(0.0), shifted(0.2)])
-    for time, x in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.05), (3.0, 0.2), (9.0, 0.2)):
-        np.testing.assert_allclose(at_time(stamps, Ts, time), shifted(x), atol=1e-12)
-
-
 def wall(timestamp):
     rng = np.random.default_rng(1)
-    color = rng.integers(0, 255, (60, 80, 3), dtype=np.uint8)
-    return Frame(timestamp, np.full((60, 80), 1.0, np.float32), color)
+    color = rng.integers(0, 255, (64, 80, 3), dtype=np.uint8)
+    return Frame(timestamp, np.full((64, 80), 1.0, np.float32), color)
 
 
 def made_up_atlas(submaps):
     """An atlas with one frame a second at x = the time, all kept, in the submaps given."""
     keyframes = KeyframeDatabase(RelocalizationConfig(), TINY)
     atlas = Atlas(lambda: TsdfVolume(TINY), keyframes, FrameStore(TINY, gap=1))
-    everything = np.ones((60, 80), dtype=bool)
+    everything = np.ones((64, 80), dtype=bool)
     for second, submap in enumerate(submaps):
         if submap not in atlas.volumes:
             atlas.start_submap()
@@ -74,6 +71,28 @@ def test_everything_moves_along_with_a_correction():
     np.testing.assert_allclose(atlas.history.Ts_world_camera, Ts_new)
     assert atlas.volume is volume_before  # views of the map stay connected
     assert atlas.volume.map_id == volume.map_id
+
+
+@pytest.mark.parametrize("solvable", [True, False])
+def test_a_loop_counts_only_if_its_correction_is_finite(monkeypatch, solvable):
+    """Three frames back at the first, where the loop measures 2 mm of drift."""
+    atlas = made_up_atlas([0, 0, 0, 0])
+    loops = LoopCloser(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
+    if not solvable:
+        monkeypatch.setattr("dudmap.places.loop_closing.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
+    image = np.zeros(TINY.shape, np.float32)
+    observation = Observation(3.0, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
+    T = atlas.poses[-1].T_world_camera
+    tracked = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
+    view = View(observation, [], None, np.ones(TINY.shape, dtype=bool), tracked)
+    place = PlaceMatch(atlas.keyframes.keyframes[0], T, 20)
+    before = [pose.T_world_camera.copy() for pose in atlas.poses]
+    correction = loops._correct(place, view, T @ shifted(0.002))
+    assert (correction is not None) == solvable
+    assert loops.closed == len(loops._edges) == int(solvable)
+    moves = [np.abs(pose.T_world_camera - T).max() for pose, T in zip(atlas.poses, before, strict=True)]
+    assert np.all(np.isfinite(moves))
+    assert (max(moves) > 0) == solvable
 
 
 def test_join_brings_one_map_into_the_other():

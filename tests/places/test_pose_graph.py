@@ -1,10 +1,9 @@
 """The pose graph against problems whose solution is known."""
 
 import numpy as np
-from scipy.linalg import expm
 
 from dudmap.geometry import se3
-from dudmap.places.pose_graph import Edge, adjoint, optimize, small_adjoint
+from dudmap.places.pose_graph import Edge, optimize
 
 
 def random_pose(rng, reach=1.0):
@@ -13,13 +12,6 @@ def random_pose(rng, reach=1.0):
 
 def chain(Ts, sigma=0.01):
     return [Edge(i, i + 1, se3.inverse(Ts[i]) @ Ts[i + 1], sigma, sigma) for i in range(len(Ts) - 1)]
-
-
-def test_adjoints():
-    rng = np.random.default_rng(1)
-    T, xi = random_pose(rng), rng.normal(size=6)
-    np.testing.assert_allclose(T @ se3.exp(xi) @ se3.inverse(T), se3.exp(adjoint(T) @ xi), atol=1e-12)
-    np.testing.assert_allclose(expm(small_adjoint(xi)), adjoint(se3.exp(xi)), atol=1e-12)
 
 
 def test_a_loop_without_contradiction_changes_nothing():

@@ -1,5 +1,7 @@
 """The registration against plain NumPy and against numerical derivatives; the tracker's checks."""
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -188,3 +190,57 @@ def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
     assert "fall on the map" in monitor.deviation(result(0.001, 0.3))
     monitor.accept(result(0.001, 0.9))
     assert monitor.deviation(result(0.0025, 0.3)) == ""
+
+
+AS_IT_IS: dict[str, Any] = {"widths": (80,), "iterations": (1,), "stop": 1e3, "damping": 1e9, "min_condition": 0.0}
+"""The first guess is judged: the damping leaves no step."""
+
+
+def wall(offset: float, far: float) -> tuple[TsdfVolume, Level]:
+    """A map of a flat textured wall at a distance, metres, and an image in which it is nearer by ``offset``, metres."""
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    gray = np.asarray(255 * (0.5 + 0.2 * np.sin(u / 4) * np.cos(v / 4)), np.uint8)
+    frame = Frame(0.0, np.full(gray.shape, far, np.float32), np.repeat(gray[..., None], 3, axis=2))
+    config = VolumeConfig(voxel_size=0.02, truncation_voxels=10, truncation_noise=0)
+    volume = TsdfVolume(CAMERA, config, SENSOR, depth_max=6.0)
+    for _ in range(3):
+        volume.integrate(frame, np.eye(4))
+    return volume, Level(CAMERA, frame.depth - np.float32(offset), gray.astype(np.float32) / np.float32(255))
+
+
+@pytest.mark.parametrize("noisy", [False, True])
+@pytest.mark.parametrize("far", [1.0, 2.0, 3.0])
+@pytest.mark.parametrize(("sigmas", "reason"), [(2.0, ""), (6.0, "off the map")])
+def test_distances_are_judged_in_units_of_the_noise_at_their_depth(far, sigmas, reason, noisy):
+    sigma, sigma_one = (SENSOR.sigma(z) for z in (far, 1.0))
+    volume, level = wall(sigmas * sigma, far)
+    # a Huber constant beyond all residuals, so that the mean square is that of the offset
+    config = TrackerConfig(**AS_IT_IS, huber=1.0, noise_weighting=noisy)
+    result = Tracker(config, SENSOR).align(volume, [level], np.eye(4))
+    assert result.residual == pytest.approx(sigmas * sigma_one, rel=0.1)
+    assert result.converged is (not reason)
+    assert reason in result.reason
+
+
+@pytest.mark.parametrize("exposure", [False, True])
+def test_a_change_of_exposure_is_no_difference_from_the_map(exposure):
+    volume, level = wall(0.0, 1.5)
+    brighter = exposed(level, (1.1, 0.05))
+    other = Level(CAMERA, level.depth, np.ascontiguousarray(level.intensity[:, ::-1]))
+    tracker = Tracker(TrackerConfig(**AS_IT_IS, exposure=exposure), SENSOR)
+    same, changed, wrong = (tracker.align(volume, [x], np.eye(4)).color_residual for x in (level, brighter, other))
+    assert changed < same + 0.01
+    assert wrong > 0.05
+
+
+@pytest.mark.parametrize("robust", ["huber", "tukey"])
+def test_the_statistic_is_that_of_a_registration_weighted_by_the_noise(volume, robust):
+    level = level_of(corner(np.array([0.01, -0.01, 0.015, 0.01, 0.0, -0.01])))
+    by_noise, alike = (
+        Tracker(TrackerConfig(**AS_IT_IS, robust=robust, noise_weighting=noisy), SENSOR).align(
+            volume, [level], np.eye(4)
+        )
+        for noisy in (True, False)
+    )
+    assert by_noise.residual > 0.002
+    assert alike.residual == pytest.approx(by_noise.residual, rel=1e-4)

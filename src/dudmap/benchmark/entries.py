@@ -1,4 +1,4 @@
-"""What a suite consists of: recordings on disk and synthetic ones, described so that another process can open them."""
+"""Entries of a benchmark suite: descriptions of recordings, which another process can open."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -17,37 +17,29 @@ class Entry:
     """One recording of a suite.
 
     Attributes:
-        name: Name in tables, of folders and in the published values.
+        name: Name in tables, folders and published figures.
         path: Folder of a recording on disk; None for a synthetic one.
         parameters: Arguments of ``dudmap.synthetic.sequence``; ``camera`` is a (width, height) in pixels.
-        address: Public page a user can download it from, empty if there is none.
-        camera: Intrinsics as text for a recording that does not know its own.
-        max_frames: Use only the first frames.
+        address: Public page it can be downloaded from, empty if there is none.
+        max_frames: Use only this many frames from the start.
     """
 
     name: str
     path: Path | None = None
     parameters: Mapping[str, Any] = field(default_factory=dict)
     address: str = ""
-    camera: str | None = None
     max_frames: int | None = None
 
     def open(self) -> "Sequence":
-        """The recording.
+        """Open the recording, or set up the synthetic one.
 
         Raises:
             DatasetError: The folder is missing or not a recording.
         """
         if self.path is not None:
-            from dudmap.geometry.trajectory import Trajectory
             from dudmap.sequences import open_sequence
-            from dudmap.sequences.tum import TumSequence
 
-            recording = open_sequence(self.path, self.camera)
-            beside = sorted(self.path.glob("*.gt.freiburg"))  # the name that ICL-NUIM gives its ground truth
-            if isinstance(recording, TumSequence) and recording.ground_truth is None and len(beside) == 1:
-                recording.ground_truth = Trajectory.load(beside[0])
-            return recording
+            return open_sequence(self.path)
         from dudmap.synthetic import sequence
         from dudmap.synthetic.recording import DEFAULT_CAMERA
 
@@ -55,7 +47,7 @@ class Entry:
         return sequence(**{**self.parameters, "camera": DEFAULT_CAMERA.resized(*size)})
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
-        """True static surface in the frame of the ground truth, whole and as far as the camera saw it, if known."""
+        """True static surface and its observed part, in the frame of the ground truth, if known."""
         from dudmap.geometry.mesh import Mesh
         from dudmap.synthetic.recording import SyntheticSequence
 
@@ -68,17 +60,17 @@ class Entry:
 
 
 def local_entries(data: Path) -> list[Entry]:
-    """Every recording in a folder, or the folder itself if it is one.
+    """Every recording in a folder, or the folder itself if it is a recording.
 
     Raises:
-        DatasetError: There is none.
+        DatasetError: No recording was found.
     """
-    from dudmap.sequences.tum import TumSequence
+    from dudmap.sequences import is_recording
 
     if not data.is_dir():
         raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
     folders = [data, *sorted(child for child in data.iterdir() if child.is_dir())]
-    found = [Entry(folder.resolve().name, folder) for folder in folders if TumSequence.recognises(folder)]
+    found = [Entry(folder.resolve().name, folder) for folder in folders if is_recording(folder)]
     if not found:
         raise DatasetError(f"no recording found in {data}; expected folders with rgb.txt and depth.txt")
     return found

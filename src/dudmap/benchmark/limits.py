@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from dudmap.benchmark.measure import Row, in_own_process, measure_sequence
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.pipeline.metrics import SCORED_COVERAGE
+from dudmap.evaluation.segmentation import SCORED_COVERAGE
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface

@@ -1,11 +1,12 @@
-"""One system on one recording, in a process of its own so that time and memory are its own."""
+"""Measurement of one system on one recording, in a separate process so that time and memory are not shared."""
 
 import multiprocessing
 import tempfile
+import traceback
 from collections.abc import Callable, Iterable
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,17 +22,17 @@ if TYPE_CHECKING:
     from dudmap.sequences import Sequence
 
 Row = dict[str, Any]
-"""One line of a table: sequence, system, and figures by name; ``error`` holds a sentence where there are none."""
+"""One row of a table: sequence, system and figures by name, or ``error`` with a sentence."""
 
 
 @dataclass(frozen=True)
 class Job:
-    """What is to be measured.
+    """One measurement of a suite.
 
     Attributes:
         entry: The recording.
         system: Name of the system.
-        config: Its parameters.
+        config: Parameters of the system.
         out: Folder that keeps the run; None keeps nothing.
     """
 
@@ -42,10 +43,10 @@ class Job:
 
 
 def measure(job: Job) -> Row:
-    """Run the system over the recording and score what it gave.
+    """Run a system on a recording and score the result.
 
     Raises:
-        DudmapError: The recording cannot be used, or nothing could be tracked.
+        DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     sequence = job.entry.open()
     row = measure_sequence(
@@ -64,26 +65,26 @@ def measure_sequence(
     samples: int = SAMPLES,
     passes: int = 1,
 ) -> Row:
-    """Figures of one run: those of its metrics.json, and how trajectory and mesh compare with the truth.
+    """Run a system on a recording: figures of its metrics.json and errors of trajectory and mesh.
 
     Args:
         sequence: The recording.
-        config: The system.
-        surfaces: True static surface, whole and as far as it was seen, in the frame of the ground truth, if known.
+        config: Parameters of the system.
+        surfaces: True static surface and its observed part, in the frame of the ground truth, if known.
         out: Folder that keeps the run; None keeps nothing.
         max_frames: Use only the first frames.
-        samples: Points drawn on each surface.
-        passes: See ``dudmap.run.run``.
+        samples: Number of points sampled on each surface.
+        passes: See ``dudmap.pipeline.run.run``.
 
     Raises:
-        DudmapError: The recording cannot be used, or nothing could be tracked.
+        DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.geometry.mesh import Mesh
     from dudmap.pipeline.frame_source import AHEAD
     from dudmap.pipeline.run import run
     from dudmap.synthetic.recording import SyntheticSequence
 
-    ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would take the cores from the system
+    ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = out or Path(temporary)
         report = run(
@@ -104,12 +105,12 @@ def measure_sequence(
 
 
 def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] = lambda row: None) -> list[Row]:
-    """Measure all jobs, each in its own process, ``workers`` at a time; a failed one becomes a row with ``error``.
+    """Measure all jobs, each in its own process; a failed one gives a row with ``error``.
 
     Args:
-        jobs: What to measure; rows come back in this order.
-        workers: Processes at a time. Times per frame mean most with one.
-        done: Called with every row as soon as it is there.
+        jobs: The measurements; rows are returned in this order.
+        workers: Number of processes at a time. Times per frame are reliable with one only.
+        done: Called with every row as soon as it is complete.
     """
 
     def one(job: Job) -> Row:
@@ -122,26 +123,14 @@ def measure_all(jobs: Iterable[Job], workers: int, done: Callable[[Row], None] =
 
 
 def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
-    """What ``function(argument)`` returns in a fresh process; {"error": sentence} where it fails."""
-    context = multiprocessing.get_context("spawn")
-    receiver, sender = context.Pipe(duplex=False)
-    process = context.Process(target=_send, args=(function, argument, sender))
-    process.start()
-    sender.close()
-    try:
-        return receiver.recv()
-    except EOFError:
-        process.join()
-        return {"error": f"its process ended with code {process.exitcode} and without a result"}
-    finally:
-        process.join()
-        receiver.close()
-
-
-def _send(function: Callable[[Any], Row], argument: Any, sender: Connection) -> None:  # noqa: ANN401
-    try:
-        sender.send(function(argument))
-    except DudmapError as error:
-        sender.send({"error": str(error)})
-    finally:
-        sender.close()
+    """Result of ``function(argument)`` in a new process; ``{"error": sentence}`` if it raises or the process dies."""
+    with ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn")) as pool:
+        try:
+            return pool.submit(function, argument).result()
+        except DudmapError as error:
+            return {"error": str(error)}
+        except BrokenProcessPool:
+            return {"error": "its process died without a result, as when it crashes or runs out of memory"}
+        except Exception as error:  # a defect in one measurement must not discard the others of a suite
+            traceback.print_exception(error)
+            return {"error": f"{type(error).__name__}: {error}"}

@@ -2,9 +2,8 @@
 
 from typing import TYPE_CHECKING, Any
 
-from dudmap.errors import DatasetError
+from dudmap.evaluation.trajectory import RUN_FIGURES, accuracy, ate
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.metrics import accuracy
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
@@ -17,21 +16,8 @@ SAMPLES = 100_000
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
-    """ATE and RPE, and the errors when only the first pose is aligned.
-
-    ``drift_rmse_m`` and ``rotation_rmse_deg`` are the root mean squares of distance and angle after the motion that
-    brings the first estimated pose onto the true one: what a fixed or merely turning camera is judged by.
-    """
-    from dudmap.evaluation.trajectory import ate
-
-    out = accuracy(estimate, truth)
-    try:
-        from_start = ate(estimate, truth, align="origin")
-    except DatasetError:  # told by accuracy_missing
-        return out
-    out["drift_rmse_m"] = round(from_start.rmse, 6)
-    out["rotation_rmse_deg"] = round(from_start.rot_rmse_deg, 5)
-    return out
+    """ATE, RPE, and the drift after aligning the first pose only; see ``evaluation.trajectory.trajectory_figures``."""
+    return accuracy(estimate, truth, (*RUN_FIGURES, "drift_rmse_m", "rotation_rmse_deg"))
 
 
 def score_mesh(
@@ -61,7 +47,6 @@ def score_mesh(
     """
     from dudmap.evaluation.reconstruction import compare_surfaces
     from dudmap.evaluation.surface import moved
-    from dudmap.evaluation.trajectory import ate
 
     T = ate(estimate, truth, align="origin").T_reference_estimate
     result = compare_surfaces(moved(mesh, T), whole, observed=seen, thresholds=(COMPLETE_WITHIN,), samples=samples)

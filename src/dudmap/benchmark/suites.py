@@ -1,4 +1,4 @@
-"""The suites: which recordings they consist of and where a user can get them."""
+"""Benchmark suites: their recordings and the addresses these can be downloaded from."""
 
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -9,13 +9,12 @@ from dudmap.errors import ConfigError, DatasetError
 TUM = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download"
 BONN = "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/"
 ICL_NUIM = "https://www.doc.ic.ac.uk/~ahanda/VaFRIC/iclnuim.html"
-# These two as public code that uses the recordings names them; whether the servers still answer was not tried.
+# CoRBS and VolumeDeform: addresses given in public code that uses them; not checked.
 CORBS = "http://corbs.dfki.uni-kl.de/"
 VOLUMEDEFORM = "https://cloud9.cs.fau.de/index.php/s/46qcNZSNePHx08A"
-ICL_CAMERA = "481.2,480,319.5,239.5,640,480,5000"
 
 SUITES: dict[str, str] = {
-    "synthetic": "Analytic worlds with exact truth; needs no data.",
+    "synthetic": "Synthetic worlds with exact ground truth; needs no data.",
     "thesis": "The recordings of tables 5.1 to 5.8 of the DUDMap thesis.",
     "tum-dynamic": "The eight fr3 sitting and walking recordings of TUM RGB-D.",
     "bonn": "The 24 dynamic and 2 static recordings of Bonn RGB-D Dynamic.",
@@ -62,12 +61,12 @@ QUICK = ("room-static", "room-person", "room-people-at-start")
 
 @dataclass(frozen=True)
 class Suite:
-    """Recordings that are there, and those that are not.
+    """Recordings of a suite.
 
     Attributes:
         name: Name of the suite.
-        entries: What can be measured.
-        missing: What cannot, with the address to get it from.
+        entries: Recordings that were found.
+        missing: Recordings that were not found.
     """
 
     name: str
@@ -75,21 +74,21 @@ class Suite:
     missing: list[Entry]
 
     def names(self) -> list[str]:
-        """Names of all recordings of the suite, there or not."""
+        """Names of all recordings of the suite, found or not."""
         return [entry.name for entry in [*self.entries, *self.missing]]
 
 
 def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
-    """The recordings of a suite.
+    """Find the recordings of a suite.
 
     Args:
         name: One of ``SUITES``.
-        data: Folder that is searched, two levels deep, for the recordings' folders; only ``synthetic`` needs none.
-        quick: Short: at most three synthetic worlds of 60 frames, at most 60 frames of every recording.
+        data: Folder that is searched, two levels deep, for the recordings; only ``synthetic`` needs none.
+        quick: Only three synthetic worlds, and at most 60 frames of every recording.
 
     Raises:
         ConfigError: There is no such suite, or it needs ``data``.
-        DatasetError: ``data`` is no folder, or holds nothing for the suite ``local``.
+        DatasetError: ``data`` is no folder, or for the suite ``local`` holds no recording.
     """
     if name not in SUITES:
         raise ConfigError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
@@ -119,7 +118,7 @@ def _entries(suite: str) -> list[Entry]:
     tum = [Entry(name, address=TUM) for name in FR3]
     bonn = [Entry(f"rgbd_bonn_{name}", address=BONN) for name in BONN_NAMES]
     rooms = [f"living_room_traj{number}{kind}_frei_png" for kind in ("n", "") for number in range(4)]
-    icl = [Entry(name, address=ICL_NUIM, camera=ICL_CAMERA) for name in rooms]
+    icl = [Entry(name, address=ICL_NUIM) for name in rooms]
     if suite == "tum-dynamic":
         return tum
     if suite == "bonn":
@@ -138,7 +137,7 @@ def _entries(suite: str) -> list[Entry]:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder is found in ``data`` or one level further down, and the others."""
+    """Entries whose folder is found in ``data`` or one level below, and the others."""
     folders = {path.name: path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern)) if path.is_dir()}
     found = [replace(entry, path=folders[entry.name]) for entry in entries if entry.name in folders]
     return found, [entry for entry in entries if entry.name not in folders]

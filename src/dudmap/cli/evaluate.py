@@ -3,7 +3,7 @@
 import json
 import math
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from typer.core import TyperGroup
@@ -11,20 +11,18 @@ from typer.core import TyperGroup
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 
 if TYPE_CHECKING:
-    import numpy as np
-
-    from dudmap.geometry.mesh import Mesh
+    from dudmap.evaluation.trajectory import Align
     from dudmap.geometry.trajectory import Trajectory
 
 Figures = dict[str, Any]
-"""Numbers by name and unit; None where there is none."""
+"""Figures by name and unit; None for a figure that could not be computed."""
 
 
 class EvaluateGroup(TyperGroup):
-    """``evaluate RUN`` is short for ``evaluate trajectory RUN``."""
+    """Command group in which ``evaluate RUN`` is short for ``evaluate trajectory RUN``."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - Typer's own types moved between versions
-        """Put the command's name before arguments that start with none."""
+        """Insert the default command where the arguments name none."""
         if args and args[0] not in self.commands and args[0] != "--help":
             args = ["trajectory", *args]
         return super().parse_args(ctx, args)
@@ -39,13 +37,13 @@ app = typer.Typer(
 )
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
-PlotsOption = Annotated[bool, typer.Option("--plots", help="Also draw PNG pictures, into the folder of the figures.")]
+PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
 OutOption = Annotated[
     Path | None,
-    typer.Option("--out", help="Folder for the JSON file and the pictures; default: beside what is scored."),
+    typer.Option("--out", help="Output folder for figures and plots; default: the folder of the estimate."),
 ]
 GapOption = Annotated[
-    float, typer.Option("--max-difference", help="Times further apart belong to different frames, s.", metavar="S")
+    float, typer.Option("--max-difference", help="Largest time difference of associated poses, s.", metavar="S")
 ]
 
 
@@ -62,7 +60,7 @@ def trajectory(
     ] = None,
     align: Annotated[
         str,
-        typer.Option("--align", help="se3: best rigid motion; origin: first pose onto the first true pose; none."),
+        typer.Option("--align", help="se3: least-squares rigid alignment; origin: first poses aligned; none."),
     ] = "se3",
     max_difference: GapOption = 0.02,
     as_json: JsonOption = False,
@@ -71,30 +69,33 @@ def trajectory(
 ) -> None:
     """Score a trajectory: ATE, RPE per second and per metre, share of frames tracked.
 
-    Without a reference, groundtruth.txt in the run folder is taken; where there is none, only length and duration
-    are told.
+    The default reference is groundtruth.txt in the run folder. Without one, only path length and duration are given.
     """
+    from dudmap.evaluation.files import find_reference, find_trajectory, tracked_share
+    from dudmap.evaluation.trajectory import trajectory_figures
     from dudmap.geometry.trajectory import Trajectory
 
-    file, folder = _trajectory_of(estimate)
+    file, folder = find_trajectory(estimate)
     found = Trajectory.load(file)
-    truth = _reference_of(reference, folder)
+    truth = find_reference(reference, folder)
     figures: Figures = {"estimate": str(file), "reference": str(truth) if truth else None}
-    figures |= describe(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
+    figures |= path_length(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
+    alignment = cast("Align", align)  # checked by ate
     pictures: list[Path] = []
-    target = _target(out, folder if folder is not None else file.parent)
+    target = _output_folder(out, folder if folder is not None else file.parent)
     if truth is not None:
         true = Trajectory.load(truth)
-        figures |= compare(found, true, align, max_difference)
+        errors = trajectory_figures(found, true, alignment, max_difference)
+        figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
         if plots:
-            pictures = _draw_trajectory(target, found, true, align, max_difference)
+            pictures = _plot_trajectory(target, found, true, alignment, max_difference)
     if plots and folder is not None and (folder / "residuals.npz").is_file():
         from dudmap.evaluation.plots import plot_residuals
 
         plot_residuals(target / "residuals.png", folder / "residuals.npz")
         pictures.append(target / "residuals.png")
     if plots and not pictures:
-        raise DatasetError("there is nothing to draw without a reference; name one with --reference")
+        raise DatasetError("there is nothing to plot without a reference; name one with --reference")
     name = "evaluation.json" if folder is not None else f"{file.stem}.evaluation.json"
     _report(figures, target / name, pictures, as_json=as_json, title="trajectory")
 
@@ -105,15 +106,19 @@ def mesh(
     reference: Annotated[
         Path, typer.Argument(help="True mesh, or folder with surface.ply (and surface_observed.ply).", metavar="REF")
     ],
-    align: Annotated[bool, typer.Option("--align", help="First register the mesh to the reference (ICP).")] = False,
+    align: Annotated[bool, typer.Option("--align", help="Register the mesh to the reference first (ICP).")] = False,
     thresholds: Annotated[
-        str, typer.Option("--distances", help="Distances for precision and recall, m, with commas.", metavar="M,M,...")
+        str,
+        typer.Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,..."),
     ] = "0.01,0.02,0.05",
     ghost_distance: Annotated[
-        float, typer.Option("--ghost-distance", help="Surface farther than this from the true one is a ghost, m.")
+        float,
+        typer.Option(
+            "--ghost-distance", help="Estimated surface farther than this from the true one counts as ghost, m."
+        ),
     ] = 0.05,
-    samples: Annotated[int, typer.Option("--samples", help="Points drawn on each surface.")] = 300_000,
-    points: Annotated[bool, typer.Option("--points", help="Accept point clouds; they have no area.")] = False,
+    samples: Annotated[int, typer.Option("--samples", help="Number of sampled points per surface.")] = 300_000,
+    points: Annotated[bool, typer.Option("--points", help="Accept point clouds, which have no area.")] = False,
     error_mesh: Annotated[
         bool, typer.Option("--error-mesh/--no-error-mesh", help="Write mesh_error.ply, coloured by the error.")
     ] = True,
@@ -123,20 +128,21 @@ def mesh(
 ) -> None:
     """Score a mesh: accuracy, completeness, precision, recall, F-score and ghosts.
 
-    A run folder scored against a recording's folder with groundtruth.txt is first moved so that the run's first
-    pose is the true one; anything else is taken to be in one frame already.
+    A run folder and a recording with groundtruth.txt are aligned at their first pose. Anything else must share one
+    coordinate frame.
     """
     from dudmap.evaluation import reconstruction
+    from dudmap.evaluation.files import first_pose_alignment, load_mesh
     from dudmap.evaluation.surface import moved, register
 
     file = estimate / "mesh.ply" if estimate.is_dir() else estimate
     true_file = reference / "surface.ply" if reference.is_dir() else reference
-    found, true = _mesh(file), _mesh(true_file)
+    found, true = load_mesh(file), load_mesh(true_file)
     observed_file = reference / "surface_observed.ply"
-    observed = _mesh(observed_file) if reference.is_dir() and observed_file.is_file() else None
+    observed = load_mesh(observed_file) if reference.is_dir() and observed_file.is_file() else None
     figures: Figures = {"estimate": str(file), "reference": str(true_file)}
     figures["observed"] = str(observed_file) if observed is not None else None
-    T = _start(estimate, reference)
+    T = first_pose_alignment(estimate, reference)
     if align:
         registration = register(found, true, T)
         T = registration.T_reference_estimate
@@ -162,7 +168,7 @@ def mesh(
         "accuracy": [round(float(share), 6) for share in result.accuracy_histogram],
         "completeness": [round(float(share), 6) for share in result.completeness_histogram],
     }
-    target = _target(out, estimate if estimate.is_dir() else file.parent)
+    target = _output_folder(out, estimate if estimate.is_dir() else file.parent)
     stem = "mesh" if estimate.is_dir() else file.stem
     pictures: list[Path] = []
     if error_mesh:
@@ -183,7 +189,7 @@ def masks(
         Path, typer.Argument(help="Recording's folder with mask.txt, or folder of <timestamp>.png.", metavar="REF")
     ],
     per_frame: Annotated[
-        bool, typer.Option("--per-frame", help="Also give every frame's figures (JSON, CSV).")
+        bool, typer.Option("--per-frame", help="Add the figures of every frame to the JSON output.")
     ] = False,
     as_json: JsonOption = False,
     plots: PlotsOption = False,
@@ -202,7 +208,7 @@ def masks(
     if per_frame:
         columns = ("timestamps", "coverage", "found_share", "precision", "recall", "iou")
         figures["per_frame"] = {key: [_rounded(x, 6) for x in getattr(result, key)] for key in columns}
-    target, pictures = _target(out, estimate), []
+    target, pictures = _output_folder(out, estimate), []
     if plots:
         from dudmap.evaluation.plots import plot_masks
 
@@ -211,104 +217,13 @@ def masks(
     _report(figures, target / "masks.evaluation.json", pictures, as_json=as_json, title="masks")
 
 
-def describe(found: "Trajectory") -> Figures:
-    """What a trajectory tells without a reference."""
+def path_length(estimate: "Trajectory") -> Figures:
+    """Number of poses, duration and path length of a trajectory."""
     import numpy as np
 
-    steps = np.linalg.norm(np.diff(found.Ts_world_camera[:, :3, 3], axis=0), axis=1)
-    duration = float(found.timestamps[-1] - found.timestamps[0])
-    return {"poses": len(found), "duration_s": round(duration, 6), "path_length_m": round(float(steps.sum()), 6)}
-
-
-def compare(found: "Trajectory", true: "Trajectory", align: str, max_difference: float) -> Figures:
-    """Absolute and relative errors; a relative one is None where the recording is too short for it."""
-    from dudmap.evaluation.trajectory import ate, rpe
-
-    absolute = ate(found, true, align, max_difference)  # pyright: ignore[reportArgumentType] - checked inside
-    out: Figures = {"pairs": absolute.num_pairs, "alignment": absolute.alignment}
-    for key in ("rmse", "mean", "median", "max"):
-        out[f"ate_{key}_m"] = _rounded(getattr(absolute, key))
-    for key in ("rmse", "mean", "median", "max"):
-        out[f"ate_rot_{key}_deg"] = _rounded(getattr(absolute, f"rot_{key}_deg"))
-    start = ate(found, true, "origin", max_difference)
-    out |= {"drift_rmse_m": _rounded(start.rmse), "rotation_rmse_deg": _rounded(start.rot_rmse_deg)}
-    for unit in ("s", "m"):
-        names = [f"rpe_trans_{key}_m_per_{unit}" for key in ("rmse", "mean", "median", "max")]
-        names += [f"rpe_rot_{key}_deg_per_{unit}" for key in ("rmse", "mean", "median", "max")]
-        try:
-            relative = rpe(found, true, 1.0, unit, max_difference)
-        except DatasetError as error:
-            out |= dict.fromkeys(names) | {f"rpe_per_{unit}_missing": str(error)}
-            continue
-        values = [getattr(relative, f"trans_{key}") for key in ("rmse", "mean", "median", "max")]
-        values += [getattr(relative, f"rot_{key}_deg") for key in ("rmse", "mean", "median", "max")]
-        out |= {name: _rounded(value) for name, value in zip(names, values, strict=True)}
-    return out
-
-
-def tracked_share(poses: int, folder: Path | None, truth: Path | None) -> float | None:
-    """Share of the recording's frames that have a pose; None where the number of frames is not known.
-
-    It is known from a run's metrics.json, or else from the lists of images beside the true trajectory.
-    """
-    from dudmap.geometry.association import read_list, read_pairs
-
-    if folder is not None and (folder / "metrics.json").is_file():
-        try:
-            frames = int(json.loads((folder / "metrics.json").read_text(encoding="utf-8"))["frames"])
-        except (ValueError, KeyError, TypeError) as error:
-            raise DatasetError(f"{folder / 'metrics.json'} does not tell the number of frames: {error}") from error
-    elif truth is not None and (truth.parent / "associations.txt").is_file():
-        frames = len(read_pairs(truth.parent / "associations.txt"))
-    elif truth is not None and (truth.parent / "depth.txt").is_file():
-        frames = len(read_list(truth.parent / "depth.txt"))
-    else:
-        return None
-    return round(poses / frames, 6) if frames else None
-
-
-def _trajectory_of(estimate: Path) -> tuple[Path, Path | None]:
-    """The trajectory's file, and the run folder if it is one."""
-    if not estimate.is_dir():
-        return estimate, None
-    file = estimate / "trajectory.txt"
-    if not file.is_file():
-        raise DatasetError(f"{estimate} is no run folder: it holds no trajectory.txt")
-    return file, estimate
-
-
-def _reference_of(reference: Path | None, folder: Path | None) -> Path | None:
-    if reference is not None:
-        file = reference / "groundtruth.txt" if reference.is_dir() else reference
-        if not file.is_file():
-            raise DatasetError(f"there is no true trajectory {file}; name a file in TUM format or a recording's folder")
-        return file
-    beside = None if folder is None else folder / "groundtruth.txt"
-    return beside if beside is not None and beside.is_file() else None
-
-
-def _mesh(file: Path) -> "Mesh":
-    from dudmap.errors import MapError
-    from dudmap.geometry.mesh import Mesh
-
-    if not file.is_file():
-        raise MapError(f"there is no mesh {file}; name a mesh file, or a folder that holds {file.name}")
-    return Mesh.load(file)
-
-
-def _start(estimate: Path, reference: Path) -> "np.ndarray | None":
-    """What brings a run's first pose onto the true one, if both are folders with trajectories.
-
-    The run's world is its first camera. Aligning all positions would turn the map: on a short path they hardly
-    determine the rotation.
-    """
-    from dudmap.evaluation.trajectory import ate
-    from dudmap.geometry.trajectory import Trajectory
-
-    found, true = estimate / "trajectory.txt", reference / "groundtruth.txt"
-    if not (found.is_file() and true.is_file()):
-        return None
-    return ate(Trajectory.load(found), Trajectory.load(true), "origin").T_reference_estimate
+    steps = np.linalg.norm(np.diff(estimate.Ts_world_camera[:, :3, 3], axis=0), axis=1)
+    duration = float(estimate.timestamps[-1] - estimate.timestamps[0])
+    return {"poses": len(estimate), "duration_s": round(duration, 6), "path_length_m": round(float(steps.sum()), 6)}
 
 
 def _distances(text: str) -> tuple[float, ...]:
@@ -318,25 +233,25 @@ def _distances(text: str) -> tuple[float, ...]:
         raise ConfigError(f"--distances is {text!r}; expected metres with commas, e.g. 0.01,0.02,0.05") from None
 
 
-def _draw_trajectory(
-    target: Path, found: "Trajectory", true: "Trajectory", align: str, max_difference: float
+def _plot_trajectory(
+    target: Path, found: "Trajectory", true: "Trajectory", align: "Align", max_difference: float
 ) -> list[Path]:
     from dudmap.evaluation import plots
     from dudmap.evaluation.trajectory import ate, rpe
 
-    absolute = ate(found, true, align, max_difference)  # pyright: ignore[reportArgumentType] - checked before
+    absolute = ate(found, true, align, max_difference)
     pictures = [target / "trajectory.png", target / "error.png"]
     plots.plot_trajectories(pictures[0], found, true, absolute)
     plots.plot_error(pictures[1], absolute)
     try:
         relative = rpe(found, true, 1.0, "s", max_difference)
-    except DatasetError:  # the figures say why there is none
+    except DatasetError:  # the reason is among the figures
         return pictures
     plots.plot_rpe(target / "rpe.png", relative)
     return [*pictures, target / "rpe.png"]
 
 
-def _target(out: Path | None, default: Path) -> Path:
+def _output_folder(out: Path | None, default: Path) -> Path:
     target = out or default
     try:
         target.mkdir(parents=True, exist_ok=True)
@@ -346,7 +261,7 @@ def _target(out: Path | None, default: Path) -> Path:
 
 
 def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool, title: str) -> None:
-    """Save the figures and print them."""
+    """Write the figures as JSON and print them."""
     text = json.dumps(figures, allow_nan=False)
     try:
         file.write_text(text + "\n", encoding="utf-8")

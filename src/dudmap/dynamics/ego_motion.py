@@ -1,318 +1,366 @@
-"""What moves between two images, while the map cannot tell yet.
+"""Motion segmentation from two images, for as long as the map cannot tell static from moving.
 
-In the first second nothing is known of free space, and whoever is in view is part of the map. Corners are followed
-from image to image (Lucas and Kanade 1981) and explained by one rigid motion (RANSAC, Fischler and Bolles 1981): what
-does not follow the motion of most of the visible surface moves. Errors are counted in pixels, so that a near person
-counts no more than a far wall.
+A new map knows no free space, and whoever is in view is part of it. Corners are tracked from image to image (Lucas and
+Kanade 1981) and the rigid motion that most of the visible surface follows is taken for that of the static world
+(RANSAC, Fischler and Bolles 1981); corners that do not follow it move. Errors are measured in pixels: a near person
+then weighs no more than a far wall.
 """
 
 from collections import deque
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ransac import NOISE_PX, projected, rigid_motion
+from dudmap.dynamics.ransac import NOISE_PX, reproject, rigid_motion
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.optical_flow import consistent_with_static, track_forward_backward
-from dudmap.frames.pyramid import Pyramid
+from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.geometry import se3
 
 MOVES_PX = 1.0
-"""A corner farther off than this,"""
+"""Smallest reprojection error of a moving corner, pixels."""
 MOVES_SIGMAS = 5.0
-"""and than this many standard deviations (per coordinate) of the corners that follow the motion,"""
+"""Smallest reprojection error of a moving corner, in standard deviations (per coordinate) of the static corners."""
 MOVES_SHARE = 0.08
-"""and by this share of its own path besides (motion blur, rolling shutter), moves."""
+"""Added to either limit: this share of the length of the corner's own flow (motion blur, rolling shutter)."""
 FAR_PX = 3.0
-"""Corners farther off than this say nothing of that deviation."""
+"""Corners with a larger reprojection error are left out of that standard deviation, pixels."""
 RAYLEIGH = 1.1774
-"""Median length of a vector of two normally distributed coordinates of deviation 1."""
+"""Median length of a vector of two normally distributed coordinates of standard deviation 1: sqrt(2 ln 2)."""
 FEWEST = 15
-"""With fewer corners no motion is believed."""
+"""Fewest corners, and fewest static inliers, of a motion that is accepted."""
 LEAST_SHARE = 0.3
-"""Nor with a smaller share of the surface that follows it."""
+"""Smallest share of the visible surface that must follow a motion that is accepted."""
 REACH = 0.1
-"""A pixel is judged by the corners within this share of its depth, in space."""
+"""Largest distance of a corner that labels a pixel of its segment, as a share of the pixel's depth."""
 NEIGHBOURS = 5
+"""Nearest corners that label a pixel of a segment whose corners disagree."""
 FEWEST_MOVING = 3
-"""Corners of a piece that must move for any of it to."""
+"""Fewest moving (static) corners of a moving (static) segment."""
 AGREED = 0.7
-"""A piece moves as a whole if at least this share of its corners does."""
-COVERED = 0.5
-"""Share of the readings that must move for frames to be compared however old the map is: behind a crowd it learns
-nothing of free space."""
-MOVED_SAY = 0.1
-"""What a corner on something known to move counts, against one that is not."""
-APART, LONGEST = 0.1, 0.4
-"""What is too slow to be seen from one image to the next is seen over this time and more, seconds, and at most that:
-the images of a young map are kept at these intervals."""
-SEVERAL = 0.02
-"""Share of the readings that must move for it to be more than noise."""
+"""Share of the corners of a segment that must move for it to move as a whole."""
+MOVED_WEIGHT = 0.1
+"""Weight of a corner on an object known to move, against 1 of any other."""
+SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
+"""Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
+the map is young, images are kept at intervals of the shorter one."""
+NOISE_SHARE = 0.02
+"""Moving readings up to this share of all are taken for noise."""
+
+
+@dataclass(frozen=True, eq=False)
+class LabelledCorners:
+    """Corners of an image, each labelled as static or moving.
+
+    Attributes:
+        level: The image, at the resolution of the labels.
+        segmentation: Its segments.
+        points: (n, 3) the corners, metres, camera frame.
+        pixels: (n, 2) int, their pixels u, v in ``level``.
+        moving: (n,) bool.
+    """
+
+    level: Level
+    segmentation: Segmentation
+    points: NDArray[np.float64]
+    pixels: NDArray[np.int64]
+    moving: NDArray[np.bool_]
+
+    def count_by_segment(self, chosen: NDArray[np.bool_] | None = None) -> NDArray[np.int64]:
+        """Corners (count + 1,) in each segment, all or the chosen (n,) of them; entry 0: in none."""
+        segment = self.segment_of if chosen is None else self.segment_of[chosen]
+        return np.bincount(segment, minlength=self.segmentation.count + 1)
+
+    @cached_property
+    def segment_of(self) -> NDArray[np.int32]:
+        """Segment (n,) that each corner lies in."""
+        return self.segmentation.labels[self.pixels[:, 1], self.pixels[:, 0]]
 
 
 @dataclass(frozen=True, eq=False)
 class DominantMotion:
-    """The rigid motion of most of the visible surface between two images, and what does not follow it.
+    """Rigid motion of most of the visible surface between two images, and what does not follow it.
 
     Attributes:
-        T_after_before: (4, 4) the static world's motion from the first camera's frame to the second's.
-        moving_after: (h, w) bool, pixels of the second image with a reading that do not follow it.
-        resting_after: (h, w) bool, pieces of surface that do, by their corners; what has no corners is neither.
-        share: Share of the corners, each counted by the surface it stands for, that follow it.
-        look_back: Finds ``moving_before``, which few ask for.
+        T_after_before: (4, 4) motion of the static world from the first camera's frame to the second's.
+        share: Share of the visible surface, as sampled by the corners, that follows it.
+        before, after: The corners in the first and in the second image; moving are those that do not follow it.
     """
 
     T_after_before: NDArray[np.float64]
-    moving_after: NDArray[np.bool_]
-    resting_after: NDArray[np.bool_]
     share: float
-    look_back: Callable[[], NDArray[np.bool_]]
+    before: LabelledCorners
+    after: LabelledCorners
 
     @cached_property
     def moving_before(self) -> NDArray[np.bool_]:
-        """(h, w) pixels of the first image with a reading that do not follow it."""
-        return self.look_back()
+        """Moving pixels (h, w) of the first image."""
+        return propagate_to_segments(self.before)
+
+    @cached_property
+    def moving_after(self) -> NDArray[np.bool_]:
+        """Moving pixels (h, w) of the second image."""
+        return propagate_to_segments(self.after)
+
+    @cached_property
+    def static_after(self) -> NDArray[np.bool_]:
+        """Pixels (h, w) of the second image in segments seen to be static; segments without corners are neither."""
+        return static_segments(self.after)
 
 
 class EgoMotionSegmenter:
-    """Finds movers from image to image while the map is too young to know them, or most of the view is hidden.
+    """Segments moving objects by comparing images, while the map is young or most of the view moves.
 
     Args:
-        seconds: Least time from the first frame on; prolonged, up to twice as long, while movers are found. 0 turns it
-            off, later too.
+        seconds: Duration of the comparison from the first frame of a map on; extended, up to twice that, while moving
+            objects are found. 0 turns the comparison off for good.
 
     Attributes:
-        active: Whether the next frame is to be compared with the remembered one in any case.
+        active: Whether the next frame is to be compared with the last one.
     """
 
     def __init__(self, seconds: float) -> None:
         self.seconds = seconds
-        self._until, self._longest = -np.inf, -np.inf
-        self._before: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
-        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Segmentation]] = deque()
-        self._compared: tuple[float, DominantMotion | None] | None = None  # time of the last comparison, and its result
         self.active = False
+        self._young_until, self._latest_end = -np.inf, -np.inf
+        self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
+        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Segmentation]] = deque()
+        self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
-        self._until, self._longest = timestamp + self.seconds, timestamp + 2 * self.seconds
+        self._young_until, self._latest_end = timestamp + self.seconds, timestamp + 2 * self.seconds
 
     @property
     def started(self) -> bool:
-        """Whether there is a map."""
-        return bool(np.isfinite(self._longest))
+        """Whether ``start`` was called."""
+        return bool(np.isfinite(self._latest_end))
 
-    def young(self, timestamp: float) -> bool:
-        """Whether the map cannot know yet what moves."""
-        return timestamp < self._until
+    def map_is_young(self, timestamp: float) -> bool:
+        """Whether the map cannot tell static from moving yet."""
+        return timestamp < self._young_until
 
-    def wanted(self, timestamp: float, small: Level, moving: NDArray[np.bool_] | None) -> bool:
-        """Whether a tracked frame, in which this (h, w) moves, is to be compared with the next."""
-        covered = moving is not None and np.count_nonzero(moving) > COVERED * np.count_nonzero(small.depth)
-        return bool(self.young(timestamp) or (covered and self.seconds > 0 and self.started))
-
-    def remember(
+    def update(
         self,
         timestamp: float,
         T_world_camera: NDArray[np.float64],
         pyramid: Pyramid,
-        surface: Segmentation,
+        segmentation: Segmentation,
         moving: NDArray[np.bool_] | None = None,
     ) -> None:
-        """Take a tracked frame, and what moves in it (h, w) bool if known, as the one to compare the next with."""
-        self._before, self._compared = (pyramid, surface, moving), None
-        self.active = self.wanted(timestamp, pyramid.labelled, moving)
-        if not self.young(timestamp):
-            self._older.clear()
-        elif not self._older or timestamp - self._older[-1][0] >= APART:
-            self._older.append((timestamp, T_world_camera, pyramid, surface))
+        """Take over a tracked frame as the one that the next is compared with.
 
-    def forget(self) -> None:
-        """Compare no more until a frame is remembered again: the last one showed nothing."""
-        self._before, self._compared, self.active = None, None, False
+        Args:
+            timestamp: Seconds.
+            T_world_camera: (4, 4) its pose.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+            moving: (h, w) bool, its moving pixels, if known.
+        """
+        self._last, self._compared = (pyramid, segmentation, moving), None
+        young = self.map_is_young(timestamp)
+        hidden = moving is not None and is_majority_dynamic(moving, pyramid.labelled)
+        self.active = young or (hidden and self.seconds > 0 and self.started)
+        if not young:
+            self._older.clear()
+        elif not self._older or timestamp - self._older[-1][0] >= SHORTEST_BASELINE:
+            self._older.append((timestamp, T_world_camera, pyramid, segmentation))
+
+    def reset(self) -> None:
+        """Drop the last frame: nothing is compared before the next ``update``."""
+        self._last, self._compared, self.active = None, None, False
 
     def compare(
-        self, timestamp: float, pyramid: Pyramid, surface: Segmentation, T_expected: NDArray[np.float64] | None = None
+        self,
+        timestamp: float,
+        pyramid: Pyramid,
+        segmentation: Segmentation,
+        T_expected: NDArray[np.float64] | None = None,
     ) -> DominantMotion | None:
-        """The static world's motion since the remembered frame, and what does not follow it; None if unknown.
+        """Motion of the static world since the last frame; None if it cannot be determined.
 
-        Asked once more for the same time, it answers without looking again.
-        """
-        if self._before is None:
-            return None
-        if self._compared is None or self._compared[0] != timestamp:
-            before, surface_before, moved = self._before
-            motion = dominant_motion(before, pyramid, (surface_before, surface), moved, T_expected)
-            self._compared = timestamp, motion
-            if (
-                motion is not None
-                and self.young(timestamp)
-                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
-            ):
-                self._until = min(timestamp + self.seconds, self._longest)
-        return self._compared[1]
-
-    def slow(
-        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, surface: Segmentation
-    ) -> NDArray[np.bool_]:
-        """What has moved (h, w) since a somewhat older frame, as far as is known, while the map is young.
+        The result is kept: a second call with the same timestamp returns the same object.
 
         Args:
             timestamp: Seconds, of the new frame.
-            T_world_camera: (4, 4) first guess of its pose.
-            pyramid: The image.
-            surface: Its pieces.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+            T_expected: (4, 4) predicted motion of the static world; None: none.
         """
-        while self._older and timestamp - self._older[0][0] > LONGEST:
+        if self._last is None:
+            return None
+        if self._compared is None or self._compared[0] != timestamp:
+            last, segmentation_last, moving = self._last
+            motion = dominant_motion(last, pyramid, (segmentation_last, segmentation), moving, T_expected)
+            self._compared = timestamp, motion
+            if (
+                motion is not None
+                and self.map_is_young(timestamp)
+                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
+            ):
+                self._young_until = min(timestamp + self.seconds, self._latest_end)
+        return self._compared[1]
+
+    def slow_movers(
+        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, segmentation: Segmentation
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) of segments that moved as a whole since an older frame; none once the map is not young.
+
+        Args:
+            timestamp: Seconds, of the new frame.
+            T_world_camera: (4, 4) prediction of its pose.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+        """
+        while self._older and timestamp - self._older[0][0] > LONGEST_BASELINE:
             self._older.popleft()
-        if not self._older or timestamp - self._older[0][0] < APART or not self.young(timestamp):
+        motion = None
+        if self._older and timestamp - self._older[0][0] >= SHORTEST_BASELINE and self.map_is_young(timestamp):
+            _, T_world_older, older, segmentation_older = self._older[0]
+            T_expected = se3.inverse(T_world_camera) @ T_world_older
+            motion = dominant_motion(older, pyramid, (segmentation_older, segmentation), T_expected=T_expected)
+        if motion is None:
             return np.zeros(pyramid.labelled.depth.shape, dtype=bool)
-        _, T_world_before, before, surface_before = self._older[0]
-        T_expected = se3.inverse(T_world_camera) @ T_world_before
-        motion = dominant_motion(before, pyramid, (surface_before, surface), T_expected=T_expected, whole=True)
-        return np.zeros(pyramid.labelled.depth.shape, dtype=bool) if motion is None else motion.moving_after
+        return propagate_to_segments(motion.after, whole_only=True)
 
 
 def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether so many readings of an image move (h, w) that it is more than noise."""
-    return bool(np.count_nonzero(moving) > SEVERAL * np.count_nonzero(level.depth))
+    """Whether the moving pixels (h, w) are a larger share of the readings of an image than noise produces."""
+    return bool(np.count_nonzero(moving) > NOISE_SHARE * np.count_nonzero(level.depth))
 
 
 def dominant_motion(
     before: Pyramid,
     after: Pyramid,
-    surfaces: tuple[Segmentation, Segmentation],
-    moved: NDArray[np.bool_] | None = None,
+    segmentations: tuple[Segmentation, Segmentation],
+    moving: NDArray[np.bool_] | None = None,
     T_expected: NDArray[np.float64] | None = None,
-    whole: bool = False,
 ) -> DominantMotion | None:
-    """Explain the corners' paths from one image to the next by one rigid motion; None where too few are left.
+    """Motion of the static world between two images, and the corners that do not follow it.
 
-    The static world is what covers most *surface*, so that each corner counts by its depth squared: a crowd may fill
-    half of the image, but hardly ever half of the visible square metres.
+    The static world is the largest *surface* that moves rigidly: each corner counts by its depth squared, since a crowd
+    may fill half of the image, but hardly ever half of the visible square metres. A corner is moving if its
+    reprojection error e exceeds
+
+        max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < FAR_PX} / sqrt(2 ln 2)
+
+    and the image does not match at its static position as well; it is dropped if it does.
 
     Args:
-        before, after: Both images; corners are followed in the finest levels.
-        surfaces: Segmentation of surface of both, at the size of the labels.
-        moved: (h, w) bool at that size, what is known to move in the first image; it has little say in what the
-            static world is.
-        T_expected: (4, 4) what the motion should be: where corners are looked for first, and what decides between
-            two motions that explain much. None: no motion.
-        whole: Only pieces most of whose corners move.
+        before, after: Both images; corners are tracked in the finest levels.
+        segmentations: Segments of both, at the resolution of the labels.
+        moving: (h, w) bool at that resolution, pixels of the first image known to move; corners on them have little
+            weight in the estimate of the motion.
+        T_expected: (4, 4) predicted motion: the search for the corners starts there, and it is the prior of the
+            estimate. None: the identity.
+
+    Returns:
+        None if too few corners are tracked, or too few of them follow one motion.
     """
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
+    camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
-    expected = projected(T_expected, _points(fine, before.corners), fine.camera)
-    pixels, targets, unlike = track_forward_backward(first, second, before.corners, expected)
+    expected = reproject(T_expected, _points(fine, before.corners), camera)
+    pixels, targets, difference = track_forward_backward(first, second, before.corners, expected)
     if len(pixels) < FEWEST:
         return None
     points = _points(fine, pixels)
-    z, (columns, rows) = points[:, 2], pixels.T
-    say, rests = np.ones(len(z)), np.ones(len(z), dtype=bool)
-    if moved is not None:
-        factor = fine.depth.shape[1] // moved.shape[1]
-        rests = ~moved[rows // factor, columns // factor]
-        say[~rests] = MOVED_SAY
-    T, surface = rigid_motion(points, targets, say, fine.camera, T_expected), say * z**2
-    error = np.linalg.norm(projected(T, points, fine.camera) - targets, axis=1)
-    if np.count_nonzero(rests & (error < NOISE_PX)) < FEWEST:
+    static = np.ones(len(points), dtype=bool)
+    if moving is not None:
+        columns, rows = _pixels_of_level(pixels, fine, before.labelled).T
+        static = ~moving[rows, columns]
+    weights = np.where(static, 1.0, MOVED_WEIGHT)
+    T, areas = rigid_motion(points, targets, weights, camera, T_expected), weights * points[:, 2] ** 2
+    predicted = reproject(T, points, camera)
+    error = np.linalg.norm(predicted - targets, axis=1)
+    inlier = error < NOISE_PX
+    share = float(areas[inlier].sum() / areas.sum())
+    if np.count_nonzero(static & inlier) < FEWEST or share < LEAST_SHARE:
         return None
-    share = float(surface[error < NOISE_PX].sum() / surface.sum())
-    if share < LEAST_SHARE:
-        return None
-    path = np.linalg.norm(targets - pixels, axis=1)
     sigma = np.median(error[error < FAR_PX]) / RAYLEIGH
-    allowed = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * path
-    moves = error > allowed
-    certain = ~moves
-    certain[moves] = ~consistent_with_static(
-        first, second, pixels[moves], projected(T, points[moves], fine.camera), allowed[moves], unlike[moves]
+    limit = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
+    moves = error > limit
+    kept = ~moves
+    kept[moves] = ~consistent_with_static(
+        first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
-    pixels, targets, points, moves = pixels[certain], targets[certain], points[certain], moves[certain]
-    depth_after = fine_after.depth[
-        _inside(targets[:, 1], fine_after.depth.shape[0]), _inside(targets[:, 0], fine_after.depth.shape[1])
-    ]
-    seen = depth_after > 0
-    points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], depth_after.astype(np.float64))
-    scale = before.labelled.camera.width / fine.camera.width
-    limit = np.array(before.labelled.depth.shape[::-1]) - 1
-    places = [np.clip(np.rint((p + 0.5) * scale - 0.5), 0, limit).astype(np.int64) for p in (pixels, targets[seen])]
+    pixels, targets, points, moves = pixels[kept], targets[kept], points[kept], moves[kept]
+    columns, rows = np.clip(np.rint(targets), 0, np.array(fine_after.depth.shape[::-1]) - 1).astype(np.int64).T
+    z = fine_after.depth[rows, columns].astype(np.float64)
+    seen = z > 0
+    points_after = fine_after.camera.points(targets[:, 0], targets[:, 1], z)[seen]
     return DominantMotion(
         T,
-        _spread(after.labelled, surfaces[1], points_after[seen], places[1], moves[seen], whole),
-        _rest(surfaces[1], places[1], moves[seen]),
         share,
-        lambda: _spread(before.labelled, surfaces[0], points, places[0], moves, whole),
+        LabelledCorners(
+            before.labelled, segmentations[0], points, _pixels_of_level(pixels, fine, before.labelled), moves
+        ),
+        LabelledCorners(
+            after.labelled,
+            segmentations[1],
+            points_after,
+            _pixels_of_level(targets[seen], fine_after, after.labelled),
+            moves[seen],
+        ),
     )
 
 
-def _spread(
-    level: Level,
-    surface: Segmentation,
-    points: NDArray[np.float64],
-    pixels: NDArray[np.int64],
-    moves: NDArray[np.bool_],
-    only_whole: bool = False,
-) -> NDArray[np.bool_]:
-    """Moving pixels (h, w): those of pieces of surface whose corners move.
+def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
+    """Moving pixels (h, w) of an image: the labels of the corners carried over to the segments they lie in.
 
-    Where corners of one piece disagree, a pixel goes with most of its neighbours in space among the piece's corners.
+    A segment moves as a whole if at least AGREED of its corners move. In a segment whose corners disagree, each pixel
+    takes the label of the majority of its nearest corners of the same segment, by distance in space.
 
     Args:
-        level: The image.
-        surface: Its pieces.
-        points: (n, 3) the corners in space, metres.
-        pixels: (n, 2) int, their pixels u, v.
-        moves: (n,).
-        only_whole: Leave the pieces whose corners disagree.
+        corners: The labelled corners.
+        whole_only: Leave out the segments whose corners disagree.
     """
     from scipy.spatial import KDTree
 
-    if np.count_nonzero(moves) < FEWEST_MOVING:
+    level, labels, moving = corners.level, corners.segmentation.labels, corners.moving
+    if np.count_nonzero(moving) < FEWEST_MOVING:
         return np.zeros(level.depth.shape, dtype=bool)
-    piece = surface.labels[pixels[:, 1], pixels[:, 0]]
-    moving = np.bincount(piece[moves], minlength=surface.count + 1)
-    total = np.bincount(piece, minlength=surface.count + 1)
-    solid = moving >= FEWEST_MOVING
-    whole = solid & (moving >= AGREED * total)
-    mixed = solid & ~whole & (moving >= 0.1 * total)
+    num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
+    enough = num_moving >= FEWEST_MOVING
+    whole = enough & (num_moving >= AGREED * num_all)
+    mixed = enough & ~whole & (num_moving >= 0.1 * num_all)
     whole[0] = mixed[0] = False
-    out = whole[surface.labels]
-    if only_whole:
+    out = whole[labels]
+    if whole_only:
         return out
-    rows, columns = np.nonzero(mixed[surface.labels] & (level.depth > 0))
+    rows, columns = np.nonzero(mixed[labels] & (level.depth > 0))
     if len(rows) == 0:
         return out
     z = level.depth[rows, columns].astype(np.float64)
-    apart = 1e3 * piece  # corners of other pieces are far away
-    corners = np.column_stack([points, apart])
-    places = np.column_stack([level.camera.points(columns, rows, z), 1e3 * surface.labels[rows, columns]])
-    distance, index = KDTree(corners).query(places, k=min(NEIGHBOURS, len(points)))
+    # the segment is a fourth coordinate, so that corners of other segments are far away
+    known = np.column_stack([corners.points, 1e3 * corners.segment_of])
+    queries = np.column_stack([level.camera.points(columns, rows, z), 1e3 * labels[rows, columns]])
+    distance, index = KDTree(known).query(queries, k=min(NEIGHBOURS, len(known)))
     near = distance < REACH * z[:, None]
-    votes = np.where(near, np.append(np.where(moves, 1, -1), 0)[np.minimum(index, len(moves))], 0).sum(axis=1)
-    out[rows, columns] = votes >= 2
+    votes = np.append(np.where(moving, 1, -1), 0)[np.minimum(index, len(moving))]
+    out[rows, columns] = np.where(near, votes, 0).sum(axis=1) >= 2
     return out
 
 
-def _rest(surface: Segmentation, pixels: NDArray[np.int64], moves: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) of pieces that hold enough corners at rest, and not too many others; arguments as above."""
-    piece = surface.labels[pixels[:, 1], pixels[:, 0]]
-    resting = np.bincount(piece[~moves], minlength=surface.count + 1)
-    total = np.bincount(piece, minlength=surface.count + 1)
-    rest = (resting >= FEWEST_MOVING) & (resting > (1 - AGREED) * total)
-    rest[0] = False
-    return rest[surface.labels]
+def static_segments(corners: LabelledCorners) -> NDArray[np.bool_]:
+    """Pixels (h, w) of segments with enough static corners, and a share of more than 1 - AGREED of such corners."""
+    num_static, num_all = corners.count_by_segment(~corners.moving), corners.count_by_segment()
+    static = (num_static >= FEWEST_MOVING) & (num_static > (1 - AGREED) * num_all)
+    static[0] = False
+    return static[corners.segmentation.labels]
 
 
 def _points(level: Level, pixels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Points (n, 3) in the camera's frame, metres, at pixels (n, 2) u, v of an image."""
+    """Points (n, 3) at pixels (n, 2) u, v of an image, metres, camera frame."""
     u, v = pixels.T
     return level.camera.points(u, v, level.depth[v, u].astype(np.float64))
 
 
-def _inside(coordinate: NDArray[np.float64], size: int) -> NDArray[np.int64]:
-    return np.clip(np.rint(coordinate), 0, size - 1).astype(np.int64)
+def _pixels_of_level(pixels: NDArray[np.number], level: Level, other: Level) -> NDArray[np.int64]:
+    """Pixels (n, 2) int u, v of another level that show the positions (n, 2) of a level."""
+    scale = other.camera.width / level.camera.width
+    last = np.array(other.depth.shape[::-1]) - 1
+    return np.clip(np.rint((pixels + 0.5) * scale - 0.5), 0, last).astype(np.int64)

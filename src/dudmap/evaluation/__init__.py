@@ -1,1 +1,1 @@
-"""Scores against the truth: trajectories, surfaces and dynamic masks. No part of the system uses them."""
+"""Errors of trajectories, surfaces and dynamic masks against the ground truth. The SLAM system does not use them."""

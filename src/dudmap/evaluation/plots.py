@@ -1,4 +1,4 @@
-"""Pictures of trajectory, surface and mask errors. Each function writes one PNG."""
+"""Plots of trajectory, surface and mask errors. Each function writes one PNG file."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -20,7 +20,7 @@ ESTIMATE, REFERENCE, SECOND = "#c8322d", "#3a3a3a", "#2f6fb5"
 
 
 def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, result: AteResult) -> None:
-    """Aligned estimate over the reference, seen along the direction in which the camera moved least, and by axis."""
+    """Aligned estimate and reference, projected along the direction of least motion, and per axis over time."""
     aligned = (result.T_reference_estimate @ estimate.Ts_world_camera)[:, :3, 3]
     start, end = result.timestamps[0] - 0.1, result.timestamps[-1] + 0.1
     during = (reference.timestamps >= start) & (reference.timestamps <= end)
@@ -45,7 +45,7 @@ def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, r
 
 
 def plot_error(path: Path, result: AteResult) -> None:
-    """Distance and angle to the true pose over time."""
+    """Position and orientation error over time."""
     figure, (translation, rotation) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     translation.plot(t, 1000 * result.errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
@@ -58,7 +58,7 @@ def plot_error(path: Path, result: AteResult) -> None:
 
 
 def plot_rpe(path: Path, result: RpeResult) -> None:
-    """Relative error over time."""
+    """Relative pose error over time."""
     figure, (translation, rotation) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     per = f"over {result.delta:g} {result.unit}"
@@ -75,12 +75,12 @@ def plot_residuals(path: Path, residuals: Path) -> None:
     """Histogram of the registration residuals with the fitted mixture.
 
     Args:
-        path: The picture.
-        residuals: NPZ file with ``edges`` (B + 1,) in standard deviations of the reading, ``counts`` (B,), and of the
-            fitted mixture of two half-normal densities (static, dynamic) ``prior`` (2,) and ``sigma`` (2,).
+        path: The PNG file.
+        residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the reading and ``counts``
+            (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,), ``sigma`` (2,).
 
     Raises:
-        DatasetError: The file does not hold these.
+        DatasetError: The file does not hold these arrays.
     """
     try:
         with np.load(residuals) as data:
@@ -106,7 +106,7 @@ def plot_residuals(path: Path, residuals: Path) -> None:
 
 
 def plot_surface(path: Path, result: SurfaceResult) -> None:
-    """Histograms of both distances, and the share of surface within a distance."""
+    """Histograms of accuracy and completeness, and their cumulative shares."""
     figure, (histogram, cumulated) = _figure(2, width=13)
     edges, width = 1000 * result.histogram_edges, 1000 * float(np.diff(result.histogram_edges[:2])[0])
     rows = (
@@ -133,18 +133,18 @@ def plot_surface(path: Path, result: SurfaceResult) -> None:
 
 
 def plot_masks(path: Path, result: MaskResult) -> None:
-    """Intersection over union, and the true and found shares of the image, over time."""
+    """Precision, recall and intersection over union, and the true and estimated dynamic shares, over time."""
     figure, (quality, shares) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
     scored = result.coverage > result.scored_coverage
     quality.plot(t[scored], result.iou[scored], ".", color=ESTIMATE, markersize=4, label="IoU")
     quality.plot(t[scored], result.recall[scored], color=SECOND, linewidth=0.8, label="recall")
     quality.plot(t[scored], result.precision[scored], color="#2e8b57", linewidth=0.8, label="precision")
-    quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * result.scored_coverage:g} % moving")
+    quality.set(ylim=(0, 1.02), ylabel=f"frames with > {100 * result.scored_coverage:g} % dynamic")
     quality.set_title(f"mean IoU {result.mean_iou:.3f} over {result.num_scored} frames")
     quality.legend(loc="lower left")
-    shares.fill_between(t, 100 * result.coverage, color="#b9c4d0", label="truly moves")
-    shares.plot(t, 100 * result.found_share, color=ESTIMATE, linewidth=1, label="found to move")
+    shares.fill_between(t, 100 * result.coverage, color="#b9c4d0", label="true mask")
+    shares.plot(t, 100 * result.found_share, color=ESTIMATE, linewidth=1, label="estimated mask")
     shares.set(xlabel="time, s", ylabel="% of the image")
     shares.legend()
     _save(figure, path)
@@ -163,7 +163,7 @@ def _figure(count: int, *, rows: bool = False, width: float = 9.0) -> "tuple[Fig
 
 
 def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, label: str) -> None:
-    """A line that is broken where frames are missing."""
+    """Plot a line that is interrupted where frames are missing."""
     x, y = x.copy(), y.copy()
     steps = np.diff(stamps)
     breaks = np.flatnonzero(steps > 3 * np.median(steps)) + 1 if len(steps) else np.array([], dtype=int)
@@ -171,6 +171,7 @@ def _line_with_gaps(axes: "Axes", stamps: NDArray, x: NDArray, y: NDArray, label
 
 
 def _rules(axes: "Axes", levels: dict[str, float]) -> None:
+    """Horizontal lines at named levels."""
     for style, (name, level) in zip(("--", ":"), levels.items(), strict=True):
         axes.axhline(level, color=REFERENCE, linestyle=style, linewidth=1, label=f"{name} {level:.3g}")
     axes.set_ylim(bottom=0)
@@ -181,4 +182,4 @@ def _save(figure: "Figure", path: Path) -> None:
     try:
         figure.savefig(path)
     except OSError as error:
-        raise DudmapError(f"cannot write the picture {path}: {error.strerror or error}") from error
+        raise DudmapError(f"cannot write the plot {path}: {error.strerror or error}") from error

@@ -1,7 +1,7 @@
-"""How well a reconstructed surface matches the true one, and how much of it is not there in truth.
+"""Comparison of a reconstructed surface with the true one: accuracy, completeness and ghosts.
 
-Surfaces are compared by area: points are drawn uniformly over one of them, and each is measured to the nearest
-triangle of the other. Vertex by vertex, a mesh would be judged mostly where its triangles are small.
+Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
+comparison of vertices would weight a mesh by its triangle density.
 """
 
 from collections.abc import Iterable
@@ -17,14 +17,14 @@ from dudmap.geometry.mesh import Mesh
 Distances = NDArray[np.float32]
 
 THRESHOLDS = (0.01, 0.02, 0.05)
-"""Distances in metres at which precision and recall are given."""
+"""Default distances of precision and recall, metres."""
 GHOST_DISTANCE = 0.05
-"""Surface farther than this from the true one is a ghost, metres: above what noise and a band of a few voxels do to a
-good surface, and less than the thickness of an arm."""
+"""Estimated surface farther than this from the true one is a ghost, metres. This is more than the error that noise and
+a truncation band of a few voxels cause on a good surface, and less than the thickness of an arm."""
 SAMPLES = 300_000
-"""Points drawn on each surface; a share of 1 % is then known to 0.02 % (standard error)."""
+"""Points sampled on each surface; the standard error of a share of 1 % is then at most 0.02 %."""
 HISTOGRAM_LARGEST, HISTOGRAM_BINS = 0.2, 100
-"""Distances are counted in bins of 2 mm up to 20 cm; the last bin also holds everything beyond."""
+"""Histogram of the distances: bins of 2 mm up to 0.2 m; the last bin also counts everything beyond."""
 
 
 @dataclass(frozen=True)
@@ -47,13 +47,13 @@ class DistanceStatistics:
 
 @dataclass(frozen=True)
 class ThresholdScore:
-    """Shares within a distance (Knapitsch et al. 2017, Tanks and Temples, eq. 3-5).
+    """Precision and recall at a distance (Knapitsch et al. 2017, Tanks and Temples, eq. 3-5).
 
     Attributes:
         distance: Metres.
-        precision: Share of the estimate that lies within it of the reference.
-        recall: Share of the reference that lies within it of the estimate.
-        f_score: Their harmonic mean.
+        precision: Share of the estimate within the distance of the reference.
+        recall: Share of the reference within the distance of the estimate.
+        f_score: Harmonic mean of precision and recall.
     """
 
     distance: float
@@ -71,15 +71,15 @@ class SurfaceResult:
         completeness: Distances from the reference to the estimate.
         scores: Precision, recall and F-score per distance.
         area_m2: Area of the estimate; None for a point cloud.
-        reference_area_m2: Area of the surface that completeness is measured on; None for a point cloud.
-        ghost_distance: What lies farther than this from the reference is a ghost, metres.
-        ghost_area_m2: Area of the estimate that does; None for a point cloud.
-        ghost_share: Share of the estimate's area that does.
-        missing_share: Share of the reference that is farther than the ghost distance from the estimate.
-        histogram_edges: (B + 1,) metres; the last bin also holds everything beyond.
+        reference_area_m2: Area of the surface on which completeness is measured; None for a point cloud.
+        ghost_distance: Distance from the reference above which the estimate counts as ghost, metres.
+        ghost_area_m2: Area of the ghosts; None for a point cloud.
+        ghost_share: Share of the ghosts in the area of the estimate.
+        missing_share: Share of the reference farther than the ghost distance from the estimate.
+        histogram_edges: (B + 1,) metres; the last bin also counts everything beyond.
         accuracy_histogram: (B,) share of the estimate per bin.
         completeness_histogram: (B,) share of the reference per bin.
-        num_samples: Points drawn on each surface.
+        num_samples: Number of points sampled on each surface.
     """
 
     accuracy: DistanceStatistics
@@ -129,14 +129,13 @@ def compare_surfaces(
 
     Args:
         estimate: The reconstruction, in the reference's frame.
-        reference: The true static surface: accuracy and ghosts are distances to it.
-        observed: The part of it that a perfect system would have found, which completeness is measured on; None for
-            all of the reference.
+        reference: The true static surface, which accuracy and ghosts are measured to.
+        observed: The part of it that the camera saw, on which completeness is measured; None for all of it.
         thresholds: Distances in metres for precision, recall and F-score.
         ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
-        samples: Points drawn on each surface.
-        points: Accept a point cloud for either; its points are taken as they are and it has no area.
-        seed: Of the drawing.
+        samples: Number of points sampled on each surface.
+        points: Accept point clouds, whose points serve as samples and which have no area.
+        seed: Seed of the sampling.
 
     Raises:
         MapError: A mesh has no faces (without ``points``) or holds NaN.
@@ -175,25 +174,25 @@ def compare_surfaces(
 
 
 def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
-    """A surface that has been prepared is used as it is: its search tree takes as long as the rest."""
+    """Surface of a mesh; a given ``Surface`` is returned unchanged, so that its search tree is built once."""
     return mesh if isinstance(mesh, Surface) else Surface(mesh, name, points=points)
 
 
 def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
-    """The estimate, each vertex coloured by its distance to the reference: blue 0, red ``largest`` metres and more.
+    """The estimate with each vertex coloured by its distance to the reference, from blue at 0 to red at ``largest`` m.
 
     Raises:
         MapError: The reference has no faces (without ``points``) or holds NaN.
         ConfigError: ``largest`` is not positive.
     """
     if not (np.isfinite(largest) and largest > 0):
-        raise ConfigError(f"the distance of the deepest colour is {largest}; expected a positive number")
+        raise ConfigError(f"the distance at the end of the colour scale is {largest}; expected a positive number")
     distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)
     return Mesh(estimate.vertices, estimate.faces, distance_colors(distances, largest), estimate.normals)
 
 
 def distance_colors(distances: Distances, largest: float) -> NDArray[np.uint8]:
-    """Colours (N, 3) from blue at 0 over green and yellow to red at ``largest`` and beyond."""
+    """Colours (N, 3) from blue at 0 through green and yellow to red at ``largest`` and beyond."""
     anchors = np.array([[40, 70, 200], [40, 170, 190], [90, 190, 70], [240, 210, 50], [210, 40, 30]], dtype=np.float64)
     at = np.clip(np.nan_to_num(distances.astype(np.float64), nan=largest) / largest, 0, 1) * (len(anchors) - 1)
     steps = np.arange(len(anchors))

@@ -1,4 +1,4 @@
-"""How well found dynamic masks match the true ones, pixel by pixel."""
+"""Pixel-wise comparison of estimated dynamic masks with the true ones."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
@@ -9,14 +9,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
-from dudmap.pipeline.metrics import SCORED_COVERAGE
+from dudmap.geometry.association import associate, read_list, read_pairs
+from dudmap.sequences.images import read_mask
+from dudmap.sequences.masks import stamped_masks
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
+SCORED_COVERAGE = 0.05
+"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio is one of two
+small numbers and says little."""
+
 
 class MaskPair(NamedTuple):
-    """Seconds, and what was found to move and what truly moves, both (H, W)."""
+    """Timestamp in seconds, estimated and true dynamic mask (H, W) of one frame."""
 
     timestamp: float
     estimate: Mask
@@ -25,23 +31,23 @@ class MaskPair(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class MaskResult:
-    """Comparison of found with true dynamic masks over N frames; NaN where a ratio has no pixels.
+    """Comparison of estimated with true dynamic masks over N frames. A ratio over no pixels is NaN.
 
     Attributes:
         timestamps: (N,) seconds.
-        coverage: (N,) share of the image that truly moves.
-        found_share: (N,) share of the image that was found to move.
-        precision: (N,) share of what was found that truly moves.
-        recall: (N,) share of what truly moves that was found.
+        coverage: (N,) share of the image that is dynamic in the true mask.
+        found_share: (N,) share of the image that is dynamic in the estimated mask.
+        precision: (N,) share of the estimated mask that is in the true mask.
+        recall: (N,) share of the true mask that is in the estimated mask.
         iou: (N,) intersection over union.
-        overall_precision: The same over the pixels of all frames together.
-        overall_recall: The same over the pixels of all frames together.
-        overall_iou: The same over the pixels of all frames together.
-        mean_iou: Mean over the frames in which more than ``scored_coverage`` of the image truly moves.
-        num_scored: Number of those.
-        scored_coverage: See ``mean_iou``.
-        false_alarm_share: Share of the image found to move, mean over the frames in which nothing does.
-        num_missing: True masks without a found one.
+        overall_precision: Precision over the pixels of all frames together.
+        overall_recall: Recall over the pixels of all frames together.
+        overall_iou: Intersection over union over the pixels of all frames together.
+        mean_iou: Mean of ``iou`` over the frames whose ``coverage`` exceeds ``scored_coverage``.
+        num_scored: Number of those frames.
+        scored_coverage: Threshold on the coverage for ``mean_iou``.
+        false_alarm_share: Mean ``found_share`` over the frames whose true mask is empty.
+        num_missing: Number of true masks without an estimated one.
     """
 
     timestamps: Numbers
@@ -60,18 +66,22 @@ class MaskResult:
     num_missing: int
 
 
+def mask_iou(estimate: Mask, reference: Mask) -> float:
+    """Intersection over union of two masks (H, W), of which at least one is not empty."""
+    return np.count_nonzero(estimate & reference) / np.count_nonzero(estimate | reference)
+
+
 def compare_masks(
     pairs: Iterable[MaskPair], *, scored_coverage: float = SCORED_COVERAGE, num_missing: int = 0
 ) -> MaskResult:
-    """Precision, recall and intersection over union, per frame and over all.
+    """Precision, recall and intersection over union, per frame and over all frames.
 
-    Every pixel counts, with a depth reading or without.
+    Every pixel counts, whether it has a depth reading or not.
 
     Args:
-        pairs: Masks of the same frames.
-        scored_coverage: Frames in which less of the image truly moves do not count for ``mean_iou``: the ratio of two
-            small numbers says little.
-        num_missing: True masks that have no partner, only passed on.
+        pairs: Estimated and true masks of the same frames.
+        scored_coverage: Frames with a smaller true share of dynamic pixels do not count for ``mean_iou``.
+        num_missing: Number of true masks without a partner; copied to the result.
 
     Raises:
         DatasetError: There is no pair, or two masks differ in size.
@@ -111,23 +121,21 @@ def compare_masks(
 
 
 class MaskFolders:
-    """The masks of a run and the true ones, paired by time.
+    """Estimated masks of a run and the true ones, paired by time; iterating reads the pairs from disk.
 
     Args:
         estimate: Run folder with masks/, or a folder of PNG files named by their time stamp.
         reference: Recording in TUM layout with mask.txt, or a folder of PNG files named by their time stamp.
 
     Attributes:
-        num_missing: True masks without a found one.
+        num_missing: Number of true masks without an estimated one.
 
     Raises:
-        DatasetError: A folder holds no masks, or none belong together.
+        DatasetError: A folder holds no masks, or no two masks are close enough in time.
     """
 
     def __init__(self, estimate: Path, reference: Path) -> None:
-        from dudmap.geometry.association import associate
-
-        found, true = _named_masks(estimate), _true_masks(reference)
+        found, true = _estimated_masks(estimate), _true_masks(reference)
         pairs = associate(np.array([stamp for stamp, _ in found]), np.array([stamp for stamp, _ in true]))
         if not pairs:
             raise DatasetError(
@@ -138,18 +146,14 @@ class MaskFolders:
         self.num_missing = len(true) - len(pairs)
 
     def __iter__(self) -> Iterator[MaskPair]:
-        from dudmap.sequences.images import read_mask
-
         for stamp, found, true in self._pairs:
             yield MaskPair(stamp, read_mask(found), read_mask(true))
 
 
 def _true_masks(folder: Path) -> list[tuple[float, Path]]:
-    """Times and files of the true masks, by the depth images' times where associations.txt tells them."""
-    from dudmap.geometry.association import associate, read_list, read_pairs
-
+    """Timestamps and files of the true masks; the depth timestamps where associations.txt gives them."""
     if not (folder / "mask.txt").is_file():
-        return _named_masks(folder)
+        return _estimated_masks(folder)
     masks = read_list(folder / "mask.txt")
     if not (folder / "associations.txt").is_file():
         return [(mask.timestamp, mask.path) for mask in masks]
@@ -159,16 +163,11 @@ def _true_masks(folder: Path) -> list[tuple[float, Path]]:
     return sorted((frames[j][1].timestamp, masks[i].path) for i, j in pairs)
 
 
-def _named_masks(folder: Path) -> list[tuple[float, Path]]:
-    """PNG files named by their time stamp, of the folder itself or of its folder masks/."""
+def _estimated_masks(folder: Path) -> list[tuple[float, Path]]:
+    """Timestamps and files of the masks in a folder and in its subfolder masks/."""
     if not folder.is_dir():
         raise DatasetError(f"there is no folder {folder}; expected a run folder or a folder of masks")
-    masks = []
-    for path in [*(folder / "masks").glob("*.png"), *folder.glob("*.png")]:
-        try:
-            masks.append((float(path.stem), path))
-        except ValueError:
-            continue
+    masks = [*stamped_masks(folder / "masks"), *stamped_masks(folder)]
     if not masks:
         raise DatasetError(
             f"{folder} holds no masks (masks/<timestamp>.png or mask.txt); run with --save-masks to write them"
@@ -177,4 +176,5 @@ def _named_masks(folder: Path) -> list[tuple[float, Path]]:
 
 
 def _ratio(part: Numbers, whole: Numbers) -> Numbers:
+    """Elementwise ``part / whole``; NaN where ``whole`` is zero."""
     return np.divide(part, whole, out=np.full(np.shape(whole), np.nan), where=np.asarray(whole) > 0)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.geometry import se3
+from dudmap.geometry.alignment import kabsch
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.trajectory import Trajectory
 
@@ -15,12 +16,15 @@ Numbers = NDArray[np.float64]
 Align = Literal["se3", "origin", "none"]
 Unit = Literal["s", "m", "frames"]
 
+STATISTICS = "rmse", "mean", "median", "max"
+"""Statistics of every error, in the order of the result classes."""
+
 FEWEST_PAIRS = 3
 SMALLEST_SPREAD = 1e-3
-"""Positions that spread less than this across their main direction (metres, and as a share of the spread along it)
-do not determine a rotation."""
+"""Positions that spread less than this across their principal direction (metres, and as a share of the spread along
+it) do not determine a rotation."""
 PATH_TOLERANCE = 0.1
-"""Relative: poses one metre apart may be 0.9 to 1.1 m apart along the path."""
+"""Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,20 +33,20 @@ class AteResult:
 
     Attributes:
         rmse: Root mean square of the distances between aligned estimated and true positions, metres.
-        mean: Mean of the same, metres.
+        mean: Mean of these distances, metres.
         median: Median, metres.
         max: Largest, metres.
         rot_rmse_deg: Root mean square of the angles between aligned estimated and true orientations, degrees.
-        rot_mean_deg: Mean of the same, degrees.
+        rot_mean_deg: Mean of these angles, degrees.
         rot_median_deg: Median, degrees.
         rot_max_deg: Largest, degrees.
         num_pairs: Number N of pose pairs.
         timestamps: (N,) seconds, of the estimate.
         errors: (N,) metres.
         rot_errors_deg: (N,) degrees.
-        T_reference_estimate: (4, 4) motion that was applied to the estimate.
-        alignment: How that motion was found: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3`` was
-            asked for but the positions (all equal, or on one line) leave the rotation open.
+        T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
+        alignment: How this motion was computed: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3``
+            was requested but the positions (all equal, or collinear) do not determine the rotation.
     """
 
     rmse: float
@@ -60,24 +64,29 @@ class AteResult:
     T_reference_estimate: Numbers
     alignment: str
 
+    def figures(self) -> dict[str, float]:
+        """All statistics by name and unit, for tables and JSON."""
+        out = {f"ate_{key}_m": getattr(self, key) for key in STATISTICS}
+        return out | {f"ate_rot_{key}_deg": getattr(self, f"rot_{key}_deg") for key in STATISTICS}
+
 
 @dataclass(frozen=True, eq=False)
 class RpeResult:
-    """Relative pose error over a fixed distance in time, path or frames.
+    """Relative pose error over a fixed interval of time, path length or frames.
 
     Attributes:
         trans_rmse: Root mean square of the translations of the relative errors, metres.
-        trans_mean: Mean of the same, metres.
+        trans_mean: Mean of these lengths, metres.
         trans_median: Median, metres.
         trans_max: Largest, metres.
         rot_rmse_deg: Root mean square of the angles of the relative errors, degrees.
-        rot_mean_deg: Mean of the same, degrees.
+        rot_mean_deg: Mean of these angles, degrees.
         rot_median_deg: Median, degrees.
         rot_max_deg: Largest, degrees.
         num_pairs: Number N of relative motions.
-        delta: Their distance.
-        unit: Unit of the distance.
-        timestamps: (N,) seconds, of the first pose of each.
+        delta: Length of the interval.
+        unit: Unit of the interval.
+        timestamps: (N,) seconds, of the first pose of each pair.
         trans_errors: (N,) metres.
         rot_errors_deg: (N,) degrees.
     """
@@ -97,9 +106,14 @@ class RpeResult:
     trans_errors: Numbers
     rot_errors_deg: Numbers
 
+    def figures(self) -> dict[str, float]:
+        """All statistics by name and unit, for tables and JSON; meaningful for a delta of one unit."""
+        out = {f"rpe_trans_{key}_m_per_{self.unit}": getattr(self, f"trans_{key}") for key in STATISTICS}
+        return out | {f"rpe_rot_{key}_deg_per_{self.unit}": getattr(self, f"rot_{key}_deg") for key in STATISTICS}
+
 
 class PosePairs(NamedTuple):
-    """Poses that belong together in time: (N,) timestamps of the estimate, and (N, 4, 4) poses of both."""
+    """Poses associated by time: (N,) timestamps of the estimate and (N, 4, 4) poses of estimate and reference."""
 
     timestamps: Numbers
     Ts_estimate: Numbers
@@ -107,12 +121,12 @@ class PosePairs(NamedTuple):
 
 
 def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: float = LARGEST_GAP) -> PosePairs:
-    """Poses of both trajectories, one to one: the closest times first, then the closest of what is left, and so on.
+    """Associate the poses of two trajectories one to one, closest timestamps first.
 
     Args:
         estimate: Estimated poses.
         reference: True poses.
-        max_difference: Times further apart than this are no pair, seconds.
+        max_difference: Largest difference of the timestamps of a pair, seconds.
 
     Raises:
         DatasetError: The trajectories do not overlap in time, or there are fewer than three pairs.
@@ -147,14 +161,14 @@ def ate(
         estimate: Estimated poses, camera to world.
         reference: True poses, camera to world.
         align: ``se3``: A brings the positions closest to each other in the least-squares sense, without scale (Umeyama
-            1991, as in the TUM script); where the positions leave its rotation open it is the mean of the rotations
-            that align the orientations. ``origin``: A maps the first pose onto its partner, so that a fixed camera is
-            measured against where it started. ``none``: A is the identity.
-        max_difference: Poses further apart in time are no pair, seconds.
+            1991, as in the TUM script); where the positions do not determine its rotation it is the mean of the
+            rotations that align the orientations. ``origin``: A maps the first pose onto its partner, so that the
+            error of a fixed camera is its drift from the start. ``none``: A is the identity.
+        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
 
     Raises:
         DatasetError: No overlap in time, or fewer than three pairs.
-        ConfigError: ``align`` is none of the three.
+        ConfigError: ``align`` is not one of the three.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -179,18 +193,18 @@ def rpe(
 ) -> RpeResult:
     """Relative pose error: E_ij = (T_reference_i^-1 T_reference_j)^-1 (T_estimate_i^-1 T_estimate_j).
 
-    Every pose i that has a partner j ``delta`` further on gives one error, as in the TUM script with ``--fixed_delta``:
-    j is the pose nearest to that distance. A j that is not really ``delta`` away gives none: off by more than half the
-    usual time between two poses (at least ``max_difference``) for ``s``, by more than a tenth for ``m``. (The script
-    pairs across gaps where tracking was lost, and drops the tail by leaving out all pairs that end at the last pose.)
-    Metres are counted along the reference's path; ``frames`` counts poses that have a partner in the reference.
+    Every pose i with a partner j one ``delta`` later gives one error, as in the TUM script with ``--fixed_delta``: j is
+    the pose nearest to that distance. A pair is dropped if it misses ``delta`` by more than half the median time
+    between two poses (at least ``max_difference``) for ``s``, or by more than a tenth for ``m``. (The script pairs
+    across gaps where tracking was lost, and leaves out all pairs that end at the last pose.) Metres are counted along
+    the reference path; ``frames`` counts the poses that have a partner in the reference.
 
     Args:
         estimate: Estimated poses, camera to world.
         reference: True poses, camera to world.
-        delta: The distance; a whole number for ``frames``.
+        delta: The interval; a whole number for ``frames``.
         unit: ``s``, ``m`` or ``frames``.
-        max_difference: Poses further apart in time are no pair, seconds.
+        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
 
     Raises:
         DatasetError: No overlap in time, fewer than three pairs, or no two poses are ``delta`` apart.
@@ -219,24 +233,75 @@ def rpe(
     return RpeResult(*_statistics(errors), *_statistics(angles), len(i), delta, unit, stamps[i], errors, angles)
 
 
-def umeyama(points: Numbers, targets: Numbers) -> tuple[Numbers, Numbers]:
-    """Rigid motion (4, 4) that brings points (N, 3) closest to targets (N, 3), least squares (Umeyama 1991, eq. 34-42).
+def trajectory_figures(
+    estimate: Trajectory, reference: Trajectory, align: Align = "se3", max_difference: float = LARGEST_GAP
+) -> dict[str, float | int | str | None]:
+    """All figures of a trajectory by name and unit, for tables and JSON.
 
-    Also returns (3,) how far the two spread together along the principal directions, metres: the square roots of the
-    singular values of their cross-covariance. The rotation is determined only if the second is not zero.
+    ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
+    first pose only, by which a fixed or merely rotating camera is judged; RPE per second and per metre. A relative
+    error is None where the recording is too short for it, and ``rpe_per_s_missing`` or ``rpe_per_m_missing`` says why.
+
+    Args:
+        estimate: Estimated poses, camera to world.
+        reference: True poses, camera to world.
+        align: Alignment of the ATE, see ``ate``.
+        max_difference: Largest difference of the timestamps of a pair of poses, seconds.
+
+    Raises:
+        DatasetError: No overlap in time, or fewer than three pairs.
+        ConfigError: ``align`` is not acceptable.
     """
-    center, target_center = points.mean(axis=0), targets.mean(axis=0)
-    covariance = (targets - target_center).T @ (points - center) / len(points)
-    U, singular, V_t = np.linalg.svd(covariance)
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
-    T[:3, 3] = target_center - T[:3, :3] @ center
-    return T, np.sqrt(singular)
+    absolute = ate(estimate, reference, align, max_difference)
+    from_start = ate(estimate, reference, "origin", max_difference)
+    out: dict[str, float | int | str | None] = {"pairs": absolute.num_pairs, "alignment": absolute.alignment}
+    out |= absolute.figures()
+    out |= {"drift_rmse_m": from_start.rmse, "rotation_rmse_deg": from_start.rot_rmse_deg}
+    units: tuple[Unit, ...] = ("s", "m")
+    for unit in units:
+        try:
+            out |= rpe(estimate, reference, 1.0, unit, max_difference).figures()
+        except DatasetError as error:
+            out |= dict.fromkeys(f"rpe_trans_{key}_m_per_{unit}" for key in STATISTICS)
+            out |= dict.fromkeys(f"rpe_rot_{key}_deg_per_{unit}" for key in STATISTICS)
+            out[f"rpe_per_{unit}_missing"] = str(error)
+    return out
+
+
+RUN_FIGURES = "ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
+"""Trajectory figures of a run's metrics.json."""
+
+
+def accuracy(
+    estimate: Trajectory, reference: Trajectory, keys: tuple[str, ...] = RUN_FIGURES
+) -> dict[str, float | str | None]:
+    """Selected ``trajectory_figures``, rounded to six digits.
+
+    Where the trajectories cannot be compared the figures are None and ``accuracy_missing`` gives the reason.
+    """
+    out: dict[str, float | str | None] = dict.fromkeys(keys)
+    try:
+        figures = trajectory_figures(estimate, reference)
+    except DatasetError as error:
+        return out | {"accuracy_missing": str(error)}
+    for key in keys:
+        value = figures[key]
+        out[key] = round(value, 6) if isinstance(value, float) else None
+    if "rpe_per_s_missing" in figures:
+        out["accuracy_missing"] = str(figures["rpe_per_s_missing"])
+    return out
 
 
 def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
+    """Rigid motion of the estimate onto the reference from the positions, or from the orientations where they must.
+
+    The square roots of the singular values of the cross-covariance are how far both sets of positions extend along
+    their common principal directions, metres. The rotation is determined only if the second one is not zero.
+    """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
-    T, spread = umeyama(positions, targets)
+    T = kabsch(targets, positions)
+    covariance = (targets - targets.mean(axis=0)).T @ (positions - positions.mean(axis=0)) / len(positions)
+    spread = np.sqrt(np.linalg.svd(covariance, compute_uv=False))
     if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
         return T, "se3"
     rotations = Ts_reference[:, :3, :3] @ np.swapaxes(Ts_estimate[:, :3, :3], 1, 2)
@@ -246,7 +311,7 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
 
 
 def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices i and, for each, the j > i whose position is nearest to that of i plus delta; position increases."""
+    """Indices i and, for each, the j > i whose position is nearest to that of i plus delta; positions increase."""
     wanted = position + delta
     after = np.clip(np.searchsorted(position, wanted), 1, len(position) - 1)
     before = after - 1
@@ -259,7 +324,7 @@ def _partners(position: Numbers, delta: float, tolerance: float) -> tuple[NDArra
 def rotation_angles(Ts: Numbers) -> Numbers:
     """Angles (N,) in radians, in [0, pi], of the rotations of (N, 4, 4) or (N, 3, 3) matrices.
 
-    From ``|R - I|_F^2 = 8 sin^2(angle / 2)``, which is exact for small angles where the trace is not.
+    Computed from ``|R - I|_F^2 = 8 sin^2(angle / 2)``, which is accurate for small angles where the trace is not.
     """
     chord = np.linalg.norm(Ts[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
     return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))

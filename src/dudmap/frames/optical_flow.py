@@ -1,4 +1,4 @@
-"""Corners followed from one image to another (Lucas and Kanade 1981)."""
+"""Corners and their sparse optical flow between two images (Lucas and Kanade 1981)."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -7,19 +7,24 @@ from dudmap.frames.observation import Level
 
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
-ALIKE, ALIKE_GREY = 1.5, 2.0
-"""A window that differs by less than this times another's difference, and this many of 255 grey values, is as good."""
+SIMILAR, SIMILAR_GREY = 1.5, 2.0
+"""A match is as good as another if its window's mean grey difference is below SIMILAR times the other's plus
+SIMILAR_GREY of 255 grey values."""
 WINDOW = 11
-"""Edge of the window a corner is recognised by, pixels."""
+"""Edge of the window that a corner is matched by, pixels."""
 
 
 def grey(level: Level) -> NDArray[np.uint8]:
-    """Intensities (h, w) as the search takes them."""
+    """Intensities (h, w) in grey values from 0 to 255."""
     return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
 
 
 def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """The strongest corner (n, 2) int of each cell of an image, where there is one, on a surface of some extent."""
+    """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
+
+    A corner has a depth reading and lies on the nearest surface in its window: a window across a depth edge follows the
+    foreground, not the surface behind it.
+    """
     import cv2
 
     strength = cv2.cornerMinEigenVal(image, 5)
@@ -27,14 +32,50 @@ def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
     height, width = image.shape[0] // cell, image.shape[1] // cell
     tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
     tiles = tiles.reshape(height * width, cell * cell)
-    place = tiles.argmax(axis=1)
-    rows = np.arange(height * width) // width * cell + place // cell
-    columns = np.arange(height * width) % width * cell + place % cell
-    # a window that also shows something nearer follows that, not the surface behind
+    strongest = tiles.argmax(axis=1)
+    rows = np.arange(height * width) // width * cell + strongest // cell
+    columns = np.arange(height * width) % width * cell + strongest % cell
     z = level.depth[rows, columns]
     nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8))
     useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
     return np.stack([columns, rows], axis=1)[useful]
+
+
+def lucas_kanade(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.number],
+    guess: NDArray[np.number],
+    window: int,
+    halvings: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """Pyramidal Lucas-Kanade flow.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) positions u, v in the first image.
+        guess: (n, 2) positions in the second image that the search starts from.
+        window: Edge of the matched window, pixels.
+        halvings: Halved copies of the images that are searched before the images themselves; 0 searches these alone.
+
+    Returns:
+        Positions (n, 2) in the second image, arbitrary where not found; whether each was found (n,); mean absolute
+        difference (n,) of the grey values of the two windows.
+    """
+    import cv2
+
+    if len(pixels) == 0:
+        return np.empty((0, 2), np.float32), np.zeros(0, dtype=bool), np.empty(0, np.float32)
+    positions, found, difference = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2),
+        np.array(guess, np.float32, order="C").reshape(-1, 1, 2),  # a copy: it is overwritten with the result
+        winSize=(window, window),
+        maxLevel=halvings,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(positions, np.float32)[:, 0], found[:, 0] > 0, np.asarray(difference, np.float32)[:, 0]
 
 
 def track_forward_backward(
@@ -43,29 +84,22 @@ def track_forward_backward(
     pixels: NDArray[np.int64],
     expected: NDArray[np.float64],
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Corners (m, 2) int, their places (m, 2) in a second image, found there and back, and what differs.
-
-    The last is the mean difference (m,) of the grey values of their windows.
+    """Corners that pass the forward-backward check: tracked back from where they were found, they return.
 
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) where they are looked for first.
-    """
-    import cv2
+        expected: (n, 2) predicted positions in the second, from which the search starts.
 
-    if len(pixels) == 0:
-        return pixels, np.empty((0, 2)), np.empty(0)
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    guess = expected.astype(np.float32).reshape(-1, 1, 2)
-    size, flags = (WINDOW, WINDOW), cv2.OPTFLOW_USE_INITIAL_FLOW
-    there, found, unlike = cv2.calcOpticalFlowPyrLK(first, second, start, guess, winSize=size, maxLevel=3, flags=flags)
-    back, found_back, _ = cv2.calcOpticalFlowPyrLK(
-        second, first, there, start.copy(), winSize=size, maxLevel=0, flags=flags
-    )
-    good = (found[:, 0] > 0) & (found_back[:, 0] > 0)
-    good[good] = np.linalg.norm((back - start)[good, 0], axis=1) < 0.5
-    return pixels[good], there[good, 0].astype(np.float64), unlike[good, 0].astype(np.float64)
+    Returns:
+        These corners (m, 2) int, their positions (m, 2) in the second image, and the mean differences (m,) of the grey
+        values of their windows.
+    """
+    positions, found, difference = lucas_kanade(first, second, pixels, expected, WINDOW, 3)
+    back, found_back, _ = lucas_kanade(second, first, positions, pixels, WINDOW, 0)
+    good = found & found_back
+    good[good] = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1) < 0.5
+    return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64)
 
 
 def consistent_with_static(
@@ -74,30 +108,22 @@ def consistent_with_static(
     pixels: NDArray[np.int64],
     expected: NDArray[np.float64],
     allowed: NDArray[np.float64],
-    unlike: NDArray[np.float64],
+    difference: NDArray[np.float64],
 ) -> NDArray[np.bool_]:
-    """Corners (n,) that were found elsewhere, but could as well be where a static world would have put them.
+    """Whether corners (n,) that were found elsewhere match as well at the position of a static point.
 
-    The coarse levels of the search see more than the window and follow what is nearer, and textures repeat. So the
-    search is done once more, from the place of a static point on and at full size alone.
+    The coarse levels of the search see more than the window and may follow a nearer surface, and textures repeat.
+    Therefore the search is repeated from the position of a static point, at full resolution alone.
 
     Args:
         first, second: (h, w) uint8 images.
         pixels: (n, 2) int, corners in the first.
-        expected: (n, 2) where they were if the world stood still.
-        allowed: (n,) farthest from there that it still may, pixels.
-        unlike: (n,) mean difference of the grey values of their windows where they were found.
+        expected: (n, 2) positions in the second if the points are static.
+        allowed: (n,) largest distance of a match from there, pixels.
+        difference: (n,) mean differences of the grey values of the windows of the matches found elsewhere.
     """
-    import cv2
-
-    if len(pixels) == 0:
-        return np.zeros(0, dtype=bool)
-    start = pixels.astype(np.float32).reshape(-1, 1, 2)
-    guess = expected.astype(np.float32).reshape(-1, 1, 2)
-    there, found, other = cv2.calcOpticalFlowPyrLK(
-        first, second, start, guess.copy(), winSize=(WINDOW, WINDOW), maxLevel=0, flags=cv2.OPTFLOW_USE_INITIAL_FLOW
-    )
-    rests = found[:, 0] > 0  # what was not found has arbitrary numbers
-    near = np.linalg.norm((there - guess)[rests, 0], axis=1) < allowed[rests]
-    rests[rests] = near & (other[rests, 0] < ALIKE * unlike[rests] + ALIKE_GREY)
-    return rests
+    guess = expected.astype(np.float32)
+    positions, static, other = lucas_kanade(first, second, pixels, guess, WINDOW, 0)
+    near = np.linalg.norm((positions - guess)[static], axis=1) < allowed[static]
+    static[static] = near & (other[static] < SIMILAR * difference[static] + SIMILAR_GREY)
+    return static

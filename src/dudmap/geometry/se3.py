@@ -146,3 +146,36 @@ def retract(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> N
     out[:3, :3] = exp_rotation(step[3:]) @ T_world_camera[:3, :3]
     out[:3, 3] += step[:3]
     return out
+
+
+def adjoint(T: Matrix) -> Matrix:
+    """Adjoint (6, 6) of a rigid motion: ``T exp(xi) T^-1 == exp(adjoint(T) xi)``, twists (v, omega)."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = T[:3, :3]
+    out[:3, 3:] = hat(T[:3, 3]) @ T[:3, :3]
+    return out
+
+
+def small_adjoint(xi: Matrix) -> Matrix:
+    """Adjoint (6, 6) of a twist: the derivative of ``adjoint(exp(t xi))`` at t = 0."""
+    out = np.zeros((6, 6))
+    out[:3, :3] = out[3:, 3:] = hat(xi[3:])
+    out[:3, 3:] = hat(xi[:3])
+    return out
+
+
+def interpolate_in_time(timestamps: Matrix, Ts: Matrix, timestamp: float) -> Matrix:
+    """Motion (4, 4) at a time, on the screw between the two neighbours in time; outside the range the nearest.
+
+    Args:
+        timestamps: (n,) increasing, n > 0.
+        Ts: (n, 4, 4).
+        timestamp: Time of the motion.
+    """
+    after = int(np.searchsorted(timestamps, timestamp))
+    if after == len(timestamps):
+        return Ts[-1]
+    if after == 0 or timestamps[after] == timestamp:
+        return Ts[after]
+    start, end = timestamps[after - 1], timestamps[after]
+    return interpolate(Ts[after - 1], Ts[after], (timestamp - start) / (end - start))

@@ -53,12 +53,7 @@ class Trajectory:
         """
         if len(self) == 0 or not self.timestamps[0] <= timestamp <= self.timestamps[-1]:
             raise DatasetError(f"no pose at time {timestamp:.6f}: it lies outside the trajectory")
-        after = int(np.searchsorted(self.timestamps, timestamp))
-        if self.timestamps[after] == timestamp:
-            return self.Ts_world_camera[after].copy()
-        start, end = self.timestamps[after - 1], self.timestamps[after]
-        share = (timestamp - start) / (end - start)
-        return se3.interpolate(self.Ts_world_camera[after - 1], self.Ts_world_camera[after], share)
+        return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
 
     def save(self, path: str | Path) -> None:
         """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""

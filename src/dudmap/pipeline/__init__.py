@@ -1,1 +1,1 @@
-"""Runs over a recording: frames in, run folder out."""
+"""Processing of a whole recording into a run folder."""

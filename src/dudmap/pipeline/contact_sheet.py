@@ -1,4 +1,4 @@
-"""One picture of what a run saw and what it made of it."""
+"""Overview image of one processed frame: input, dynamic mask, residuals and rendered map."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
     from dudmap.mapping.volume import View
 
 RESIDUAL_RANGE = 0.05
-"""Residuals beyond this have the deepest colour, metres."""
+"""Residual at the end of the colour scale, metres."""
 LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
-"""Direction to the light of the shaded view, camera frame."""
+"""Unit vector towards the light of the shaded view, camera frame."""
 
 
 def save_sheet(
@@ -30,16 +30,16 @@ def save_sheet(
     T_world_camera: NDArray[np.float64],
     true_mask: NDArray[np.bool_] | None = None,
 ) -> None:
-    """Write a PNG with colour, depth, dynamic mask, residuals and the map seen from the same pose.
+    """Write a PNG file with colour, depth, dynamic mask, residuals and the map rendered from the same pose.
 
     Args:
         path: The PNG file.
-        frame: The frame as it came from the camera.
-        dynamic_mask: (H, W) what was found to move.
-        residuals: (h, w) signed distance of the readings to the map in metres, NaN = none.
-        view: The map seen from the frame's pose.
-        T_world_camera: (4, 4) that pose.
-        true_mask: (H, W) what truly moves, drawn as an outline.
+        frame: The unprocessed frame.
+        dynamic_mask: (H, W) estimated dynamic mask.
+        residuals: (h, w) signed distance of the readings to the map in metres, NaN where there is none.
+        view: The map rendered from the pose of the frame.
+        T_world_camera: (4, 4) pose of the frame.
+        true_mask: (H, W) true dynamic mask, drawn as an outline.
 
     Raises:
         DudmapError: The file cannot be written.
@@ -54,24 +54,24 @@ def save_sheet(
     _show(axes[0, 0], "colour", frame.color)
     depth = _show(axes[0, 1], "depth", np.ma.masked_equal(frame.depth, 0), cmap="viridis", limits=(0, far))
     figure.colorbar(depth, ax=axes[0, 1], label="m", shrink=0.7)
-    _show(axes[0, 2], "dynamic: found (red)", _overlaid(frame.color, dynamic_mask))
+    _show(axes[0, 2], "dynamic mask: estimated (red)", _overlaid(frame.color, dynamic_mask))
     if true_mask is not None and true_mask.any():
         axes[0, 2].contour(true_mask, levels=[0.5], colors="lime", linewidths=1)
-        axes[0, 2].set_title("dynamic: found (red), true (green line)")
+        axes[0, 2].set_title("dynamic mask: estimated (red), true (green outline)")
     shown = np.ma.masked_invalid(residuals)
     limit = RESIDUAL_RANGE
-    distance = _show(axes[1, 0], "residuals: distance to the map", shown, cmap="RdBu", limits=(-limit, limit))
+    distance = _show(axes[1, 0], "residuals: signed distance to the map", shown, cmap="RdBu", limits=(-limit, limit))
     figure.colorbar(distance, ax=axes[1, 0], label="m", shrink=0.7)
-    _show(axes[1, 1], "the map from the same pose: colour", np.where(view.depth[..., None] > 0, view.color, 255))
-    _show(axes[1, 2], "the map from the same pose: shape", shaded(view, T_world_camera))
+    _show(axes[1, 1], "rendered map: colour", np.where(view.depth[..., None] > 0, view.color, 255))
+    _show(axes[1, 2], "rendered map: shape", shaded(view, T_world_camera))
     try:
         figure.savefig(path, dpi=80, format="png")
     except OSError as error:
-        raise DudmapError(f"cannot write the picture {path}: {error.strerror or error}") from error
+        raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
 
 
 def shaded(view: "View", T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Grey image (H, W, 3) of a view's surface under one lamp beside the camera; white where there is none."""
+    """Grey image (H, W, 3) of the surface of a view, lit from beside the camera; white where there is no surface."""
     light = T_world_camera[:3, :3] @ LIGHT
     brightness = 0.25 + 0.7 * np.clip(view.normals @ light, 0, 1)
     grey = np.where(view.depth > 0, 255 * brightness, 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""The machine, the library versions and the memory of a run."""
+"""Machine, library versions and memory of a run."""
 
 import os
 import platform
@@ -13,7 +13,7 @@ from dudmap import __version__
 
 
 def peak_rss_mb() -> float | None:
-    """Largest resident memory of this process so far, MB; None where the system does not tell."""
+    """Peak resident memory of this process so far, MB; None on Windows."""
     if sys.platform == "win32":
         return None
     import resource
@@ -23,7 +23,7 @@ def peak_rss_mb() -> float | None:
 
 
 def versions() -> dict[str, str]:
-    """Versions of dudmap and of what its figures depend on."""
+    """Versions of dudmap and of the libraries that its results depend on."""
     import cv2
 
     return {

@@ -1,4 +1,4 @@
-"""Frames and masks on their way into the system, read ahead or as they arrive."""
+"""Sources of frames and masks: read ahead in order, or replayed in real time."""
 
 import time
 from collections import deque
@@ -20,53 +20,53 @@ if TYPE_CHECKING:
     from dudmap.tracking.frame_view import FrameView
 
 AHEAD = 4
-"""Frames of a recording on disk that are read while an earlier one is processed."""
+"""Number of frames of a recording on disk that are read ahead of the processed one."""
 
 
-class Reading(NamedTuple):
-    """What the reader found.
+class FrameRead(NamedTuple):
+    """Result of reading one frame; an image that cannot be read is replaced by its error.
 
     Attributes:
-        frame: The frame, or why there is none.
-        mask: (H, W) its true dynamic mask, None if not known, or why it cannot be read.
-        ms: Reading time of the frame.
-        known: (H, W) what a mask from outside says moves, None if there is none, or why it cannot be read.
-        prepared: The frame as the system takes it, where it was made ready ahead.
+        frame: The frame.
+        true_mask: (H, W) true dynamic mask, None if unknown.
+        ms: Reading time of the frame, milliseconds.
+        given_mask: (H, W) external dynamic mask, None if there is none.
+        prepared: The preprocessed frame, None unless the reader prepares frames.
     """
 
     frame: Frame | FrameError
-    mask: NDArray[np.bool_] | FrameError | None
+    true_mask: NDArray[np.bool_] | FrameError | None
     ms: float
-    known: NDArray[np.bool_] | FrameError | None = None
+    given_mask: NDArray[np.bool_] | FrameError | None = None
     prepared: "FrameView | None" = None
 
 
-class Turn(NamedTuple):
-    """A frame whose turn it is.
+class SourceFrame(NamedTuple):
+    """Next frame to process.
 
     Attributes:
-        number: Its number.
-        reading: What was read.
-        dropped: Frames that were dropped since the one before.
-        arrival: When it arrived, seconds of ``time.perf_counter``; None where frames wait for the system.
+        number: Number of the frame in the recording.
+        read: Result of reading it.
+        dropped: Number of frames dropped since the previous one.
+        arrival: Time of arrival in a live run, seconds of ``time.perf_counter``; None otherwise.
     """
 
     number: int
-    reading: Reading
+    read: FrameRead
     dropped: int = 0
     arrival: float | None = None
 
 
 def read_ahead(
-    sequence: "Sequence", count: int, ahead: int = AHEAD, known: "MaskFolder | None" = None, slam: "Slam | None" = None
-) -> "Generator[Reading]":
-    """The first ``count`` frames in order, read and made ready for ``slam`` by one thread up to ``ahead`` ahead."""
+    sequence: "Sequence", count: int, ahead: int = AHEAD, masks: "MaskFolder | None" = None, slam: "Slam | None" = None
+) -> "Generator[FrameRead]":
+    """First ``count`` frames in order, read and prepared for ``slam`` by one thread up to ``ahead`` frames ahead."""
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
-    pending: deque[Future[Reading]] = deque()
+    pending: deque[Future[FrameRead]] = deque()
     try:
         for index in range(count + ahead):
             if index < count:
-                pending.append(reader.submit(_read, sequence, index, known, slam))
+                pending.append(reader.submit(_read, sequence, index, masks, slam))
             if index >= ahead:
                 yield pending.popleft().result()
     finally:
@@ -74,41 +74,43 @@ def read_ahead(
 
 
 def in_order(
-    sequence: "Sequence", count: int, ahead: int, known: "MaskFolder | None", slam: "Slam"
-) -> "Generator[Turn]":
-    """Frames that wait for the system."""
-    for index, reading in enumerate(read_ahead(sequence, count, ahead, known, slam if ahead else None)):
-        yield Turn(index, reading)
+    sequence: "Sequence", count: int, ahead: int, masks: "MaskFolder | None", slam: "Slam"
+) -> "Generator[SourceFrame]":
+    """Frames of a recording in order; none is dropped."""
+    for index, read in enumerate(read_ahead(sequence, count, ahead, masks, slam if ahead else None)):
+        yield SourceFrame(index, read)
 
 
-def as_they_come(sequence: "Sequence", count: int, known: "MaskFolder | None") -> "Generator[Turn]":
-    """Frames that arrive as their times tell; of those that have, the newest."""
+def in_real_time(sequence: "Sequence", count: int, masks: "MaskFolder | None") -> "Generator[SourceFrame]":
+    """Frames of a recording at the rate of the sensor; always the latest that has arrived."""
     from dudmap.pipeline.replay import live
 
     last = -1
-    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, known))) as arrivals:
+    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks))) as arrivals:
         for arrival in arrivals:
-            yield Turn(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
+            yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
             last = arrival.number
 
 
 def load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
-    """Run the first frames through a system that is thrown away: a sensor is switched on when all is compiled."""
+    """Compile or load all kernels by processing the first frames with a system that is discarded afterwards."""
     for index in range(min(count, 3)):
         frame = _read(sequence, index).frame
         if not isinstance(frame, FrameError):
             slam.process(frame)
 
 
-def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> Reading:
+def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> FrameRead:
     start = time.perf_counter()
     try:
         frame: Frame | FrameError = sequence[index]
     except FrameError as error:
-        return Reading(error, None, 1000 * (time.perf_counter() - start))
+        return FrameRead(error, None, 1000 * (time.perf_counter() - start))
     ms = 1000 * (time.perf_counter() - start)
     prepared = None if slam is None else slam.prepare(frame)
-    return Reading(frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared)
+    return FrameRead(
+        frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared
+    )
 
 
 def _or_error(read: Callable[[int], NDArray[np.bool_] | None], index: int) -> NDArray[np.bool_] | FrameError | None:

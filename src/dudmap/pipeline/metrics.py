@@ -1,4 +1,4 @@
-"""The figures of a run: counted frame by frame, summed up once."""
+"""Metrics of a run, collected frame by frame."""
 
 import csv
 import json
@@ -10,31 +10,28 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
     from dudmap.objects.object_tracker import Mover
     from dudmap.result import FrameResult
 
-SCORED_COVERAGE = 0.05
-"""Masks are scored in frames where more than this share of the image truly moves."""
-
 
 @dataclass
 class RunRecord:
-    """What is counted while the frames pass.
+    """Metrics of the frames processed so far.
 
     Attributes:
-        rows: Per processed frame: timestamp, state, total and reading time and every stage's time, ms.
-        lost: Timestamp and reason of every frame that was not tracked.
+        rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
+        lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read.
-        mask_ious: Intersection over union of the dynamic mask, per frame with enough true motion.
-        masked: Frames that had a mask from outside, None if none were given.
-        dropped: Frames of a live run that there was no time for, None if the frames waited.
-        movers: One object per frame with moving bodies, as written to movers.jsonl.
-        residuals: (BINS,) counts of the normalised residuals of all frames (see ``dudmap.dynamics``), or a single 0.
+        mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
+        movers: Per frame with moving objects, the JSON object of movers.jsonl.
+        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
+        fused, skipped_similar, relocalized, corrected, blind: Numbers of frames, as in ``FrameResult``.
+        masked: Number of frames with an external mask, None without external masks.
+        dropped: Number of frames dropped by a live run, None otherwise.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -61,9 +58,15 @@ class RunRecord:
         mask: NDArray[np.bool_] | None,
         **delays: float,
     ) -> None:
-        """Count one processed frame; ``mask`` is its true dynamic mask (H, W) if known.
+        """Add one processed frame.
 
-        ``delays`` of a live run: frames ``dropped`` before this one, ``latency`` from its arrival to the result, ms.
+        Args:
+            result: Result of the frame.
+            total_ms: Processing time.
+            reading_ms: Reading time.
+            mask: True dynamic mask (H, W), if known.
+            delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
+                arrival to the result, ms.
         """
         self.rows.append(
             {
@@ -89,11 +92,10 @@ class RunRecord:
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
-            union = np.count_nonzero(mask | result.dynamic_mask)
-            self.mask_ious.append(np.count_nonzero(mask & result.dynamic_mask) / union)
+            self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
     def save_timings(self, path: Path) -> None:
-        """CSV with one row per processed frame and one column per stage, milliseconds."""
+        """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
         with path.open("w", newline="", encoding="utf-8") as file:
             writer = csv.DictWriter(file, columns, restval=0)
@@ -101,11 +103,11 @@ class RunRecord:
             writer.writerows(self.rows)
 
     def save_movers(self, path: Path) -> None:
-        """JSON lines, one per frame with moving bodies."""
+        """Write JSON lines, one per frame with moving objects."""
         path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
 
     def save_residuals(self, path: Path) -> None:
-        """NPZ with the histogram of all residuals and the mixture fitted to it; nothing if there are none.
+        """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
 
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
@@ -119,7 +121,7 @@ class RunRecord:
         np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
-        """Counts and times of the whole run."""
+        """Counts and times of all frames, under the keys of metrics.json."""
         totals = np.array([row["total"] for row in self.rows] or [np.nan])
         readings = np.array([row["reading"] for row in self.rows] or [np.nan])
         return {
@@ -144,7 +146,7 @@ class RunRecord:
         } | self._occasional()
 
     def _occasional(self) -> dict[str, Any]:
-        """What only runs with masks and live runs have."""
+        """Metrics of runs with masks and of live runs."""
         out: dict[str, Any] = {}
         if self.masked is not None:
             out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
@@ -160,26 +162,8 @@ class RunRecord:
         return out
 
 
-def accuracy(estimate: Trajectory, reference: Trajectory) -> dict[str, Any]:
-    """Absolute and relative trajectory error against the ground truth; the reason where they cannot be computed."""
-    from dudmap.evaluation.trajectory import ate, rpe
-
-    keys = ("ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s")
-    out: dict[str, Any] = dict.fromkeys(keys)
-    try:
-        absolute = ate(estimate, reference)
-        out["ate_rmse_m"] = _number(absolute.rmse, 6)
-        out["ate_rot_rmse_deg"] = _number(absolute.rot_rmse_deg, 6)
-        relative = rpe(estimate, reference, delta=1.0)
-        out["rpe_trans_rmse_m_per_s"] = _number(relative.trans_rmse, 6)
-        out["rpe_rot_rmse_deg_per_s"] = _number(relative.rot_rmse_deg, 6)
-    except DatasetError as error:
-        out["accuracy_missing"] = str(error)
-    return out
-
-
 def _row(mover: "Mover") -> dict[str, Any]:
-    """A moving body as JSON can hold it: metres, m/s, world frame."""
+    """JSON object of a moving object: metres, m/s, world frame."""
     return {
         "id": mover.id,
         "centroid": mover.centroid.round(4).tolist(),
@@ -192,5 +176,5 @@ def _row(mover: "Mover") -> dict[str, Any]:
 
 
 def _number(value: float | np.floating, digits: int = 3) -> float | None:
-    """A number JSON can hold; None for NaN."""
+    """Rounded number for JSON; None for NaN."""
     return round(float(value), digits) if np.isfinite(value) else None

@@ -1,4 +1,4 @@
-"""What a run shows on the terminal: a bar while it goes, a table at the end."""
+"""Terminal output of a run: a progress bar and a summary table."""
 
 import time
 from collections import deque
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 
 class RunProgress:
-    """Bar on stderr with the current frame, frames per second, dynamic share and tracking state.
+    """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
 
-    A frame that is lost or unreadable is always said, once per gap, even when the bar is off.
+    Losses of tracking and unreadable frames are reported, once per gap, even without the bar.
 
     Args:
         total: Number of frames.
-        bar: Whether to show the bar; it shows on a terminal only.
+        bar: Show the bar if stderr is a terminal.
     """
 
     def __init__(self, total: int, *, bar: bool = True) -> None:
@@ -50,7 +50,7 @@ class RunProgress:
         self._bar.stop()
 
     def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
-        """Show a processed frame, and how many of a live run were dropped so far."""
+        """Show a processed frame and the number of frames that a live run has dropped so far."""
         if result.state == "lost":
             if self._lost == 0:
                 self.note(f"frame {index}: lost, {result.lost_reason}")
@@ -72,16 +72,16 @@ class RunProgress:
         )
 
     def note(self, sentence: str) -> None:
-        """Say something above the bar."""
+        """Print a sentence above the bar."""
         self.console.print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
 
     def working(self, what: str) -> None:
-        """Show what happens after the last frame."""
+        """Show an activity other than the processing of a frame."""
         self._bar.update(self._task, state=what)
 
 
 def summary(metrics: dict[str, Any]) -> Table:
-    """Table of a run's figures."""
+    """Table of the metrics of a run."""
     table = Table(title=str(metrics["sequence"]), show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column(justify="right")
@@ -93,16 +93,16 @@ def summary(metrics: dict[str, Any]) -> Table:
         table.add_row(f"  {key.replace('_', ' ')}", f"[red]{value}[/]" if bad else str(value))
     if "dropped" in metrics:
         table.add_row("  dropped", str(metrics["dropped"]))
-        table.add_row("arrival to result, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))
-        table.add_row("arrival to result, 95 %", _text(metrics["latency_ms_p95"], "{:.1f} ms"))
+        table.add_row("latency, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))
+        table.add_row("latency, 95th percentile", _text(metrics["latency_ms_p95"], "{:.1f} ms"))
     table.add_row("time per frame, median", _text(metrics["ms_per_frame_median"], "{:.1f} ms"))
-    table.add_row("time per frame, 95 %", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
+    table.add_row("time per frame, 95th percentile", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
     table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))
     table.add_row("map", _text(metrics["map_bytes"], "{:.1f} MB", 1e-6))
     table.add_row("mesh", f"{metrics['mesh_triangles']} triangles")
     if "bodies" in metrics:
         rigid = sum(body["rigid"] for body in metrics["bodies"])
-        table.add_row("meshes of movers", f"{rigid} of {len(metrics['bodies'])} movers are rigid")
+        table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
     if "ate_rmse_m" in metrics:
         table.add_row("ATE RMSE", _text(metrics["ate_rmse_m"], "{:.2f} cm", 100))
         table.add_row("RPE RMSE, translation", _text(metrics["rpe_trans_rmse_m_per_s"], "{:.2f} cm/s", 100))

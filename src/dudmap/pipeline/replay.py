@@ -1,4 +1,4 @@
-"""Frames at the sensor's rate: the newest is taken, those there is no time for are dropped."""
+"""Replay of a recording at the rate of the sensor, with frames dropped where processing is too slow."""
 
 import threading
 import time
@@ -13,12 +13,12 @@ T = TypeVar("T")
 
 
 class Arrival(NamedTuple, Generic[T]):
-    """A frame that has arrived.
+    """Item of a live stream.
 
     Attributes:
-        number: Its number in the stream.
-        item: What was read.
-        time: When it arrived, seconds of ``time.perf_counter``.
+        number: Number of the frame in the stream.
+        item: Result of reading the frame.
+        time: Time of arrival, seconds of ``time.perf_counter``.
     """
 
     number: int
@@ -26,10 +26,10 @@ class Arrival(NamedTuple, Generic[T]):
     time: float
 
 
-class Newest(Generic[T]):
-    """Room for one thing between a sensor and its consumer: what is put replaces what was not taken.
+class LatestSlot(Generic[T]):
+    """Thread-safe slot for one item between a sensor and its consumer; a new item replaces one not yet taken.
 
-    Nothing ever queues, so the consumer is never further behind than the one thing it works on.
+    Since nothing queues, the consumer is never more than one item behind.
     """
 
     def __init__(self) -> None:
@@ -38,19 +38,19 @@ class Newest(Generic[T]):
         self._closed = False
 
     def put(self, item: T) -> None:
-        """Offer a newer thing; never blocks."""
+        """Store a newer item; never blocks."""
         with self._changed:
             self._held = [item]
             self._changed.notify()
 
     def take(self) -> T | None:
-        """The newest thing; waits if there is none since the last call, None once closed and empty."""
+        """Latest item; waits for one that was not taken yet. None once the slot is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._held or self._closed)
             return self._held.pop() if self._held else None
 
     def close(self) -> None:
-        """Nothing more will come; what is there can still be taken."""
+        """Declare the end of the stream; a stored item can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -63,16 +63,16 @@ def replay(
     wait: Callable[[float], bool],
     now: Callable[[], float] = time.perf_counter,
 ) -> None:
-    """Offer the frames of a recording when a sensor would: the first one now, the others as their times tell.
+    """Deliver the frames of a recording in real time: the first one now, the others at their timestamps.
 
-    Frames that arrive while an earlier one is still being read are dropped unread, except the newest of them.
+    Of the frames that become due while an earlier one is read, only the latest is read; the others are dropped.
 
     Args:
-        timestamps: (N,) seconds, increasing.
-        read: Gives frame number ``index``.
-        put: Takes each frame.
-        wait: Waits for so many seconds, or less; True ends the replay.
-        now: The clock, seconds.
+        timestamps: (N,) increasing timestamps, seconds.
+        read: Reads the frame of the given number.
+        put: Receives each frame.
+        wait: Waits for at most the given number of seconds; returns True to stop the replay.
+        now: Clock, seconds.
     """
     start = now() - timestamps[0]
     index = 0
@@ -86,24 +86,24 @@ def replay(
 
 
 def live(timestamps: NDArray[np.float64], read: Callable[[int], T]) -> Generator[Arrival[T]]:
-    """The frames of a recording at the sensor's rate; each step gives the newest that has arrived.
+    """Replay a recording in real time; each step yields the latest frame that has arrived.
 
-    A frame that is not taken before the next one has been read is dropped: a gap in ``Arrival.number``. The last frame
-    is always given.
+    A frame that is not consumed before the next one has been read is dropped, which leaves a gap in
+    ``Arrival.number``. The last frame is always yielded.
     """
-    newest: Newest[Arrival[T]] = Newest()
+    latest: LatestSlot[Arrival[T]] = LatestSlot()
     stop = threading.Event()
 
     def sensor() -> None:
         try:
-            replay(timestamps, read, newest.put, stop.wait)
+            replay(timestamps, read, latest.put, stop.wait)
         finally:
-            newest.close()
+            latest.close()
 
     with ThreadPoolExecutor(1, thread_name_prefix="dudmap-sensor") as thread:
         future = thread.submit(sensor)
         try:
-            while (arrival := newest.take()) is not None:
+            while (arrival := latest.take()) is not None:
                 yield arrival
             future.result()
         finally:

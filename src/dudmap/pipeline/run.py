@@ -1,4 +1,4 @@
-"""A run: frames go in, a run folder comes out. No algorithm in it."""
+"""Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
 from collections.abc import Callable
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError
-from dudmap.pipeline.frame_source import AHEAD, Reading, Turn, as_they_come, in_order, load_kernels
+from dudmap.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
-from dudmap.pipeline.run_folder import RunReport, make, save_mask, write
+from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask, write_run_folder
 
 if TYPE_CHECKING:
     from dudmap.result import FrameResult
@@ -33,42 +33,42 @@ def run(
     ahead: int = AHEAD,
     live: bool = False,
     passes: int = 1,
-    observe: "Callable[[int, Reading, FrameResult], None] | None" = None,
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
-    The folder gets trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
-    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it),
-    movers.jsonl (one JSON object per frame with moving bodies: timestamp and, of each body, id, centroid, box,
-    velocity, speed and pixels; metres, m/s, world frame), the true trajectory as groundtruth.txt where it is known
-    and, if asked for, masks/<timestamp>.png (255 = dynamic) and movers/<id>.ply and .txt, mesh and poses of every rigid
-    moving body (``movers.meshes``). Where the camera was lost and what it showed then was
-    never joined with the rest, the largest map is written, and the others as trajectory-2.txt and mesh-2.ply and so on,
-    each in a world of its own. Results of an earlier run in the same folder are removed first. If anything stops the
-    run, what was computed so far is written all the same.
+    The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
+    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), movers.jsonl
+    (one JSON object per frame with moving objects: timestamp, and per object id, centroid, box, velocity, speed and
+    pixels; metres, m/s, world frame), groundtruth.txt if the true trajectory is known, masks/<timestamp>.png (255 =
+    dynamic) with ``save_masks``, and movers/<id>.ply and .txt, mesh and poses of every rigid moving object, with
+    ``movers.meshes``. Submaps that could not be merged with the largest one are written as trajectory-2.txt and
+    mesh-2.ply and so on, each in its own world frame. Results of an earlier run in the same folder are removed first.
+    If the run is interrupted or fails, the results up to there are written.
 
     Args:
-        sequence: The recording; its ground truth and masks are used for scoring only.
+        sequence: The recording; its ground truth and masks are used for evaluation only.
         config: All parameters.
-        out: The run folder; made if needed.
-        max_frames: Stop after this many frames.
+        out: The run folder; created if needed.
+        max_frames: Process only this many frames.
         save_masks: Write the dynamic mask of every frame.
         save_map: Write map.npz.
-        masks: Folder of masks from outside, <timestamp>.png with 255 = moves; they are added to what is found. Frames
-            without one are counted.
+        masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
+            ones. Frames with and without a mask are counted.
         progress: Show a progress bar on a terminal.
-        ahead: Frames that are read while an earlier one is processed; 0 where reading is work for all cores, as with
-            rendered frames, and would disturb the times. The result does not depend on it.
-        live: Frames arrive as their times tell, from when the kernels are loaded; the newest that has arrived is
-            processed, and those that there is no time for are dropped and counted. Nothing queues.
-        passes: 2 goes over the recording twice: the second time every frame is compared with the map of the whole
-            first time, so that people at the start leave the map too. What is written is the last finished pass.
-        observe: Called after each processed frame with its number, reading and result.
+        ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
+            would distort the times. The result does not depend on it.
+        live: Replay the recording in real time once the kernels are loaded: the latest frame that has arrived is
+            processed; frames for which there is no time are dropped and counted.
+        passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
+            first, so that objects that were in view from the start also leave the map. The last complete pass is
+            written.
+        observe: Called after each processed frame with its number, what was read, and the result.
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with ``live``.
         DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
-        KeyboardInterrupt: ctrl-C, after writing; the message says what is saved where.
+        KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.slam import Slam
 
@@ -80,13 +80,13 @@ def run(
         )
     if passes not in (1, 2) or (live and passes == 2):
         raise ConfigError(
-            f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 for a recording at rest"
+            f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
         )
-    known = None if masks is None else _open_masks(masks, sequence)
+    given_masks = None if masks is None else _open_masks(masks, sequence)
     slam = Slam(sequence.camera, config)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
-    make(out, masks, save_masks=save_masks)
+    prepare_run_folder(out, masks, save_masks=save_masks)
     stopped = ""
     with RunProgress(count * passes, bar=progress) as display:
         try:
@@ -100,16 +100,23 @@ def run(
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(
-                    as_they_come(sequence, count, known) if live else in_order(sequence, count, ahead, known, slam)
-                ) as turns:
-                    for turn in turns:
+                    in_real_time(sequence, count, given_masks)
+                    if live
+                    else in_order(sequence, count, ahead, given_masks, slam)
+                ) as frames:
+                    for frame in frames:
                         _process(
-                            turn, slam, record, display, out if save_masks and last else None, observe if last else None
+                            frame,
+                            slam,
+                            record,
+                            display,
+                            out if save_masks and last else None,
+                            observe if last else None,
                         )
             if len(slam.maps) > 1:
-                display.note(_apart(slam))
+                display.note(_unmerged_submaps(slam))
             if record.dropped:
-                display.note(f"live: {record.dropped} of {count} frames dropped; the newest was always taken")
+                display.note(f"live: {record.dropped} of {count} frames were dropped")
         except KeyboardInterrupt:
             stopped = f"interrupted after {len(record.rows)} frames{_of_second(finished)}"
             raise KeyboardInterrupt(f"{stopped}; {_saved(finished)} in {out}") from None
@@ -121,9 +128,9 @@ def run(
             raise
         finally:
             display.working("writing")
-            if stopped and finished is not None:  # the first pass is whole, the second is not
+            if stopped and finished is not None:  # the first pass is complete, the second is not
                 slam, record = finished
-            report = write(out, slam, record, sequence, config, stopped, save_map=save_map)
+            report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -131,11 +138,11 @@ def run(
     return report
 
 
-def _apart(slam: "Slam") -> str:
-    """Sentence on maps that are not connected."""
+def _unmerged_submaps(slam: "Slam") -> str:
+    """Sentence on the submaps that could not be merged."""
     main, *others = (len(trajectory) for trajectory, _ in slam.maps)
     names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
-    return f"places were not recognised after a loss: the main map has {main} frames; beside it there is {names}"
+    return f"{len(others)} submap(s) could not be merged: the main map has {main} frames; the others are {names}"
 
 
 def _of_second(finished: object) -> str:
@@ -154,38 +161,39 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
 
 
 def _process(
-    turn: Turn,
+    source: SourceFrame,
     slam: "Slam",
     record: RunRecord,
     display: RunProgress,
-    out_of_masks: Path | None,
-    observe: "Callable[[int, Reading, FrameResult], None] | None",
+    mask_folder: Path | None,
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None",
 ) -> None:
-    index, reading = turn.number, turn.reading
+    """Process one frame, count it, save its mask, and report it."""
+    index, read = source.number, source.read
     if record.dropped is not None:
-        record.dropped += turn.dropped
-    if isinstance(reading.frame, FrameError):
-        record.unreadable.append(str(reading.frame))
-        display.note(f"skipped: {reading.frame}")
+        record.dropped += source.dropped
+    if isinstance(read.frame, FrameError):
+        record.unreadable.append(str(read.frame))
+        display.note(f"skipped: {read.frame}")
         return
-    truth = reading.mask
-    if isinstance(truth, FrameError):
-        display.note(f"frame {index}: its mask is not scored, {truth}")
-        truth = None
-    known = reading.known
-    if isinstance(known, FrameError):
-        display.note(f"frame {index}: its mask is left out, {known}")
-        known = None
+    true_mask = read.true_mask
+    if isinstance(true_mask, FrameError):
+        display.note(f"frame {index}: the true mask is not scored, {true_mask}")
+        true_mask = None
+    given_mask = read.given_mask
+    if isinstance(given_mask, FrameError):
+        display.note(f"frame {index}: the given mask is ignored, {given_mask}")
+        given_mask = None
     if record.masked is not None:
-        record.masked += known is not None
+        record.masked += given_mask is not None
     start = time.perf_counter()
-    frame = reading.prepared or reading.frame
-    result = slam.process(frame) if known is None else slam.process(frame, known)
+    frame = read.prepared or read.frame
+    result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
     end = time.perf_counter()
-    delays = {} if turn.arrival is None else {"dropped": turn.dropped, "latency": 1000 * (end - turn.arrival)}
-    record.add(result, 1000 * (end - start), reading.ms, truth, **delays)
-    if out_of_masks is not None:
-        save_mask(out_of_masks / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+    delays = {} if source.arrival is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
+    record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
+    if mask_folder is not None:
+        save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
-        observe(index, reading, result)
+        observe(index, read, result)
     display.frame(index, result, record.dropped)

@@ -1,4 +1,4 @@
-"""The run folder: what a run leaves behind."""
+"""The run folder: creation, cleaning and writing of all result files."""
 
 import json
 from collections.abc import Callable
@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
-from dudmap.pipeline.metrics import RunRecord, accuracy
+from dudmap.pipeline.metrics import RunRecord
 
 if TYPE_CHECKING:
     from dudmap.objects.object_map import RigidObject
@@ -29,16 +30,16 @@ SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
 )  # fmt: skip
-"""What `dudmap evaluate` writes beside a run; it would not belong to the next one."""
+"""Files of `dudmap evaluate` in a run folder, which are removed before the next run."""
 
 
 @dataclass(frozen=True, eq=False)
 class RunReport:
-    """What a run gave.
+    """Result of a run.
 
     Attributes:
         out: The run folder.
-        metrics: The content of metrics.json.
+        metrics: Content of metrics.json.
         trajectory: Poses of all tracked frames.
     """
 
@@ -54,14 +55,16 @@ def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
 
 
-def make(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
-    """Make the run folder, prove that it can be written, and remove an earlier run's results and their scores.
+def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
+    """Create the run folder, check that it is writable, and remove the results of an earlier run.
 
     Raises:
-        DudmapError: It cannot be made or written, or what is to be removed is a recording or the masks to be read.
+        DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
     """
     if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
-        raise DudmapError(f"{out} holds a recording, whose truth and masks a run would overwrite; name another folder")
+        raise DudmapError(
+            f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
+        )
     if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
         raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
     try:
@@ -82,7 +85,7 @@ def make(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
         raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
 
 
-def write(
+def write_run_folder(
     out: Path,
     slam: "Slam",
     record: RunRecord,
@@ -92,7 +95,7 @@ def write(
     *,
     save_map: bool,
 ) -> RunReport:
-    """Write all files of the run folder; one that fails does not keep the others from being written.
+    """Write all files of the run folder; a file that fails does not prevent the others.
 
     Raises:
         DudmapError: A file could not be written.
@@ -137,7 +140,7 @@ def write(
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
     if config.movers.meshes:
-        steps.append(lambda: metrics.update(bodies=_save_bodies(out / "movers", slam.rigid_objects)))
+        steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
     problems = []
     try:
         for step in steps:
@@ -152,10 +155,10 @@ def write(
     return RunReport(out, metrics, trajectory)
 
 
-def _save_bodies(folder: Path, bodies: "list[RigidObject]") -> list[dict[str, Any]]:
-    """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
+def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:
+    """Write mesh and trajectory of every rigid object; returns the entries of all objects in metrics.json."""
     out = []
-    for body in bodies:
+    for body in objects:
         row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
         if body.mesh is not None and body.trajectory is not None:
             folder.mkdir(exist_ok=True)

@@ -113,7 +113,9 @@ class Atlas:
         )
         for place in (*self.poses, *self.keyframes.keyframes):
             if place.submap == self.current:
-                place.T_world_camera = at_time(stamps, corrections, place.timestamp) @ place.T_world_camera
+                place.T_world_camera = (
+                    se3.interpolate_in_time(stamps, corrections, place.timestamp) @ place.T_world_camera
+                )
         for n, T in zip(nodes, Ts_new, strict=True):
             self.history.Ts_world_camera[n] = T
         self.volume.take_over(volume)
@@ -133,14 +135,3 @@ class Atlas:
         self.history.reintegrate(self.volumes[target], nodes)
         del self.volumes[source]
         self.current = target
-
-
-def at_time(stamps: NDArray[np.float64], Ts: NDArray[np.float64], timestamp: float) -> NDArray[np.float64]:
-    """Motion (4, 4) between those (n, 4, 4) at times (n,), on the screw; before and after them the nearest."""
-    after = int(np.searchsorted(stamps, timestamp))
-    if after == 0:
-        return Ts[0]
-    if after == len(stamps):
-        return Ts[-1]
-    share = (timestamp - stamps[after - 1]) / (stamps[after] - stamps[after - 1])
-    return se3.interpolate(Ts[after - 1], Ts[after], share)

@@ -14,7 +14,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
-from dudmap.places.place_recognition import Keyframe, PlaceMatch
+from dudmap.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
 from dudmap.places.pose_graph import Edge, optimize
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import Tracker, TrackingResult
@@ -138,10 +138,17 @@ class LoopCloser:
         if self._searcher is None:
             self._searcher = ThreadPoolExecutor(1, thread_name_prefix="dudmap-loops")
             weakref.finalize(self, self._searcher.shutdown, wait=False)
-        features = self.atlas.keyframes.features(view.observation, view.static_mask)
+        features = self._features(view)
         places = self._searcher.submit(self.atlas.keyframes.match, features, among)
         self._search = Search(view, self.atlas.current, returned, places, self._count + EVERY)
         self._next_attempt = self._count + self.config.loops.gap
+
+    def _features(self, view: View) -> PlacedFeatures:
+        """Features of a frame; those of the newest keyframe if the frame has just become one."""
+        keyframes = self.atlas.keyframes.keyframes
+        if keyframes and keyframes[-1].timestamp == view.observation.timestamp:
+            return keyframes[-1].features
+        return self.atlas.keyframes.extract(view.observation, view.static_mask)
 
     def _old(self, keyframe: Keyframe, now: float) -> bool:
         return now - keyframe.last_seen > self.config.loops.min_age
@@ -260,14 +267,15 @@ class LoopCloser:
             if edge.a in number and edge.b in number:
                 edges.append(Edge(number[edge.a], number[edge.b], edge.T_a_b, edge.sigma_distance, edge.sigma_angle))
         Ts_new = optimize(Ts, edges)
+        if not np.all(np.isfinite(Ts_new)):
+            return None
         volume = self.atlas.make_volume()
         history.reintegrate(volume, nodes, list(Ts_new))
-        correction = Ts_new[-1] @ se3.inverse(Ts[-1])
         if self._worse(volume, nodes, Ts, Ts_new):
             return None
         self._edges += loop
         self.closed += 1
-        return self.atlas.correct(nodes, Ts_new, volume) if np.all(np.isfinite(correction)) else None
+        return self.atlas.correct(nodes, Ts_new, volume)
 
     def _worse(
         self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], Ts_new: NDArray[np.float64]

@@ -1,12 +1,11 @@
-"""Lost and found: keyframes with features that have a place in space, and the poses they suggest for a lost frame.
+"""Place recognition: keyframes with features of known 3D position, and the poses they suggest for a frame.
 
-SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012), pose by RANSAC
-over three pairs of points (Fischler and Bolles 1981) with the closed form of Kabsch (1976) and Umeyama (1991).
+SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012), pose by 3D-3D
+RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
 """
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +14,7 @@ from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.frames.observation import Observation
 from dudmap.geometry.alignment import agree, rigid_ransac
 from dudmap.geometry.camera import Camera
+from dudmap.places.features import SiftExtractor, reduced_grey
 
 COMPARED = 64
 """Strongest features of each keyframe that choose the keyframes worth a closer look."""
@@ -28,27 +28,30 @@ SAME_PLACE = 0.1, 5.0
 
 @dataclass(frozen=True, eq=False)
 class PlacedFeatures:
-    """Features of a frame that have a depth reading on one surface, strongest first.
+    """SIFT features of a frame whose depth is known, strongest first.
 
     Attributes:
-        descriptors: (n, 128) float32, unit length.
+        descriptors: (n, 128) float32, RootSIFT, unit length.
         points: (n, 3) float64, metres, camera frame.
     """
 
     descriptors: NDArray[np.float32]
     points: NDArray[np.float64]
 
+    def __len__(self) -> int:
+        return len(self.points)
+
 
 @dataclass(eq=False)
 class Keyframe:
-    """A tracked frame that is remembered.
+    """A tracked frame whose features are stored.
 
     Attributes:
         timestamp: Seconds.
-        T_world_camera: (4, 4) in the world of its submap; moves when the map is corrected.
-        features: What it is recognised by.
-        submap: Number of the map it belongs to.
-        last_seen: When the camera was last near, seconds.
+        T_world_camera: (4, 4) in the world of its submap; updated when the map is corrected.
+        features: Its static features.
+        submap: Number of the submap it belongs to.
+        last_seen: Last time at which the camera was near its pose, seconds.
     """
 
     timestamp: float
@@ -60,26 +63,28 @@ class Keyframe:
 
 @dataclass(frozen=True, eq=False)
 class PlaceMatch:
-    """A keyframe that a frame was recognised to show.
+    """A frame recognised to show the place of a keyframe.
 
     Attributes:
-        keyframe: It.
+        keyframe: The keyframe.
         T_world_camera: (4, 4) pose of the frame in the world of the keyframe's submap.
-        support: Matches that agree.
+        num_inliers: Feature matches that agree with the pose.
     """
 
     keyframe: Keyframe
     T_world_camera: NDArray[np.float64]
-    support: int
+    num_inliers: int
 
 
 class KeyframeDatabase:
-    """Remembers where the camera has been, and recognises these places.
+    """Keyframes along the trajectory, and the recognition of the places they show.
+
+    ``extract`` and ``match`` do not change the database. Not for concurrent calls of ``extract``.
 
     Args:
         config: Distances, limits and thresholds.
         camera: Camera of the observations.
-        sensor: Noise of the depth readings.
+        sensor: Noise model of the depth readings.
     """
 
     def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:
@@ -87,9 +92,33 @@ class KeyframeDatabase:
         self.camera = camera
         self.sensor = sensor or SensorConfig()
         self.keyframes: list[Keyframe] = []
-        self._detector: Any = None
-        self._since_last = config.keyframe_gap
-        self._latest: tuple[Observation, PlacedFeatures] | None = None
+        self._sift = SiftExtractor(config.max_features)
+        self._frames_since_last = config.keyframe_gap
+
+    def extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
+        """SIFT features of a frame that lie on one static surface.
+
+        Args:
+            observation: The frame.
+            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+        """
+        features = self._sift.extract(reduced_grey(observation.rgb, self.config.image_width))
+        if len(features) == 0:
+            return PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+        height, width = observation.depth.shape
+        reduced_height, reduced_width = features.image_shape
+        # pixel centres lie at whole numbers in both images
+        pixels = (features.pixels + 0.5) * (width / reduced_width, height / reduced_height) - 0.5
+        depth, usable = _depth_at(observation.depth, pixels)
+        if static_mask is not None:
+            usable &= np.all(_neighbourhood(static_mask, pixels), axis=1)
+        order = np.argsort(-features.responses, kind="stable")
+        order = order[usable[order]][: self.config.max_features]
+        u, v = pixels[order].T
+        points = self.camera.points(u, v, depth[order].astype(np.float64))
+        descriptors = features.descriptors[order]
+        root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+        return PlacedFeatures(root.astype(np.float32), points)
 
     def add(
         self,
@@ -98,135 +127,113 @@ class KeyframeDatabase:
         static_mask: NDArray[np.bool_] | None = None,
         submap: int = 0,
     ) -> bool:
-        """Make a tracked frame a keyframe if the camera has been nowhere near; call with every tracked frame.
+        """Make a tracked frame a keyframe if none of its submap is near; call with every tracked frame.
+
+        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt and
+        ``relocalization.min_inliers`` features.
 
         Args:
             observation: The frame.
             T_world_camera: (4, 4).
-            static_mask: (H, W) bool, pixels that do not move; None = all.
-            submap: Number of the map it belongs to.
+            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+            submap: Number of the submap it belongs to.
 
         Returns:
-            Whether it became one.
+            Whether the frame was added.
         """
-        self._since_last += 1
-        if self._since_last <= self.config.keyframe_gap or self._near(T_world_camera, submap):
+        self._frames_since_last += 1
+        if self._frames_since_last <= self.config.keyframe_gap:
             return False
-        self._since_last = 0
-        features = self.features(observation, static_mask)
-        if len(features.points) < self.config.min_inliers:
+        if self.near(T_world_camera, submap, self.config.keyframe_distance, self.config.keyframe_angle_deg):
             return False
-        stamp = observation.timestamp
-        self.keyframes.append(Keyframe(stamp, T_world_camera.copy(), features, submap, stamp))
+        self._frames_since_last = 0
+        features = self.extract(observation, static_mask)
+        if len(features) < self.config.min_inliers:
+            return False
+        timestamp = observation.timestamp
+        self.keyframes.append(Keyframe(timestamp, T_world_camera.copy(), features, submap, timestamp))
         if len(self.keyframes) > self.config.max_keyframes:
-            self._forget_one()
+            self._remove_most_redundant()
         return True
 
-    def find(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> list[PlaceMatch]:
-        """Known places that a frame may show, the best supported first."""
-        return self.match(self._features(observation, static_mask), self.keyframes) if self.keyframes else []
+    def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
+        """Keyframes that a frame with these features may show, with the frame's pose.
 
-    def features(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
-        """Features of a frame; the same frame again costs nothing."""
-        if self._latest is None or self._latest[0] is not observation:
-            self._latest = observation, self._features(observation, static_mask)
-        return self._latest[1]
+        Args:
+            features: Features of the frame.
+            among: Keyframes to compare with; None = all.
 
-    def match(self, features: PlacedFeatures, among: Sequence[Keyframe]) -> list[PlaceMatch]:
-        """KeyframeDatabase among these that a frame with such features may show, the best supported first."""
-        if len(features.points) < self.config.min_inliers or not among:
+        Returns:
+            Matches with distinct poses, those with more inliers first.
+        """
+        among = self.keyframes if among is None else among
+        if len(features) < self.config.min_inliers or not among:
             return []
         found: list[PlaceMatch] = []
-        for keyframe in _most_alike(features, among):
+        for keyframe in _most_similar(features, among):
             pairs = matches(features.descriptors, keyframe.features.descriptors, self.config.ratio)
             if len(pairs) < self.config.min_inliers:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
             T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b))
-            count = int(np.count_nonzero(inliers))
-            if count >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
-                found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, count))
-        found.sort(key=lambda place: -place.support)
-        places: list[PlaceMatch] = []
-        for place in found:
+            num_inliers = int(np.count_nonzero(inliers))
+            if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
+                found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
+        found.sort(key=lambda match: -match.num_inliers)
+        distinct: list[PlaceMatch] = []
+        for match in found:
             if not any(
-                place.keyframe.submap == other.keyframe.submap
-                and agree(place.T_world_camera, other.T_world_camera, *SAME_PLACE)
-                for other in places
+                match.keyframe.submap == other.keyframe.submap
+                and agree(match.T_world_camera, other.T_world_camera, *SAME_PLACE)
+                for other in distinct
             ):
-                places.append(place)
-        return places
+                distinct.append(match)
+        return distinct
 
     def near(
         self, T_world_camera: NDArray[np.float64], submap: int, distance: float, angle_deg: float
     ) -> list[Keyframe]:
-        """KeyframeDatabase of a submap closer to a pose than a distance (m) and an angle (deg)."""
+        """Keyframes of a submap that are closer to a pose (4, 4) than a distance (m) and an angle (deg)."""
         if not self.keyframes:
             return []
-        places = np.array([known.T_world_camera for known in self.keyframes])
-        close = np.linalg.norm(places[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
-        cosine = (np.einsum("iab,ab->i", places[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
+        Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
+        close = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
+        cosine = (np.einsum("iab,ab->i", Ts[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
         close &= np.degrees(np.arccos(np.clip(cosine, -1, 1))) < angle_deg
         return [self.keyframes[n] for n in np.flatnonzero(close) if self.keyframes[n].submap == submap]
 
-    def _near(self, T_world_camera: NDArray[np.float64], submap: int) -> bool:
-        return bool(self.near(T_world_camera, submap, self.config.keyframe_distance, self.config.keyframe_angle_deg))
-
-    def _forget_one(self) -> None:
-        """Drop the older of the two keyframes that lie nearest to each other."""
-        places = np.array([known.T_world_camera for known in self.keyframes])
-        apart = np.linalg.norm(places[:, None, :3, 3] - places[None, :, :3, 3], axis=-1)
-        cosine = (np.einsum("iab,jab->ij", places[:, :3, :3], places[:, :3, :3]) - 1) / 2
-        turned = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
-        gap = np.maximum(apart / self.config.keyframe_distance, turned / self.config.keyframe_angle_deg)
-        submaps = np.array([known.submap for known in self.keyframes])
+    def _remove_most_redundant(self) -> None:
+        """Remove the older of the two keyframes of one submap whose poses are nearest to each other."""
+        Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
+        distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
+        cosine = (np.einsum("iab,jab->ij", Ts[:, :3, :3], Ts[:, :3, :3]) - 1) / 2
+        angle_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        gap = np.maximum(distance / self.config.keyframe_distance, angle_deg / self.config.keyframe_angle_deg)
+        submaps = np.array([keyframe.submap for keyframe in self.keyframes])
         gap[submaps[:, None] != submaps] = np.inf
-        gap[np.tril_indices(len(places))] = np.inf
+        gap[np.tril_indices(len(Ts))] = np.inf
         del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
 
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Largest believable error (n,) of a feature's place, metres."""
+        """Largest believable error (n,) of the position of a feature, metres."""
         z = points[:, 2]
-        return SLACK * z + 2 * (self.sensor.sigma_base + self.sensor.sigma_scale * z**2)
-
-    def _features(self, observation: Observation, static_mask: NDArray[np.bool_] | None) -> PlacedFeatures:
-        import cv2
-
-        if self._detector is None:
-            self._detector = cv2.SIFT.create(nfeatures=self.config.max_features)
-        height, width = observation.depth.shape
-        scale = min(self.config.image_width / width, 1.0)
-        grey = cv2.cvtColor(observation.rgb, cv2.COLOR_RGB2GRAY)
-        size = round(width * scale), round(height * scale)
-        if scale < 1:
-            grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
-        keypoints, descriptors = self._detector.detectAndCompute(grey, None)
-        if descriptors is None:
-            return PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
-        # pixel centres at whole numbers in both images
-        reduced = np.array([point.pt for point in keypoints])
-        pixels = (reduced + 0.5) * (width / size[0], height / size[1]) - 0.5
-        depth, single = _depth_at(observation.depth, pixels)
-        used = single if static_mask is None else single & _all_around(static_mask, pixels)
-        order = np.argsort([-point.response for point in keypoints], kind="stable")
-        order = order[used[order]][: self.config.max_features]
-        u, v = pixels[order].T
-        z = depth[order].astype(np.float64)
-        points = self.camera.points(u, v, z)
-        root = np.sqrt(descriptors[order] / np.maximum(descriptors[order].sum(axis=1, keepdims=True), 1e-9))
-        return PlacedFeatures(root.astype(np.float32), points)
+        return SLACK * z + 2 * self.sensor.sigma(z)
 
 
-def _most_alike(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
-    """KeyframeDatabase whose strongest features resemble the frame's most, the best first."""
+def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
+    """The keyframes whose strongest features are most similar to the frame's, the best first.
+
+    The score of a keyframe sums, over the frame's features, how far its best cosine similarity exceeds the median of
+    all keyframes: features that many places share do not count.
+    """
     if len(among) <= LOOKED_AT:
         return among
-    parts = [known.features.descriptors[:COMPARED] for known in among]
+    parts = [keyframe.features.descriptors[:COMPARED] for keyframe in among]
     starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
     similarity = np.concatenate(parts) @ features.descriptors.T
-    best = np.maximum.reduceat(similarity, starts, axis=0)  # of each keyframe, for each feature
-    unusual = np.clip(best - np.median(best, axis=0), 0, None)  # what many places show says nothing
-    return [among[n] for n in np.argsort(-unusual.sum(axis=1), kind="stable")[:LOOKED_AT]]
+    best = np.maximum.reduceat(similarity, starts, axis=0)  # per keyframe and feature of the frame
+    distinctive = np.clip(best - np.median(best, axis=0), 0, None)
+    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:LOOKED_AT]]
 
 
 def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
@@ -251,8 +258,8 @@ def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDA
     return np.stack([chosen, nearest[chosen]], axis=1)
 
 
-def _around(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
-    """Values (n, 9) of the 3x3 pixels around places (n, 2) in an image, clamped at its border."""
+def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
+    """Values (n, 9) of the 3x3 neighbourhoods of pixels (n, 2) of an image, clamped at its border."""
     u, v = np.rint(pixels).astype(np.int64).T
     offsets = np.arange(-1, 2)
     rows = np.clip(v[:, None, None] + offsets[:, None], 0, image.shape[0] - 1)
@@ -260,13 +267,12 @@ def _around(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
     return image[rows, columns].reshape(len(pixels), 9)
 
 
-def _all_around(mask: NDArray[np.bool_], pixels: NDArray[np.float64]) -> NDArray[np.bool_]:
-    return np.all(_around(mask, pixels), axis=1)
-
-
 def _depth_at(depth: NDArray[np.float32], pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-    """Depth (n,) around places, and whether all readings there lie on one surface: a corner at an edge is nowhere."""
-    readings = _around(depth, pixels)
-    middle = np.median(readings, axis=1)
+    """Median depth (n,) of 3x3 neighbourhoods, and whether all their readings lie on one surface.
+
+    A corner at a depth edge has no well-defined position.
+    """
+    readings = _neighbourhood(depth, pixels)
+    median = np.median(readings, axis=1)
     spread = readings.max(axis=1) - readings.min(axis=1)
-    return middle, (readings.min(axis=1) > 0) & (spread < 0.02 + 0.02 * middle)
+    return median, (readings.min(axis=1) > 0) & (spread < 0.02 + 0.02 * median)

@@ -59,8 +59,8 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
         for edge in edges:
             T_b_a = se3.inverse(Ts[edge.b]) @ Ts[edge.a]
             error = se3.log(se3.inverse(edge.T_a_b) @ se3.inverse(T_b_a))
-            J_b = np.eye(6) + 0.5 * small_adjoint(error)
-            J_a = -J_b @ adjoint(T_b_a)
+            J_b = np.eye(6) + 0.5 * se3.small_adjoint(error)
+            J_a = -J_b @ se3.adjoint(T_b_a)
             weight = np.repeat([edge.sigma_distance**-2.0, edge.sigma_angle**-2.0], 3)
             for i, J_i in ((edge.a, J_a), (edge.b, J_b)):
                 b[6 * i : 6 * i + 6] += J_i.T @ (weight * error)
@@ -77,19 +77,3 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
         if np.abs(steps).max() < STOP:
             break
     return Ts
-
-
-def adjoint(T: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) with ``T exp(xi) T^-1 == exp(adjoint(T) xi)``, twists (v, omega)."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = T[:3, :3]
-    out[:3, 3:] = se3.hat(T[:3, 3]) @ T[:3, :3]
-    return out
-
-
-def small_adjoint(xi: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6, 6) derivative of ``adjoint(exp(t xi))`` at t = 0."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = se3.hat(xi[3:])
-    out[:3, 3:] = se3.hat(xi[:3])
-    return out

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap.config import SimilarityConfig
 from dudmap.geometry import se3
 from dudmap.kernels.threads import submit
+from dudmap.places.features import SiftExtractor, reduced_grey
 
 FEWEST = 20
 """With fewer features than this in a frame nothing can be said; the frame is taken as new."""
@@ -46,7 +46,7 @@ class SimilarityTest:
 
     def __init__(self, config: SimilarityConfig | None = None) -> None:
         self.config = config or SimilarityConfig()
-        self._detector: Any = None
+        self._sift = SiftExtractor(self.config.max_features)
         self._last_image: NDArray[np.uint8] | None = None
         self._known: list[Features] = []  # of at most the last accepted and the latest frame
 
@@ -56,7 +56,7 @@ class SimilarityTest:
 
     def accept(self, rgb: NDArray[np.uint8]) -> None:
         """Remember a frame as the last one that was fused."""
-        self._last_image = self._reduced(rgb)
+        self._last_image = reduced_grey(rgb, self.config.image_width)
 
     def share(self, rgb: NDArray[np.uint8]) -> float:
         """Share in [0, 1] of the last accepted frame's features found again in ``rgb``; 0 where none can be told."""
@@ -71,32 +71,15 @@ class SimilarityTest:
 
     def features(self, rgb: NDArray[np.uint8]) -> Features:
         """Features of a frame; the same frame again costs only a comparison of the reduced images."""
-        return self._features(self._reduced(rgb))
+        return self._features(reduced_grey(rgb, self.config.image_width))
 
     def _features(self, image: NDArray[np.uint8]) -> Features:
         for known in self._known:
             if np.array_equal(known.image, image):
                 return known
-        import cv2
-
-        if self._detector is None:
-            self._detector = cv2.SIFT.create(nfeatures=self.config.max_features)
-        _, descriptors = self._detector.detectAndCompute(image, None)
-        if descriptors is None:
-            descriptors = np.empty((0, 128), dtype=np.float32)
-        features = Features(image, descriptors)
+        features = Features(image, self._sift.extract(image).descriptors)
         self._known = [*self._known[-1:], features]
         return features
-
-    def _reduced(self, rgb: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        import cv2
-
-        grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
-        width = self.config.image_width
-        if width >= grey.shape[1]:
-            return grey
-        height = max(1, round(grey.shape[0] * width / grey.shape[1]))
-        return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
 
     def _good_matches(self, last: NDArray[np.float32], new: NDArray[np.float32]) -> int:
         """Features of ``last`` whose best match in ``new`` is clearly better than the second best (Lowe 2004).

@@ -98,7 +98,8 @@ class Relocalizer:
         if not limits.enabled:
             return None
         with timer("recognise"):
-            candidates = self.atlas.keyframes.find(observation, static_mask)
+            keyframes = self.atlas.keyframes
+            candidates = keyframes.match(keyframes.extract(observation, static_mask))
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
         candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
         num_readings = max(np.count_nonzero(level.depth), 1)
@@ -129,5 +130,4 @@ class Relocalizer:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
-        num_features = len(self.atlas.keyframes.features(observation).points)
-        return num_features >= self.config.relocalization.min_inliers
+        return len(self.atlas.keyframes.extract(observation)) >= self.config.relocalization.min_inliers

@@ -1,4 +1,4 @@
-"""Recordings on disk: one small reader per format, all giving the same kind of object."""
+"""Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Protocol, runtime_checkable
@@ -13,18 +13,18 @@ if TYPE_CHECKING:
     from dudmap.geometry.camera import Camera
     from dudmap.geometry.trajectory import Trajectory
 
-__all__ = ["Sequence", "open_sequence"]
+__all__ = ["Sequence", "is_recording", "open_sequence"]
 
 
 @runtime_checkable
 class Sequence(Protocol):
-    """A recording with random access; everything that Slam is fed from has this shape.
+    """A recording with random access to its frames.
 
     Attributes:
-        name: Short name, fit for a folder.
-        camera: Intrinsics of all frames; colour and depth share them.
-        timestamps: (N,) float64, seconds, strictly increasing, of the depth images.
-        ground_truth: True camera poses, if known; for scoring only.
+        name: Short name, usable as a folder name.
+        camera: Intrinsics shared by colour and depth of all frames.
+        timestamps: (N,) float64 strictly increasing timestamps of the depth images, seconds.
+        ground_truth: True camera poses if known; used for evaluation only.
     """
 
     @property
@@ -44,28 +44,50 @@ class Sequence(Protocol):
         """Frame number ``index``.
 
         Raises:
-            FrameError: This one frame cannot be read; the others may be fine.
+            FrameError: This frame cannot be read; the others may be valid.
         """
         ...
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame if known; for scoring only."""
+        """True dynamic mask (H, W) of a frame if known; used for evaluation only."""
         ...
 
 
+class Reader(Protocol):
+    """Class of a sequence on disk: can recognise its format and open a folder of it."""
+
+    def __call__(self, path: Path, camera: "Camera | str | None" = None) -> Sequence:
+        """Open a recording."""
+        ...
+
+    def recognises(self, path: Path) -> bool:
+        """Whether a folder has this format."""
+        ...
+
+
+def readers() -> "tuple[Reader, ...]":
+    """Readers of all known formats, in the order in which they are tried."""
+    from dudmap.sequences.tum import TumSequence
+
+    return (TumSequence,)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a folder is a recording of a known format."""
+    return any(reader.recognises(path) for reader in readers())
+
+
 def open_sequence(path: str | Path, camera: "Camera | str | None" = None) -> Sequence:
-    """Recognise and open a recording.
+    """Open a recording with the first reader of ``readers()`` that recognises it.
 
     Args:
         path: Folder in the layout of the TUM RGB-D benchmark.
         camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
-            (size from the images and 5000 units per metre where left out).
+            (default: the size of the images and 5000 depth units per metre).
 
     Raises:
-        DatasetError: Nothing readable is there; the message says what was found and what was expected.
+        DatasetError: The folder is missing or not a recording of a known format.
     """
-    from dudmap.sequences.tum import TumSequence
-
     path = Path(path)
     if not path.exists():
         raise DatasetError(f"there is no folder {path}; expected a recording with rgb.txt and depth.txt")
@@ -73,8 +95,9 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None) -> Seq
         raise DatasetError(f"{path} is a file; expected a folder with rgb.txt and depth.txt")
     if not any(path.iterdir()):
         raise DatasetError(f"the folder {path} is empty; expected a recording with rgb.txt and depth.txt")
-    if TumSequence.recognises(path):
-        return TumSequence(path, camera)
+    for reader in readers():
+        if reader.recognises(path):
+            return reader(path, camera)
     missing = [name for name in ("rgb.txt", "depth.txt") if not (path / name).is_file()]
     raise DatasetError(
         f"{path} is not a recording in TUM layout: {' and '.join(missing)} not found "

@@ -1,4 +1,4 @@
-"""Decoding of colour and depth images, with every defect turned into one sentence."""
+"""Decoding of colour, depth and mask images, with one clear error for every defect of a file."""
 
 import struct
 import zlib
@@ -13,10 +13,10 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """Colour image (H, W, 3), red green blue.
+    """Colour image (H, W, 3) in RGB order.
 
     Raises:
-        FrameError: The file is missing, cut off, damaged or no image.
+        FrameError: The file is missing, truncated, damaged or not an image.
     """
     import cv2
 
@@ -30,7 +30,7 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats.
 
     Raises:
-        FrameError: The file is missing, cut off, damaged, not one channel, or neither 16 bit nor float.
+        FrameError: The file is missing, truncated, damaged, has several channels, or is neither 16 bit nor float.
     """
     import cv2
 
@@ -49,10 +49,10 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Mask (H, W) of an 8-bit image in which values above 127 are true.
+    """Mask (H, W) of an 8-bit image; values above 127 are true.
 
     Raises:
-        FrameError: The file is missing, cut off, damaged or no image.
+        FrameError: The file is missing, truncated, damaged or not an image.
     """
     import cv2
 
@@ -63,7 +63,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 
 def _bytes(path: Path) -> NDArray[np.uint8]:
-    """Content of an image file that is whole; decoders would fill the missing rest with grey."""
+    """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
     try:
         data = path.read_bytes()
     except FileNotFoundError:
@@ -80,7 +80,7 @@ def _bytes(path: Path) -> NDArray[np.uint8]:
 
 
 def _check_png(path: Path, data: bytes) -> None:
-    """Walk the chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
+    """Check all chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
     at = len(PNG)
     while at + 12 <= len(data):
         (length,) = struct.unpack_from(">I", data, at)

@@ -1,4 +1,4 @@
-"""Where a recording's intrinsics come from: text, its own file, or the benchmarks' published cameras."""
+"""Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
 
 import re
 from dataclasses import dataclass
@@ -8,26 +8,33 @@ from dudmap.errors import DatasetError
 from dudmap.geometry.camera import Camera
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+DEPTH_SCALE = 5000.0
+"""Depth units per metre in the TUM layout, where nothing else is given."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
 
 
 @dataclass(frozen=True)
 class Intrinsics:
-    """What is known of a camera before its images are seen.
+    """Intrinsics before the image size is known.
 
     Attributes:
-        values: Numbers by key (``KEYS``); fx, fy, cx, cy always there.
-        source: Where they come from, for messages.
+        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present.
+        source: Origin of the numbers, for error messages.
     """
 
     values: dict[str, float]
     source: str
 
+    @property
+    def depth_scale(self) -> float:
+        """Depth units per metre."""
+        return self.values.get("depth_scale", DEPTH_SCALE)
+
     def camera(self, width: int, height: int) -> Camera:
-        """Camera of images of this size.
+        """Camera for images of the given size.
 
         Raises:
-            DatasetError: The intrinsics are for images of another size, or not acceptable.
+            DatasetError: The intrinsics belong to another image size, or are invalid.
         """
         expected = (int(self.values.get("width", width)), int(self.values.get("height", height)))
         if expected != (width, height):
@@ -43,29 +50,30 @@ class Intrinsics:
             cy=self.values["cy"],
             width=width,
             height=height,
-            depth_scale=self.values.get("depth_scale", 5000.0),
+            depth_scale=self.depth_scale,
             distortion=distortion if any(distortion) else (),
         )
 
 
-def _numbers(*numbers: float) -> dict[str, float]:
+def _by_key(*numbers: float) -> dict[str, float]:
     return dict(zip(KEYS, numbers, strict=False))
 
 
 KNOWN = (
-    (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", _numbers(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
-    (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _numbers(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
-    (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", _numbers(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
-    (r"rgbd_bonn", "Bonn", _numbers(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)),
+    (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", _by_key(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
+    (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _by_key(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
+    (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", _by_key(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
+    (r"rgbd_bonn", "Bonn", _by_key(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)),
+    (r"(living|office)_room_traj", "ICL-NUIM", _by_key(481.2, 480.0, 319.5, 239.5, 640, 480, 5000)),
 )
-"""Folder-name pattern, name and intrinsics of the benchmarks' cameras."""
+"""Pattern of the folder name, name and published intrinsics of the data sets."""
 
 
 def of_folder(path: Path) -> Intrinsics:
-    """Intrinsics of a recording: its ``intrinsics.txt``, else those of a benchmark that its folder's name tells.
+    """Intrinsics of a recording: its ``intrinsics.txt``, else those of the data set that the folder name matches.
 
     Raises:
-        DatasetError: Neither is there, or the file cannot be understood.
+        DatasetError: There is neither, or the file cannot be parsed.
     """
     file = path / "intrinsics.txt"
     if file.is_file():
@@ -74,16 +82,16 @@ def of_folder(path: Path) -> Intrinsics:
         if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
             return Intrinsics(values, f"the {name} camera")
     raise DatasetError(
-        f"the camera of {path} is not known: there is no intrinsics.txt and the folder is not named like a TUM or Bonn "
-        "recording; give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+        f"the camera of {path} is not known: there is no intrinsics.txt and the folder is not named like a TUM, Bonn "
+        "or ICL-NUIM recording; give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
     )
 
 
 def from_text(text: str) -> Intrinsics:
-    """Intrinsics of ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+    """Parse ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
 
     Raises:
-        DatasetError: These are not 4, 6 or 7 numbers.
+        DatasetError: The text does not hold 4, 6 or 7 numbers.
     """
     try:
         numbers = [float(field) for field in text.split(",")]
@@ -91,7 +99,7 @@ def from_text(text: str) -> Intrinsics:
         numbers = []
     if len(numbers) not in (4, 6, 7):
         raise DatasetError(f"cannot understand the camera {text!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
-    return Intrinsics(_numbers(*numbers), f"the camera {text!r}")
+    return Intrinsics(_by_key(*numbers), f"the camera {text!r}")
 
 
 def from_camera(camera: Camera) -> Intrinsics:
@@ -101,10 +109,10 @@ def from_camera(camera: Camera) -> Intrinsics:
 
 
 def from_file(path: Path) -> Intrinsics:
-    """Intrinsics of a text file: ``key value`` lines, a 3x3 matrix, or one line ``fx fy cx cy [w h [depth_scale]]``.
+    """Parse a text file: ``key value`` lines, a 3x3 matrix, or one line ``fx fy cx cy [w h [depth_scale]]``.
 
     Raises:
-        DatasetError: It is none of these, or a key is unknown or missing.
+        DatasetError: The file has none of these forms, or a key is unknown or missing.
     """
     try:
         lines = path.read_text(encoding="utf-8").splitlines()
@@ -116,9 +124,9 @@ def from_file(path: Path) -> Intrinsics:
     if rows and all(_is_number(field) for row in rows for field in row):
         table = [[float(field) for field in row] for row in rows]
         if [len(row) for row in table] == [3, 3, 3] and table[2] == [0, 0, 1]:
-            return Intrinsics(_numbers(table[0][0], table[1][1], table[0][2], table[1][2]), str(path))
+            return Intrinsics(_by_key(table[0][0], table[1][1], table[0][2], table[1][2]), str(path))
         if len(table) == 1 and len(table[0]) in (4, 6, 7):
-            return Intrinsics(_numbers(*table[0]), str(path))
+            return Intrinsics(_by_key(*table[0]), str(path))
     raise DatasetError(
         f"cannot understand {path}; expected lines such as 'fx 517.3' with fx, fy, cx, cy, width, height and "
         "depth_scale, or a 3x3 matrix, or one line 'fx fy cx cy'"

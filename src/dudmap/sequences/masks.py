@@ -1,4 +1,4 @@
-"""Masks of things that move, made by someone else: one 8-bit image per frame, named by its time."""
+"""External dynamic masks: one 8-bit image per frame, named by its timestamp."""
 
 from pathlib import Path
 
@@ -12,22 +12,22 @@ from dudmap.sequences.images import read_mask
 
 
 class MaskFolder:
-    """Folder of ``<timestamp>.png`` (255 = moves), each for the frame nearest in time, at most 20 ms away.
+    """Folder of masks ``<timestamp>.png`` (255 = dynamic), each paired with the nearest frame at most 20 ms away.
 
     Args:
         path: The folder.
-        timestamps: (N,) seconds of the frames, increasing.
-        camera: Camera of the frames; the masks have its size.
+        timestamps: (N,) increasing timestamps of the frames, seconds.
+        camera: Camera of the frames; the masks must have its image size.
 
     Raises:
-        DatasetError: There is no such folder, no image in it is named by a time, or none belongs to a frame.
+        DatasetError: The folder does not exist, holds no image named by a timestamp, or no mask is near a frame.
     """
 
     def __init__(self, path: str | Path, timestamps: NDArray[np.float64], camera: Camera) -> None:
         path = Path(path)
         if not path.is_dir():
             raise DatasetError(f"there is no folder {path}; expected one with masks named <timestamp>.png")
-        stamps = {stamp: file for file in path.glob("*.png") if (stamp := _stamp(file)) is not None}
+        stamps = dict(stamped_masks(path))
         if not stamps:
             raise DatasetError(
                 f"{path} holds no masks; expected images named <timestamp>.png, e.g. 1305031102.175304.png"
@@ -44,11 +44,11 @@ class MaskFolder:
         self._files = {j: stamps[float(times[i])] for i, j in pairs}
 
     def __getitem__(self, index: int) -> NDArray[np.bool_] | None:
-        """Mask (H, W) of a frame, None where there is none.
+        """Mask (H, W) of a frame, or None if it has none.
 
         Raises:
             FrameError: The image cannot be decoded.
-            DatasetError: It does not have the size of the frames.
+            DatasetError: The image does not have the size of the frames.
         """
         file = self._files.get(index)
         if file is None:
@@ -62,9 +62,14 @@ class MaskFolder:
         return mask
 
 
-def _stamp(file: Path) -> float | None:
-    try:
-        stamp = float(file.stem)
-    except ValueError:
-        return None
-    return stamp if np.isfinite(stamp) else None
+def stamped_masks(folder: Path) -> list[tuple[float, Path]]:
+    """Timestamps in seconds and paths of the PNG files of a folder that are named by a timestamp."""
+    masks = []
+    for path in folder.glob("*.png"):
+        try:
+            stamp = float(path.stem)
+        except ValueError:
+            continue
+        if np.isfinite(stamp):
+            masks.append((stamp, path))
+    return masks

@@ -1,4 +1,4 @@
-"""Folders in the layout of the TUM RGB-D benchmark (Sturm et al. 2012), which the Bonn data set shares."""
+"""Folders in the layout of the TUM RGB-D benchmark (Sturm et al. 2012), which Bonn and ICL-NUIM share."""
 
 from pathlib import Path
 
@@ -13,34 +13,33 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import images, intrinsics
 
 PROBES = 30
-"""Frames, spread evenly, one of which must be usable for a recording to be opened."""
+"""Number of evenly spread frames that are tried until one is valid and gives the image size."""
 
 
 class TumSequence:
-    """Recording of rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
+    """Recording with rgb.txt, depth.txt and optionally associations.txt, intrinsics.txt, groundtruth.txt, mask.txt.
 
-    associations.txt (``t_rgb rgb_file t_depth depth_file``) says which colour belongs to which depth image; without it
-    they are paired one to one, nearest first, at most 20 ms apart. A frame's time is that of its depth image.
+    associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
+    associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
-    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder's name (TUM freiburg1-3, Bonn).
-    The published distortion of TUM freiburg1 and 2 is deliberately not among the latter: it describes the colour
-    lens, but the benchmark's depth was reprojected by the driver as if that lens had none, and undistorting both
-    images alike would bend correct depth. On 240 frames of freiburg1_xyz it made no difference: ATE 0.96 cm without,
-    0.93 cm with it; 0.98 and 0.99 cm on the same frames with people put in. Coefficients in intrinsics.txt (k1 k2 p1
-    p2 k3) are applied to both images.
+    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder name (TUM freiburg1-3, Bonn,
+    ICL-NUIM). The published distortion of TUM freiburg1 and 2 is deliberately left out: it describes the colour lens,
+    but the driver reprojected the depth as if that lens had no distortion, and undistorting both images would distort
+    correct depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
+    intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
 
     Args:
         path: The folder.
-        camera: Intrinsics that replace the recording's own, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+        camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
 
     Attributes:
-        name: The folder's name.
+        name: Name of the folder.
         camera: Intrinsics.
-        timestamps: (N,) seconds, strictly increasing, of the depth images.
-        ground_truth: True poses, None without groundtruth.txt.
+        timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
+        ground_truth: True camera poses, None without groundtruth.txt.
 
     Raises:
-        DatasetError: A list is missing or malformed, nothing matches, or no frame is usable.
+        DatasetError: A list is missing or malformed, no images can be paired, or no frame is valid.
     """
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
@@ -54,8 +53,8 @@ class TumSequence:
         else:
             known = intrinsics.from_camera(camera) if camera else intrinsics.of_folder(self.path)
         self.camera = self._probe(known)
-        truth = self.path / "groundtruth.txt"
-        self.ground_truth = Trajectory.load(truth) if truth.is_file() else None
+        truth = self._find_ground_truth()
+        self.ground_truth = None if truth is None else Trajectory.load(truth)
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -70,7 +69,7 @@ class TumSequence:
         """Frame number ``index``.
 
         Raises:
-            FrameError: It cannot be read, or has another size than the recording; number and file are named.
+            FrameError: The frame cannot be read, or has another size than the recording.
         """
         frame = self._read(index, self.camera.depth_scale)
         if frame.depth.shape != self.camera.shape:
@@ -81,10 +80,10 @@ class TumSequence:
         return frame
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame, None where mask.txt names none.
+        """True dynamic mask (H, W) of a frame, None if mask.txt lists none.
 
         Raises:
-            FrameError: The mask's file cannot be read or has another size than the recording.
+            FrameError: The mask cannot be read or has another size than the recording.
         """
         path = self._masks.get(range(len(self))[index])
         if path is None:
@@ -122,8 +121,15 @@ class TumSequence:
             )
         return [(colors[i], depths[j]) for i, j in pairs]
 
+    def _find_ground_truth(self) -> Path | None:
+        """groundtruth.txt, else the only ``*.gt.freiburg``, which is the name that ICL-NUIM gives its trajectories."""
+        if (self.path / "groundtruth.txt").is_file():
+            return self.path / "groundtruth.txt"
+        found = list(self.path.glob("*.gt.freiburg"))
+        return found[0] if len(found) == 1 else None
+
     def _find_masks(self) -> dict[int, Path]:
-        """Mask files by frame number; the list's times are those of the colour images."""
+        """Mask files by frame number; mask.txt has the timestamps of the colour images."""
         path = self.path / "mask.txt"
         if not path.is_file():
             return {}
@@ -134,11 +140,15 @@ class TumSequence:
         return {int(order[j]): masks[i].path for i, j in pairs}
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera in the size of the first usable frame; a recording without one is no recording."""
+        """Camera with the size of the first valid frame.
+
+        Raises:
+            DatasetError: No frame is valid.
+        """
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
-                frame = self._read(int(index), known.values.get("depth_scale", 5000.0))
+                frame = self._read(int(index), known.depth_scale)
             except FrameError as error:
                 problem = problem or str(error)
                 continue

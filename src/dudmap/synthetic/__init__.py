@@ -1,6 +1,6 @@
-"""Analytic worlds with moving things: exact depth, colour, poses, masks and surface.
+"""Synthetic recordings of analytic scenes with moving objects and exact ground truth: poses, masks and surface.
 
-Importing this package is cheap; the renderer is loaded when a sequence is made.
+The renderer is imported when ``sequence`` is first used, so that importing this package is fast.
 """
 
 from typing import TYPE_CHECKING
@@ -12,7 +12,7 @@ __all__ = ["names", "sequence"]
 
 
 def __getattr__(name: str) -> object:
-    """Load the renderer when ``sequence`` is first asked for."""
+    """Import the renderer on the first access to ``sequence``."""
     if name != "sequence":
         raise AttributeError(f"module 'dudmap.synthetic' has no attribute {name!r}")
     from dudmap.synthetic.recording import sequence
@@ -21,7 +21,7 @@ def __getattr__(name: str) -> object:
 
 
 def names() -> dict[str, list[str]]:
-    """Known names of scenes, movers, camera paths, situations and noise models."""
+    """Names of all scenes, movers, camera paths, situations and noise models."""
     from dudmap.synthetic.movers import MOVERS
     from dudmap.synthetic.paths import FOLLOW, PATHS
     from dudmap.synthetic.rooms import SCENES

@@ -1,24 +1,25 @@
-"""A stream of people that hides a chosen share of the image."""
+"""Stream of walking people that covers a given share of the image."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
 from dudmap.geometry.camera import Camera
-from dudmap.synthetic.movers import Mover, Staging
+from dudmap.synthetic.movers import Staging, SyntheticMover
 from dudmap.synthetic.person import Figure
 from dudmap.synthetic.render import Renderer
 from dudmap.synthetic.scene import pose
 
-ENTRY_SPEED = 3.0  # m/s, so that also the slowest crowd is soon in view
+ENTRY_SPEED = 3.0
+"""Speed at which a slow crowd enters the view, m/s."""
 
 
 class Crowd:
-    """People walking one behind the other across the view, coming back in on the other side.
+    """People walking in a line across the view, who re-enter it on the other side.
 
     Args:
-        staging: Scene, chance, speed, duration, and whether they are there at the first frame.
-        density: 0 (few people far away) to 1 (shoulder to shoulder right before the camera).
+        staging: Scene, random numbers, speed, duration, and whether the crowd is in view in the first frame.
+        density: From 0 (few people far away) to 1 (a closed line directly in front of the camera).
     """
 
     def __init__(self, staging: Staging, density: float) -> None:
@@ -39,7 +40,7 @@ class Crowd:
         self.figures = [Figure(rng, number, size, stride) for number in range(min(self.count, 5))]
 
     def advanced(self, t: float) -> float:
-        """Metres that everybody has walked at time ``t``; before 0.5 s nobody is in view, unless at the start."""
+        """Distance in metres that everybody has walked at time ``t``; without ``start_dynamic`` it starts at 0.5 s."""
         if self.staging.start_dynamic:
             return self.lane + self.speed * t
         hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
@@ -49,17 +50,17 @@ class Crowd:
         return self.lane + self.speed * (t - arrived)
 
     def steady_from(self) -> float:
-        """Time in seconds from which the whole lane is full."""
+        """Time in seconds from which the whole lane is occupied."""
         hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
         return 0.0 if self.staging.start_dynamic else 0.5 + self.lane / hurry
 
-    def movers(self) -> list[Mover]:
-        """One mover per person."""
+    def movers(self) -> list[SyntheticMover]:
+        """Movers of the crowd, one per person."""
         return [self._person(number) for number in range(self.count)]
 
-    def _person(self, number: int) -> Mover:
+    def _person(self, number: int) -> SyntheticMover:
         figure, ground = self.figures[number % len(self.figures)], self.staging.scene.ground
-        side = 0.10 * self.staging.scene.mover_scale * ((number * 7) % 5 - 2)  # not all in one line
+        side = 0.10 * self.staging.scene.mover_scale * ((number * 7) % 5 - 2)  # lateral offsets
         yaw = float(np.degrees(np.arctan2(self.direction[1], self.direction[0])))
         across = np.array([-self.direction[1], self.direction[0]])
 
@@ -73,11 +74,11 @@ class Crowd:
         def parts(t: float) -> NDArray[np.float64]:
             return figure.poses(reference(t), way(t) + 0.31 * number)
 
-        return Mover("person", figure.primitives, parts, reference, lambda t: way(t) >= 0, settles=False)
+        return SyntheticMover("person", figure.primitives, parts, reference, lambda t: way(t) >= 0, settles=False)
 
 
 def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]) -> float:
-    """Mean share of the image that the crowd hides in frames at ``times`` (N,) with poses (N, 4, 4)."""
+    """Mean share of the image that the crowd covers in frames at ``times`` (N,) with poses (N, 4, 4)."""
     scene, movers = crowd.staging.scene, crowd.movers()
     camera = Camera(66.0, 66.0, 39.5, 29.5, 80, 60)
     renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
@@ -93,16 +94,16 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
 def crowd_of(
     coverage: float, staging: Staging, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]
 ) -> Crowd:
-    """The crowd that hides ``coverage`` of the image, on average over the frames once it is there.
+    """Crowd that covers ``coverage`` of the image on average, once all of it is in view; found by bisection.
 
     Args:
         coverage: Share of the image.
-        staging: Scene, chance, speed, duration, and whether it is there at the first frame.
-        times: (N,) seconds of the frames.
-        Ts_world_camera: (N, 4, 4) their poses.
+        staging: Scene, random numbers, speed, duration, and whether the crowd is in view in the first frame.
+        times: (N,) timestamps of the frames, seconds.
+        Ts_world_camera: (N, 4, 4) camera poses of the frames.
 
     Raises:
-        ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene hides so much.
+        ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene covers it.
     """
     if not 0.02 <= coverage <= 0.95:
         raise ConfigError(f"coverage is {coverage}; expected a share of the image from 0.02 to 0.95")
@@ -111,16 +112,16 @@ def crowd_of(
     def attempt(density: float) -> tuple[Crowd, float]:
         rng = np.random.default_rng(seed)
         crowd = Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
-        there = np.flatnonzero(times >= min(crowd.steady_from(), 0.75 * times[-1]))
-        chosen = there[np.unique(np.linspace(0, len(there) - 1, 8).astype(int))]
+        steady = np.flatnonzero(times >= min(crowd.steady_from(), 0.75 * times[-1]))
+        chosen = steady[np.unique(np.linspace(0, len(steady) - 1, 8).astype(int))]
         return crowd, _coverage(crowd, times[chosen], Ts_world_camera[chosen])
 
     low, high = 0.0, 1.0
     best, reached = attempt(high)
     if reached < coverage - 0.02:
         raise ConfigError(
-            f"coverage is {coverage}, but the densest crowd in scene {staging.scene.name!r} hides {reached:.2f} of the "
-            "image; ask for less or take another scene"
+            f"coverage is {coverage}, but the densest crowd in scene {staging.scene.name!r} covers {reached:.2f} "
+            "of the image; request less or use another scene"
         )
     for _ in range(8):
         middle = (low + high) / 2

@@ -1,4 +1,4 @@
-"""Writing a synthetic recording as a folder in the layout of the TUM RGB-D benchmark, with the truth beside it."""
+"""Writer of synthetic recordings in the layout of the TUM RGB-D benchmark, with the ground truth."""
 
 import json
 from collections.abc import Callable
@@ -14,7 +14,8 @@ from dudmap import __version__
 from dudmap.errors import DatasetError
 from dudmap.synthetic.recording import SyntheticSequence
 
-PENDING = 8  # frames that may wait to be written
+PENDING = 8
+"""Largest number of frames waiting to be written."""
 
 
 def write_folder(
@@ -27,16 +28,16 @@ def write_folder(
 ) -> Path:
     """Render all frames into a folder.
 
-    It gets rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = moving), their lists rgb.txt,
-    depth.txt, mask.txt, associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (share of the image that
-    moves), movers.jsonl, scene.json, surface.ply (the static surface) and surface_observed.ply (what the camera saw
-    of it). When writing is interrupted, the lists name the frames that are complete.
+    The folder receives rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = dynamic), their
+    lists rgb.txt, depth.txt, mask.txt and associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (dynamic
+    share of the image), movers.jsonl, scene.json, surface.ply (the static surface) and surface_observed.ply (the part
+    of it that the camera saw). If writing is interrupted, the lists contain the complete frames.
 
     Args:
-        sequence: What to render.
-        out: The folder; it is made.
-        overwrite: Whether the folder may hold something already.
-        surface: Whether to write the two meshes.
+        sequence: The recording.
+        out: The folder; created if needed.
+        overwrite: Accept a folder that is not empty.
+        surface: Write the two meshes.
         progress: Called with the number of finished frames.
 
     Raises:

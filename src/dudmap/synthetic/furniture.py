@@ -1,4 +1,4 @@
-"""Walls, furniture and pictures that the built-in worlds are made of."""
+"""Walls, furniture and pictures of the built-in scenes."""
 
 import numpy as np
 
@@ -7,14 +7,13 @@ from dudmap.synthetic.scene import Material, Primitive, box, capsule, cylinder, 
 WOOD = Material("wood", (0.9, 0.9))
 DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
 METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
-BLACK = Material("denim", (1.0, 1.0), tint=(0.2, 0.2, 0.22))
 CARDBOARD = Material("cardboard", (1.6, 1.6))
 
 
 def shell(
     x: tuple[float, float], y: tuple[float, float], top: float, walls: Material, floor: Material
 ) -> list[Primitive]:
-    """Floor, ceiling and four walls, 0.2 m thick, around the free box."""
+    """Floor, ceiling and four walls, 0.2 m thick, around a box-shaped free space."""
     (x0, x1), (y0, y1), d = x, y, 0.2
     cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0 + 2 * d, y1 - y0 + 2 * d
     ceiling = Material("plaster", (0.4, 0.4), tint=(1.05, 1.05, 1.05))
@@ -40,7 +39,7 @@ def table(center: tuple[float, float], size: tuple[float, float, float], materia
 
 
 def chair(center: tuple[float, float], yaw: float, material: Material) -> list[Primitive]:
-    """Chair with a cushion, its back towards +y before it is turned by ``yaw`` degrees."""
+    """Chair with a cushion, its back towards +y before the rotation by ``yaw`` degrees."""
     parts = [
         box((0, 0, 0.45), (0.44, 0.44, 0.05), Material("plaid", (2.3, 2.3))),
         box((0, 0.2, 0.75), (0.42, 0.04, 0.3), material),
@@ -71,7 +70,7 @@ def poster(
 
 
 def shelf(x: float, y: float, width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
-    """Bookshelf standing at (x, y), open towards -y before it is turned by ``yaw``."""
+    """Bookshelf standing at (x, y), open towards -y before the rotation by ``yaw`` degrees."""
     height, depth = 0.42 * rows, 0.3
     parts = [
         box((-width / 2 + 0.01, 0, height / 2), (0.02, depth, height), WOOD),

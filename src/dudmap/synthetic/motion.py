@@ -1,15 +1,16 @@
-"""Smooth tracks over the floor, and what is derived from them."""
+"""Smooth paths over the floor."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-STEP = 0.01  # seconds between the samples of a track
+STEP = 0.01
+"""Sampling interval of a path, seconds."""
 
 
 def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]:
-    """Gaussian mean along axis 0 of samples STEP apart; the ends are held."""
+    """Gaussian smoothing along axis 0 of samples ``STEP`` apart, with constant continuation at the ends."""
     width = seconds / STEP
     if width < 0.5:
         return values
@@ -21,15 +22,15 @@ def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]
     return np.asarray(np.stack(columns, axis=1), dtype=np.float64).reshape(values.shape)
 
 
-class Track:
-    """Way over the floor through waypoints at given times, with rounded corners and gentle starts and stops.
+class FloorPath:
+    """Path over the floor through waypoints at given times, with rounded corners and gradual starts and stops.
 
     Args:
-        times: (K,) seconds, increasing; before the first and after the last the track stands still.
-        points: (K, 2) floor positions in metres.
-        smooth: Standard deviation in seconds of the rounding.
-        yaw: Heading in radians while nothing has moved yet; None takes the first direction of motion.
-        gaps: (from, to) spans in seconds in which the thing is not there.
+        times: (K,) increasing times of the waypoints, seconds; the path rests before the first and after the last.
+        points: (K, 2) floor positions, metres.
+        smooth: Standard deviation of the smoothing, seconds.
+        yaw: Heading before the first motion, radians; None takes the direction of the first motion.
+        gaps: Intervals (from, to) in which the object is absent, seconds.
     """
 
     def __init__(
@@ -45,7 +46,7 @@ class Track:
         stamps = np.arange(self._start, times[-1] + 1.0 + STEP, STEP)
         table = np.asarray(points, dtype=np.float64)
         raw = np.stack([np.interp(stamps, times, table[:, k]) for k in range(2)], axis=1)
-        # A jump inside a gap (leaving here, coming back there) must not be smeared into a motion.
+        # A jump inside a gap (absent here, present again there) must not be smoothed into a motion.
         inner = [0.5 * (a + b) for a, b in gaps if np.isfinite(a + b)]
         pieces = np.searchsorted(stamps, inner)
         pieces = pieces[(pieces > 0) & (pieces < len(stamps))]
@@ -65,7 +66,7 @@ class Track:
         self.yaws = smoothed(np.unwrap(np.append(filled, filled[-1:]))[:, None], 0.12)[:, 0]
 
     def at(self, t: float) -> tuple[NDArray[np.float64], float, float]:
-        """Position (2,), heading in radians and distance walked in metres at time ``t``."""
+        """Position (2,) in metres, heading in radians and covered distance in metres at time ``t``."""
         x = float(np.interp(t, self.stamps, self.positions[:, 0]))
         y = float(np.interp(t, self.stamps, self.positions[:, 1]))
         return (
@@ -75,7 +76,7 @@ class Track:
         )
 
     def present(self, t: float) -> bool:
-        """Whether the thing is there at time ``t``."""
+        """Whether the object exists at time ``t``."""
         return not any(a <= t < b for a, b in self.gaps)
 
 
@@ -88,12 +89,12 @@ def crossing(
     start_inside: bool = False,
     pause: float = 1.0,
     entry_speed: float = 1.2,
-) -> Track:
-    """Walk from one end of ``line`` to the other and, after a pause out of sight, back again, until ``duration``.
+) -> FloorPath:
+    """Path from one end of ``line`` to the other and, after a pause out of view, back again, until ``duration``.
 
-    The middle 40 % of the line are walked at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
-    also come into view. ``enter`` shifts the start so that 25 % of the line is reached at that time in seconds;
-    with ``start_inside`` the walk begins in the middle of the view.
+    The middle 40 % of the line are covered at ``speed``, the ends at ``max(speed, entry_speed)``, so that slow movers
+    also come into view. 25 % of the line are covered at the time ``enter`` in seconds; with ``start_inside`` the path
+    begins in the middle of the view.
     """
     a, b = np.asarray(line[0], float), np.asarray(line[1], float)
     length = float(np.linalg.norm(b - a))
@@ -113,10 +114,10 @@ def crossing(
             points.append(a + (share if ahead else 1 - share) * (b - a))
         begin = times[-1] + pause
         gaps.append((times[-1], begin))
-    return Track(times, [list(p) for p in points], smooth=0.1, gaps=gaps)
+    return FloorPath(times, [list(p) for p in points], smooth=0.1, gaps=gaps)
 
 
 def smooth_step(share: float) -> float:
-    """0 before 0, 1 after 1, and a rise with zero slope at both ends in between."""
+    """Cubic step: 0 below 0, 1 above 1, with zero slope at both ends."""
     x = min(max(share, 0.0), 1.0)
     return x * x * (3.0 - 2.0 * x)

@@ -1,4 +1,4 @@
-"""Things that move: walking people, boxes carried and put down, balls, balloons, creepers, doors."""
+"""Moving objects: walking people, carried boxes, balls, balloons, carts and doors."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -9,26 +9,27 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
 from dudmap.geometry import se3
-from dudmap.synthetic.motion import Track, crossing, smooth_step
+from dudmap.synthetic.motion import FloorPath, crossing, smooth_step
 from dudmap.synthetic.person import Figure
 from dudmap.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
 
 Matrix = NDArray[np.float64]
 Line = tuple[tuple[float, float], tuple[float, float]]
-MOVING_SPEED = 0.01  # m/s; slower than this is at rest
+MOVING_SPEED = 0.01
+"""Speed below which an object is at rest, m/s."""
 
 
 @dataclass(frozen=True, eq=False)
-class Mover:
-    """Something that moves as one (all limbs of a person are one mover).
+class SyntheticMover:
+    """A moving object; all limbs of a person are one mover.
 
     Attributes:
-        name: What it is.
+        name: Kind of object.
         primitives: Its solids, each in the frame of its part.
-        parts: Function of time giving T_world_part (P, 4, 4) for every solid.
-        reference: Function of time giving T_world_mover (4, 4), the frame whose origin's velocity is the mover's.
-        present: Function of time telling whether it exists.
-        settles: Whether it counts as static while it rests; people never do.
+        parts: Function of time that returns T_world_part (P, 4, 4) of every solid.
+        reference: Function of time that returns T_world_mover (4, 4), whose origin defines the velocity of the mover.
+        present: Function of time that returns whether the mover exists.
+        settles: Whether it counts as static while it is at rest; people never do.
     """
 
     name: str
@@ -39,12 +40,12 @@ class Mover:
     settles: bool = True
 
     def velocity(self, t: float) -> Matrix:
-        """Velocity (3,) in m/s, world frame, of the reference frame's origin."""
+        """Velocity (3,) of the origin of the reference frame, m/s, world frame."""
         h = 0.005
         return (self.reference(t + h)[:3, 3] - self.reference(t - h)[:3, 3]) / (2 * h)
 
     def top_speed(self, t: float, span: float) -> float:
-        """Greatest mean speed in m/s of any of the solids' bounding corners over ``span`` seconds around ``t``."""
+        """Largest mean speed of any bounding-box corner of the solids over ``span`` seconds around ``t``, m/s."""
         corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(1, 8, 3)
         bounds = np.array([p.bounds() for p in self.primitives])[:, None, :] * corners
         local = np.array([p.T_body_primitive for p in self.primitives])
@@ -57,14 +58,14 @@ class Mover:
 
 @dataclass(frozen=True)
 class Staging:
-    """What a mover needs to know.
+    """Conditions under which movers are built.
 
     Attributes:
-        scene: Where it moves.
-        rng: Chance.
-        speed: Wished speed in m/s, None for the mover's own.
-        duration: Seconds to fill.
-        start_dynamic: Whether it is in view, moving, at the first frame.
+        scene: Scene in which they move.
+        rng: Random number generator.
+        speed: Requested speed, m/s; None for the natural speed of each mover.
+        duration: Duration of the recording, seconds.
+        start_dynamic: Whether they are in view and moving in the first frame.
     """
 
     scene: Scene
@@ -74,27 +75,27 @@ class Staging:
     start_dynamic: bool
 
     def pace(self, natural: float) -> float:
-        """The wished speed, or ``natural`` (for people of life size) scaled to the scene."""
+        """Requested speed, else ``natural`` (m/s at life size) scaled to the scene."""
         return self.speed if self.speed is not None else natural * self.scene.mover_scale
 
 
 def person_on(
-    track: Track,
+    path: FloorPath,
     figure: Figure,
     ground: float,
     name: str = "person",
     carrying: Callable[[float], float] = lambda _: 0.0,
-) -> Mover:
-    """A person who walks a track; ``carrying`` tells how far the arms are lifted at a time, 0 to 1."""
+) -> SyntheticMover:
+    """Person walking along a path; ``carrying`` is a function of time for the lift of the arms in [0, 1]."""
 
     def reference(t: float) -> Matrix:
-        position, yaw, _ = track.at(t)
+        position, yaw, _ = path.at(t)
         return pose((*position, ground), float(np.degrees(yaw)))
 
     def parts(t: float) -> Matrix:
-        return figure.poses(reference(t), track.at(t)[2], carrying(t))
+        return figure.poses(reference(t), path.at(t)[2], carrying(t))
 
-    return Mover(name, figure.primitives, parts, reference, track.present, settles=False)
+    return SyntheticMover(name, figure.primitives, parts, reference, path.present, settles=False)
 
 
 def rigid(
@@ -102,13 +103,15 @@ def rigid(
     primitives: list[Primitive],
     reference: Callable[[float], Matrix],
     present: Callable[[float], bool] = lambda _: True,
-) -> Mover:
-    """A mover in one piece."""
-    return Mover(name, primitives, lambda t: np.tile(reference(t), (len(primitives), 1, 1)), reference, present)
+) -> SyntheticMover:
+    """Rigid mover."""
+    return SyntheticMover(
+        name, primitives, lambda t: np.tile(reference(t), (len(primitives), 1, 1)), reference, present
+    )
 
 
 def shifted(line: Line, shift: float, reverse: bool = False) -> Line:
-    """The line moved by ``shift`` metres to its left, turned round with ``reverse``."""
+    """Line shifted by ``shift`` metres to its left, and reversed with ``reverse``."""
     a, b = np.asarray(line[0]), np.asarray(line[1])
     normal = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
     (ax, ay), (bx, by) = (end + shift * normal for end in (a, b))
@@ -121,9 +124,9 @@ def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
     return Figure(staging.rng, outfit, size, 1.35 * float(np.clip(np.sqrt(speed / size / 1.2), 0.35, 1.2)))
 
 
-def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> Mover:
+def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
     scene, speed = staging.scene, staging.pace(1.2)
-    track = crossing(
+    path = crossing(
         shifted(scene.walk_line, shift * scene.mover_scale, reverse),
         speed,
         staging.duration,
@@ -131,15 +134,15 @@ def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: f
         start_inside=staging.start_dynamic,
         entry_speed=1.2 * scene.mover_scale,
     )
-    return person_on(track, _figure(staging, outfit, speed), scene.ground)
+    return person_on(path, _figure(staging, outfit, speed), scene.ground)
 
 
-def _people(staging: Staging) -> list[Mover]:
+def _people(staging: Staging) -> list[SyntheticMover]:
     return [_walker(staging, 1, 0.0, False, 0.0), _walker(staging, 2, 0.3, True, 0.6)]
 
 
-def _wanderer(staging: Staging) -> list[Mover]:
-    """A person who walks round and round in view and never leaves."""
+def _wanderer(staging: Staging) -> list[SyntheticMover]:
+    """Person who walks in circles and never leaves the view."""
     scene, speed = staging.scene, staging.pace(0.6)
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     along, middle = (b - a) / 2, (a + b) / 2
@@ -153,8 +156,8 @@ def _wanderer(staging: Staging) -> list[Mover]:
     walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
     times = walked / speed
     keep = times <= staging.duration + 2.0
-    track = Track(list(times[keep] - 1.5), loop[keep].tolist(), smooth=0.1)
-    return [person_on(track, _figure(staging, 3, speed), scene.ground)]
+    path = FloorPath(list(times[keep] - 1.5), loop[keep].tolist(), smooth=0.1)
+    return [person_on(path, _figure(staging, 3, speed), scene.ground)]
 
 
 CARTON = (0.36, 0.30, 0.28)
@@ -165,8 +168,8 @@ def _carton(size: float) -> list[Primitive]:
     return [box((0, 0, z / 2), (x, y, z), Material("cardboard", (1.9 / size, 1.9 / size)))]
 
 
-def _carrier(staging: Staging, put_down: bool) -> list[Mover]:
-    """A person brings a box, puts it down and leaves; or comes, takes it and leaves with it."""
+def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
+    """Person who brings a box, puts it down and leaves; or who enters, takes a box and leaves with it."""
     scene, speed, size = staging.scene, staging.pace(1.0), staging.scene.mover_scale
     a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
     spot = scene.rest[:2, 3]
@@ -179,15 +182,15 @@ def _carrier(staging: Staging, put_down: bool) -> list[Mover]:
     steps = [float(np.linalg.norm(q - p)) / speed for p, q in pairwise(way)]
     steps[2] = 1.6
     times = np.cumsum([0.0, *steps])
-    track = Track(list(times), [list(p) for p in way], smooth=0.15, gaps=[(float(times[-1]), np.inf)])
-    begin, end = float(times[2]) + 0.3, float(times[2]) + 1.3  # the box changes hands in between
+    path = FloorPath(list(times), [list(p) for p in way], smooth=0.15, gaps=[(float(times[-1]), np.inf)])
+    begin, end = float(times[2]) + 0.3, float(times[2]) + 1.3  # the box is moved between hands and floor
     yaw = float(np.degrees(np.arctan2(towards[1], towards[0])))
 
     def share(t: float) -> float:  # 0 in the hands, 1 on the floor
         done = smooth_step((t - begin) / (end - begin))
         return done if put_down else 1.0 - done
 
-    person = person_on(track, _figure(staging, 4, speed), scene.ground, carrying=lambda t: 1.0 - share(t))
+    person = person_on(path, _figure(staging, 4, speed), scene.ground, carrying=lambda t: 1.0 - share(t))
 
     def reference(t: float) -> Matrix:
         if share(t) >= 1.0:
@@ -204,27 +207,27 @@ def _carrier(staging: Staging, put_down: bool) -> list[Mover]:
     return [person, rigid("carried_box" if put_down else "removed_box", _carton(size), reference, present)]
 
 
-def _ball(staging: Staging) -> list[Mover]:
+def _ball(staging: Staging) -> list[SyntheticMover]:
     scene, size = staging.scene, staging.scene.mover_scale
     radius, speed = 0.2 * size, staging.pace(0.8)
-    track = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=speed)
+    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=speed)
 
     def reference(t: float) -> Matrix:
-        position, yaw, walked = track.at(t)
+        position, yaw, walked = path.at(t)
         rolled = pose((*position, scene.ground + radius), float(np.degrees(yaw)))
         return rolled @ pose(pitch=float(np.degrees(walked / radius)))
 
     skin = Material("checks", (1.5 / size, 1.5 / size), tint=(1.2, 0.7, 0.5))
-    return [rigid("ball", [ellipsoid((0, 0, 0), (radius,) * 3, skin)], reference, track.present)]
+    return [rigid("ball", [ellipsoid((0, 0, 0), (radius,) * 3, skin)], reference, path.present)]
 
 
-def _balloon(staging: Staging) -> list[Mover]:
+def _balloon(staging: Staging) -> list[SyntheticMover]:
     scene, size = staging.scene, staging.scene.mover_scale
     speed = staging.pace(0.4)
-    track = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=1.0)
+    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=1.0)
 
     def reference(t: float) -> Matrix:
-        position, _, _ = track.at(t)
+        position, _, _ = path.at(t)
         height = scene.ground + size * (1.35 + 0.15 * np.sin(1.7 * t))
         return pose((*position, height), 25 * np.sin(0.9 * t), 6 * np.sin(2.3 * t))
 
@@ -233,7 +236,7 @@ def _balloon(staging: Staging) -> list[Mover]:
         ellipsoid((0, 0, 0), (0.2 * size, 0.2 * size, 0.25 * size), skin),
         capsule((0, 0, -0.25 * size), (0, 0, -0.7 * size), 0.004 * size, Material("plain")),
     ]
-    return [rigid("balloon", solids, reference, track.present)]
+    return [rigid("balloon", solids, reference, path.present)]
 
 
 def _cart_solids(size: float) -> list[Primitive]:
@@ -247,47 +250,47 @@ def _cart_solids(size: float) -> list[Primitive]:
     return [body, *wheels]
 
 
-def _cart(track: Track, scene: Scene, name: str) -> Mover:
+def _cart(path: FloorPath, scene: Scene, name: str) -> SyntheticMover:
     def reference(t: float) -> Matrix:
-        position, yaw, _ = track.at(t)
+        position, yaw, _ = path.at(t)
         return pose((*position, scene.ground), float(np.degrees(yaw)))
 
-    return rigid(name, _cart_solids(scene.mover_scale), reference, track.present)
+    return rigid(name, _cart_solids(scene.mover_scale), reference, path.present)
 
 
-def _creeper(staging: Staging) -> list[Mover]:
-    """A cart that rolls in briskly and then creeps through the view at 5 cm/s."""
+def _creeper(staging: Staging) -> list[SyntheticMover]:
+    """Cart that enters quickly and then crosses the view at 5 cm/s."""
     speed = staging.pace(0.05)
     quick = max(speed, 1.0 * staging.scene.mover_scale)
-    track = crossing(
+    path = crossing(
         staging.scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=quick
     )
-    return [_cart(track, staging.scene, "creeper")]
+    return [_cart(path, staging.scene, "creeper")]
 
 
-def _stopping(staging: Staging) -> list[Mover]:
-    """A cart that rolls in and stops in view for good."""
+def _stopping(staging: Staging) -> list[SyntheticMover]:
+    """Cart that enters and stops in view permanently."""
     scene, speed = staging.scene, staging.pace(0.8)
     a, spot = np.asarray(scene.walk_line[0]), scene.rest[:2, 3]
     if staging.start_dynamic:
         a = spot + 0.5 * (a - spot)
     begin = 0.0 if staging.start_dynamic else 0.5
     end = begin + float(np.linalg.norm(spot - a)) / speed
-    return [_cart(Track([begin, end], [list(a), list(spot)], smooth=0.2), scene, "stopping_cart")]
+    return [_cart(FloorPath([begin, end], [list(a), list(spot)], smooth=0.2), scene, "stopping_cart")]
 
 
-def _starting(staging: Staging) -> list[Mover]:
-    """A cart that stands in view like furniture and rolls away half-way through."""
+def _starting(staging: Staging) -> list[SyntheticMover]:
+    """Cart that stands in view and leaves in the second half."""
     scene, speed = staging.scene, staging.pace(0.8)
     b, spot = np.asarray(scene.walk_line[1]), scene.rest[:2, 3]
     begin = 0.4 if staging.start_dynamic else 0.5 * staging.duration
     end = begin + float(np.linalg.norm(b - spot)) / speed
-    track = Track([begin, end], [list(spot), list(b)], smooth=0.2, gaps=[(end, np.inf)])
-    return [_cart(track, scene, "starting_cart")]
+    path = FloorPath([begin, end], [list(spot), list(b)], smooth=0.2, gaps=[(end, np.inf)])
+    return [_cart(path, scene, "starting_cart")]
 
 
-def _door(staging: Staging) -> list[Mover]:
-    """A door leaf that opens, stays and closes again."""
+def _door(staging: Staging) -> list[SyntheticMover]:
+    """Door leaf that opens, rests and closes again."""
     scene, size = staging.scene, staging.scene.mover_scale
     width, height, angle = 0.8 * size, 1.95 * size, np.radians(95.0)
     swing = angle * width / staging.pace(0.5)
@@ -310,7 +313,7 @@ def _door(staging: Staging) -> list[Mover]:
     return [rigid("door", solids, reference)]
 
 
-MOVERS: dict[str, Callable[[Staging], list[Mover]]] = {
+MOVERS: dict[str, Callable[[Staging], list[SyntheticMover]]] = {
     "person": lambda staging: [_walker(staging, 0, 0.0, False, 0.0)],
     "people": _people,
     "wanderer": _wanderer,
@@ -325,13 +328,13 @@ MOVERS: dict[str, Callable[[Staging], list[Mover]]] = {
 }
 
 
-def build_movers(names: tuple[str, ...], staging: Staging) -> list[Mover]:
+def build_movers(names: tuple[str, ...], staging: Staging) -> list[SyntheticMover]:
     """Movers by name.
 
     Raises:
         ConfigError: A name is unknown.
     """
-    movers: list[Mover] = []
+    movers: list[SyntheticMover] = []
     for name in names:
         if name not in MOVERS:
             raise ConfigError(f"unknown mover {name!r}; known movers: {', '.join(MOVERS)}")

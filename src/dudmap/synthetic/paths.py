@@ -1,4 +1,4 @@
-"""Camera paths: built-in ones, and recorded trajectories placed rigidly into a scene."""
+"""Camera paths: built-in ones, and recorded trajectories placed in a scene by a rigid motion."""
 
 from collections.abc import Callable
 from itertools import pairwise
@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.synthetic.movers import Mover
+from dudmap.synthetic.movers import SyntheticMover
 from dudmap.synthetic.scene import Scene, look_at
 
 Array = NDArray[np.float64]
 
 
 def _wander(rng: np.random.Generator, times: Array, speed: float, quick: float = 1.0) -> Array:
-    """Smooth wandering (N, 3) around zero: slow sines per axis, mean speed ``speed`` in units per second.
+    """Smooth random motion (N, 3) around zero: a sum of slow sines per axis, mean speed ``speed`` in units per second.
 
-    ``quick`` multiplies the frequencies: the same speed then reaches less far.
+    ``quick`` multiplies the frequencies; at the same speed the amplitude is then smaller.
     """
     dense = np.arange(0.0, 30.0, 0.02)
     frequency = quick * rng.uniform([0.08, 0.18, 0.3], [0.16, 0.28, 0.45], (3, 3))
@@ -34,7 +34,7 @@ def _wander(rng: np.random.Generator, times: Array, speed: float, quick: float =
 
 
 def _tremor(rng: np.random.Generator, times: Array, size: float) -> Array:
-    """Trembling of a hand (N, 3): sines between 4 and 11 Hz of the given root mean square per axis."""
+    """Hand tremor (N, 3): sines between 4 and 11 Hz with the given root mean square per axis."""
     frequency = rng.uniform(4.0, 11.0, (3, 4))
     phase = rng.uniform(0, 2 * np.pi, (3, 4))
     return size * np.sin(2 * np.pi * frequency * times[:, None, None] + phase).sum(axis=2) / np.sqrt(2.0)
@@ -46,7 +46,7 @@ def _aimed(scene: Scene, positions: Array, targets: Array) -> Array:
 
 
 def _shaken(Ts: Array, rotations: Array) -> Array:
-    """Poses turned in the camera frame by rotation vectors (N, 3)."""
+    """Poses rotated in the camera frame by rotation vectors (N, 3)."""
     out = Ts.copy()
     for T, vector in zip(out, rotations, strict=True):
         T[:3, :3] = T[:3, :3] @ se3.exp(np.concatenate([np.zeros(3), vector]))[:3, :3]
@@ -54,7 +54,7 @@ def _shaken(Ts: Array, rotations: Array) -> Array:
 
 
 def _within(scene: Scene, shift: Array) -> Array:
-    """Shifts (N, 3) from home, softly limited to the scene's free space."""
+    """Shifts (N, 3) from the home position, limited to the free space of the scene by tanh."""
     low, high = (np.asarray(corner) - scene.home[:3, 3] for corner in scene.space)
     return np.where(shift > 0, high * np.tanh(shift / high), low * np.tanh(shift / low))
 
@@ -68,7 +68,7 @@ def handheld(
     tremor: float = 1.0,
     quick: float = 1.0,
 ) -> Array:
-    """A hand holds the camera towards the target: mean speed in m/s (life size), mean turn rate in degrees/s."""
+    """Hand-held camera aimed at the target: mean speed in m/s (at life size), mean rotation rate in degrees/s."""
     shift = _within(scene, _wander(rng, times, speed * max(scene.mover_scale, 0.3), quick))
     shift += _tremor(rng, times, 0.0005 * tremor * scene.mover_scale)
     Ts = _aimed(scene, scene.home[:3, 3] + shift, np.tile(scene.target, (len(times), 1)))
@@ -84,7 +84,7 @@ def _still(scene: Scene, times: Array) -> Array:
 
 
 def _pan(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Turn to and fro about the vertical, 40 degrees to either side at 20 degrees per second on average."""
+    """Rotation about the vertical, 40 degrees to either side at 20 degrees per second on average."""
     offset = scene.target - scene.home[:3, 3]
     angle = np.radians(40.0) * np.sin(2 * np.pi * times / 8.0)
     c, s = np.cos(angle), np.sin(angle)
@@ -94,7 +94,7 @@ def _pan(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
 
 
 def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Go round the target on an arc of 30 degrees to either side."""
+    """Motion around the target on an arc of 30 degrees to either side."""
     target = np.asarray(scene.target)
     offset = scene.home[:3, 3] - target
     angle = np.radians(30.0) * np.sin(2 * np.pi * times / 20.0)
@@ -107,14 +107,14 @@ def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
 
 
 def _dolly(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Walk towards the target and back, 0.3 m/s at most."""
+    """Motion towards the target and back, at most 0.3 m/s."""
     ahead = scene.home[:3, 2] * scene.mover_scale * 0.5 * np.sin(0.6 * times)[:, None]
     eyes = scene.home[:3, 3] + _within(scene, ahead + _wander(rng, times, 0.05 * scene.mover_scale))
     return _shaken(_aimed(scene, eyes, np.tile(scene.target, (len(times), 1))), _tremor(rng, times, np.radians(0.06)))
 
 
 def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Turn once round about the vertical and 45 degrees on, so that the end shows the start again."""
+    """Rotation by 405 degrees about the vertical, so that the last frames show the first view again."""
     share = times / max(times[-1], 1e-9)
     angle = np.radians(405.0) * share
     offset = scene.target - scene.home[:3, 3]
@@ -124,8 +124,8 @@ def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     return _shaken(_aimed(scene, eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
 
 
-def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: Mover) -> Array:
-    """Keep a mover in the middle of the image, with the delay of a hand; look at the target while it is away."""
+def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: SyntheticMover) -> Array:
+    """Camera that follows a mover with the delay of a hand, and aims at the target while the mover is absent."""
 
     def aim(t: float) -> Array:
         if not mover.present(t):
@@ -151,11 +151,11 @@ PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {
 FOLLOW = "follow"
 
 
-def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers: list[Mover]) -> Array:
-    """Poses Ts_world_camera (N, 4, 4) of a built-in path or of a trajectory file, at ``times`` from 0 on.
+def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers: list[SyntheticMover]) -> Array:
+    """Poses Ts_world_camera (N, 4, 4) of a built-in path or a trajectory file at ``times`` (N,), which start at 0.
 
     Raises:
-        ConfigError: There is neither a path nor a file of this name, or the file does not fit.
+        ConfigError: There is neither a path nor a file of this name, or the trajectory does not fit the scene.
     """
     rng = np.random.default_rng([seed, 2])
     if str(path) == FOLLOW:
@@ -171,13 +171,13 @@ def camera_poses(path: str | Path, scene: Scene, times: Array, seed: int, movers
 
 
 def placed(trajectory: Trajectory, scene: Scene, times: Array, name: str) -> Array:
-    """A recorded trajectory, resampled at ``times`` and moved rigidly as a whole into the scene.
+    """Recorded trajectory, resampled at ``times`` and placed in the scene by a rigid motion.
 
-    The mean orientation becomes the home pose's; the middle of the positions comes as close to home as it can while
-    every position stays in the scene's free space and clear of everything solid.
+    The mean orientation becomes that of the home pose. The centre of the positions is placed as close to the home
+    position as possible, such that all positions are in the free space of the scene and clear of its solids.
 
     Raises:
-        ConfigError: The trajectory is too short in time or too large for the scene.
+        ConfigError: The trajectory is too short or too large for the scene.
     """
     start, end = trajectory.timestamps[0], trajectory.timestamps[-1]
     if times[-1] > end - start + 1e-6:

@@ -1,4 +1,4 @@
-"""An articulated, walking person made of capsules, ellipsoids and boxes."""
+"""Articulated model of a walking person made of capsules, ellipsoids and boxes."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,11 @@ OUTFITS = (
 
 
 class Figure:
-    """Body of a person of 1.72 m times ``size``; faces +x, stands on z = 0.
+    """Person 1.72 m tall times ``size``, facing +x and standing on z = 0.
 
     Attributes:
         primitives: The solids, each in the frame of its limb.
-        limbs: (P,) limb of each solid.
+        limbs: (P,) number of the limb of each solid.
     """
 
     def __init__(self, rng: np.random.Generator, outfit: int, size: float = 1.0, stride: float = 1.35) -> None:

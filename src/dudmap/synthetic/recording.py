@@ -1,4 +1,4 @@
-"""A rendered recording: frames, true poses, masks, movers and surface."""
+"""Synthetic recording: rendered frames with true poses, masks, movers and surface."""
 
 from collections import OrderedDict
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.crowd import crowd_of
-from dudmap.synthetic.movers import MOVING_SPEED, Mover, Staging, build_movers
+from dudmap.synthetic.movers import MOVING_SPEED, Staging, SyntheticMover, build_movers
 from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.rooms import build_scene
@@ -25,18 +25,19 @@ from dudmap.synthetic.sensors import Sensor, SensorModel
 from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 
-NEAREST, FARTHEST = 0.3, 6.0  # metres; what counts as seen by an ideal sensor
-DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+NEAREST, FARTHEST = 0.3, 6.0
+"""Range of an ideal sensor, for the observed part of the surface, metres."""
+DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480, depth_scale=5000.0)
 
 
 class MoverState(NamedTuple):
-    """A mover at the time of one frame.
+    """State of a mover in one frame.
 
     Attributes:
-        id: Number from 1 on, the same in every frame.
+        id: Identity, from 1 on, the same in every frame.
         T_world_mover: (4, 4) pose.
         velocity: (3,) m/s, world frame.
-        name: What it is.
+        name: Kind of object.
         moving: Whether it counts as dynamic in this frame.
     """
 
@@ -48,21 +49,21 @@ class MoverState(NamedTuple):
 
 
 class SyntheticSequence:
-    """Sequence whose frames are rendered when asked for; ``sequence[i]`` is always the same frame.
+    """Sequence whose frames are rendered on access; ``sequence[i]`` always returns the same frame.
 
     Attributes:
-        name: Scene and movers.
+        name: Names of scene and movers.
         camera: Intrinsics.
         timestamps: (N,) seconds.
         ground_truth: Exact camera poses.
-        parameters: Everything it was made from.
-        scene: The static world.
+        parameters: Arguments from which it was made.
+        scene: The static scene.
     """
 
     def __init__(
         self,
         scene: Scene,
-        movers: list[Mover],
+        movers: list[SyntheticMover],
         ground_truth: Trajectory,
         camera: Camera,
         *,
@@ -97,10 +98,11 @@ class SyntheticSequence:
         return self._both(index)[0]
 
     def mask(self, index: int) -> NDArray[np.bool_]:
-        """True dynamic mask (H, W): the visible surface belongs to something that moves in this frame.
+        """True dynamic mask (H, W): pixels that show a mover that moves in this frame.
 
-        A person always counts as moving. Anything else does while any point of it is faster than 0.01 m/s on average
-        over the frame's interval (half a frame before to half a frame after). A mover is labelled as a whole.
+        A person always counts as moving. Any other mover moves while the mean speed of any of its points over the
+        interval of the frame (half a frame before to half a frame after) exceeds 0.01 m/s. A mover is labelled as a
+        whole.
         """
         index = self._number(index)
         if index in self._kept:
@@ -108,20 +110,20 @@ class SyntheticSequence:
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth, colour and visible primitive of a frame, without any sensor."""
+        """Ideal depth, colour and visible primitive of a frame, without sensor noise."""
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
-        """Ideal depth (H, W) in metres of a frame, 0 where nothing is."""
+        """Ideal depth (H, W) of a frame in metres, 0 where the ray hits nothing."""
         return self._render(self._number(index), with_color=False).depth
 
     @property
     def sensor_model(self) -> SensorModel | None:
-        """What the sensor does to the images, None for an ideal one."""
+        """Noise model of the sensor, None for an ideal one."""
         return self._sensor.model
 
     def movers(self, index: int) -> list[MoverState]:
-        """The movers that exist in a frame, visible or not."""
+        """Movers that exist in a frame, visible or not."""
         index = self._number(index)
         t = float(self.timestamps[index])
         return [
@@ -131,7 +133,7 @@ class SyntheticSequence:
         ]
 
     def static_twin(self) -> "SyntheticSequence":
-        """The same camera path and sensor noise without any mover."""
+        """Recording with the same camera path and sensor noise, but without movers."""
         return SyntheticSequence(
             self.scene,
             [],
@@ -146,19 +148,19 @@ class SyntheticSequence:
         )
 
     def mover_numbers(self, index: int) -> NDArray[np.int16]:
-        """Number (H, W) of the mover that a pixel shows, 0 for none; movers at rest are shown too."""
+        """Identity (H, W) of the mover that a pixel shows, 0 for none; includes movers at rest."""
         table = np.concatenate([np.zeros(len(self.scene.primitives), dtype=np.int16), self._owner + 1, [0]])
         return table.astype(np.int16)[self._render(self._number(index), with_color=False).primitive]
 
     def surface(self, observed: bool = False, views: int = 3) -> Mesh:
-        """True static surface in the world frame, as it is at the end of the sequence.
+        """True static surface in the world frame at the end of the sequence.
 
-        It holds everything static, and the movers that have been at rest for the last second. Triangles inside or
-        between solids are left out.
+        It includes the movers that were at rest during the last second. Triangles inside or between solids are left
+        out.
 
         Args:
-            observed: Only what the camera saw in this sequence (past the movers, within the sensor's range, not at a
-                grazing angle) in at least ``views`` of up to 120 frames spread evenly.
+            observed: Only the part that the camera saw (not occluded by movers, within the range of the sensor, not at
+                a grazing angle) in at least ``views`` of up to 120 evenly spread frames.
             views: See ``observed``.
         """
         end = float(self.timestamps[-1])
@@ -185,7 +187,7 @@ class SyntheticSequence:
             raise FrameError(f"frame {index} does not exist; the sequence has {len(self)} frames")
         return number
 
-    def _moves(self, mover: Mover, t: float) -> bool:
+    def _moves(self, mover: SyntheticMover, t: float) -> bool:
         return not mover.settles or mover.top_speed(t, 1.0 / self._fps) > MOVING_SPEED
 
     def _both(self, index: int) -> tuple[Frame, NDArray[np.bool_]]:
@@ -253,28 +255,28 @@ def sequence(
     motion_blur: float = 0.0,
     exposure_change: float = 0.0,
 ) -> SyntheticSequence:
-    """Make a synthetic recording; frames are rendered when they are asked for.
+    """Set up a synthetic recording; its frames are rendered on access.
 
     Args:
-        scene: Name of a world (``names()["scenes"]``).
-        movers: Names of the things that move, () for none; None for one person, or what the situation needs.
-        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or the
-            situation's.
+        scene: Name of a scene (``names()["scenes"]``).
+        movers: Names of the movers, () for none; None for one person, or those of the situation.
+        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or that of the
+            situation.
         frames: Number of frames.
         fps: Frames per second.
         noise: Sensor: ``kinect``, ``realsense`` or ``none`` (exact depth).
-        speed: Speed of the movers in m/s; None takes what is natural for each.
-        coverage: Share of the image, 0 to 0.95, that a stream of people hides on average; it replaces the movers,
-            0 means nobody.
+        speed: Speed of the movers in m/s; None for the natural speed of each.
+        coverage: Share of the image, 0 to 0.95, that a stream of people covers on average; it replaces the movers,
+            and 0 means no movers.
         start_dynamic: Whether the movers are in view from the first frame on.
         situation: Name of a difficult situation (``names()["situations"]``).
-        seed: Chooses path, looks and noise; the same seed gives the same frames.
+        seed: Seed of path, appearance and noise; equal seeds give equal frames.
         camera: Intrinsics; None for 640x480 with 525 px focal length.
-        motion_blur: Share of the frame interval during which the shutter is open.
-        exposure_change: Relative amplitude of a slow change of brightness.
+        motion_blur: Exposure time as a share of the frame interval.
+        exposure_change: Relative amplitude of a slow oscillation of the exposure.
 
     Raises:
-        ConfigError: An argument is not acceptable; the message names the known values.
+        ConfigError: An argument is invalid; the message names the known values.
     """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)
@@ -291,7 +293,7 @@ def sequence(
     staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
     if coverage is not None and coverage > 0:
         if movers is not None and set(names) - {"person", "people"}:
-            raise ConfigError(f"coverage is made of people, but the movers are {', '.join(names)}; drop one of the two")
+            raise ConfigError(f"coverage stands for people, but the movers are {', '.join(names)}; drop one of the two")
         names = ("crowd",)
         alone = (
             PATHS["still"](world, staging.rng, times) if path == FOLLOW else camera_poses(path, world, times, seed, [])

@@ -1,4 +1,4 @@
-"""From a scene, its movers and a camera pose to exact depth, colour and the visible primitive of every pixel."""
+"""Ray tracing renderer: exact depth, colour and visible primitive of every pixel."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,16 +16,16 @@ from dudmap.synthetic.textures import TEXTURES, build_atlas
 
 
 def over_rows(count: int, work: Callable[..., None], *arguments: object) -> None:
-    """Run the kernel ``work(row_from, row_to, *arguments)`` over all rows, in bands on all threads."""
+    """Run the kernel ``work(row_from, row_to, *arguments)`` over ``count`` rows, in bands on all threads."""
     run_bands(lambda start, stop: work(start, stop, *arguments), bands(count, max(count // 10, 1)))
 
 
 @dataclass(frozen=True, eq=False)
 class Rendering:
-    """What an ideal camera sees.
+    """Image of an ideal camera.
 
     Attributes:
-        depth: (H, W) float32, metres, 0 where nothing is.
+        depth: (H, W) float32, metres, 0 where the ray hits nothing.
         primitive: (H, W) int16, number of the visible primitive, -1 for none.
         color: (H, W, 3) float32 in 0..255, or None.
         cosine: (H, W) float32, cosine of the angle between the ray and the surface normal, or None.
@@ -38,10 +38,10 @@ class Rendering:
 
 
 class Renderer:
-    """Renders one set of primitives (static first, then those of the movers) at any poses.
+    """Renderer of a fixed set of primitives (static ones first, then those of the movers) at any poses.
 
     Args:
-        scene: Light and static world.
+        scene: Static primitives and lights.
         primitives: All primitives; those from ``len(scene.primitives)`` on belong to movers.
 
     Attributes:
@@ -69,16 +69,16 @@ class Renderer:
         gain: float = 1.0,
         vignette: float = 0.12,
     ) -> Rendering:
-        """Image of the world.
+        """Render an image.
 
         Args:
             camera: Intrinsics; distortion is ignored.
             T_world_camera: (4, 4) pose.
             Ts_world_mover: (M, 4, 4) poses of the movers' primitives.
-            present: (M,) which of them exist at this moment.
-            with_color: Also shade.
-            gain: Exposure factor on the colour.
-            vignette: Brightness falls with 1 / (1 + vignette r^2), r = distance from the axis at unit depth.
+            present: (M,) which of them exist in this image.
+            with_color: Also compute the colour.
+            gain: Exposure factor of the colour.
+            vignette: The brightness falls as 1 / (1 + vignette r^2), r = distance from the optical axis at unit depth.
         """
         T_camera_world = se3.inverse(T_world_camera)
         Ts = T_camera_world @ np.concatenate([self._static, Ts_world_mover])
@@ -106,7 +106,7 @@ class Renderer:
     def _bin(
         self, camera: Camera, Ts: NDArray[np.float64], exists: NDArray[np.bool_]
     ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.bool_], NDArray[np.bool_]]:
-        """Front-to-back order, smallest depths, and the tile columns and rows that each primitive's box touches.
+        """Front-to-back order, smallest depths, and the tile columns and rows that the box of each primitive covers.
 
         A box is left of the plane x = s z through the camera centre if its support function in the plane's normal
         is negative; for tile columns and rows these planes are shared, so the test costs P (C + R).

@@ -1,4 +1,4 @@
-"""The built-in static worlds; z is up, metres."""
+"""Built-in static scenes; z is up, lengths in metres."""
 
 from collections.abc import Callable
 from dataclasses import replace

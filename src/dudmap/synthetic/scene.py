@@ -1,4 +1,4 @@
-"""Primitives, materials and scenes: what there is, where it stands and what it looks like."""
+"""Primitives, materials, lights and scenes."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,20 +9,20 @@ from numpy.typing import NDArray
 Matrix = NDArray[np.float64]
 Vector = Sequence[float] | NDArray[np.float64]
 
-BOX, ELLIPSOID, CAPSULE, CYLINDER, TORUS = range(5)  # the numbers that kernels.scenes uses
+BOX, ELLIPSOID, CAPSULE, CYLINDER, TORUS = range(5)  # as in kernels.raytracing
 
 
 @dataclass(frozen=True)
 class Material:
-    """Look of a surface.
+    """Appearance of a surface.
 
     Attributes:
         texture: Name of a texture (``textures.TEXTURES``).
         scale: Repeats of the texture per metre, across and down.
         offset: Shift of the texture in repeats.
         tint: Factors on red, green, blue.
-        variation: Share by which large clouds of light and dark change the brightness.
-        glow: Light given off, added to the light received (screens, lamps).
+        variation: Relative amplitude of a low-frequency variation of the brightness.
+        glow: Emitted light, added to the reflected light (screens, lamps).
         faces: Whether the faces of a box show different parts of the texture.
     """
 
@@ -35,7 +35,7 @@ class Material:
     faces: bool = True
 
     def row(self) -> list[float]:
-        """The ten numbers that the shading kernel reads."""
+        """Parameters of the material in the order of the shading kernel (10 numbers)."""
         return [*self.scale, *self.offset, *self.tint, self.variation, self.glow, float(self.faces)]
 
 
@@ -47,8 +47,8 @@ class Primitive:
         kind: BOX, ELLIPSOID, CAPSULE and CYLINDER (axis z), TORUS (around z).
         half: Half extents in metres: box hx hy hz; ellipsoid semi-axes; capsule and cylinder (radius, radius, half
             length of the axis); torus (ring radius, ring radius, tube radius).
-        T_body_primitive: (4, 4) pose in the body (for static things the body is the world).
-        material: Its look.
+        T_body_primitive: (4, 4) pose in the frame of the body; for static solids the body is the world.
+        material: Appearance.
     """
 
     kind: int
@@ -57,7 +57,7 @@ class Primitive:
     material: Material
 
     def bounds(self) -> NDArray[np.float64]:
-        """Half extents (3,) of the box around the primitive, in its own frame."""
+        """Half extents (3,) of the bounding box in the frame of the primitive."""
         hx, hy, hz = self.half
         if self.kind == CAPSULE:
             return np.array([hx, hy, hz + hx])
@@ -66,13 +66,13 @@ class Primitive:
         return np.array([hx, hy, hz])
 
     def moved(self, T: Matrix) -> "Primitive":
-        """The same solid after the rigid motion ``T`` (4, 4)."""
+        """Primitive after the rigid motion ``T`` (4, 4)."""
         return replace(self, T_body_primitive=T @ self.T_body_primitive)
 
     def distance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Signed distance (N,) in metres of points (N, 3) in the body frame; negative inside.
 
-        Exact but for the ellipsoid, where it is a first-order estimate with the right sign.
+        Exact except for the ellipsoid, where it is a first-order approximation with the correct sign.
         """
         R, t = self.T_body_primitive[:3, :3], self.T_body_primitive[:3, 3]
         local = (points - t) @ R
@@ -95,7 +95,7 @@ class Primitive:
 
 
 def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, roll: float = 0.0) -> Matrix:
-    """Rigid motion (4, 4): ``position`` in metres, angles in degrees, turned by roll (x), pitch (y), then yaw (z)."""
+    """Rigid motion (4, 4): ``position`` in metres; rotation by roll (x), pitch (y), then yaw (z), in degrees."""
     (ca, cb, cc), (sa, sb, sc) = (f(np.radians([yaw, pitch, roll])) for f in (np.cos, np.sin))
     T = np.eye(4)
     T[:3, :3] = (
@@ -108,7 +108,7 @@ def pose(position: Vector = (0, 0, 0), yaw: float = 0.0, pitch: float = 0.0, rol
 
 
 def look_at(eye: Vector, target: Vector, roll: float = 0.0) -> Matrix:
-    """Camera pose T_world_camera (4, 4) at ``eye`` looking at ``target``, world z up, turned by ``roll`` degrees."""
+    """Camera pose T_world_camera (4, 4) at ``eye``, aimed at ``target``, world z up, rolled by ``roll`` degrees."""
     forward = np.asarray(target, float) - np.asarray(eye, float)
     forward /= np.linalg.norm(forward)
     right = np.cross(forward, [0.0, 0.0, 1.0])
@@ -122,7 +122,7 @@ def look_at(eye: Vector, target: Vector, roll: float = 0.0) -> Matrix:
 
 
 def box(center: Vector, size: Vector, material: Material, yaw: float = 0.0, pitch: float = 0.0) -> Primitive:
-    """Box of the given full size (3,) around ``center``."""
+    """Box of full extents ``size`` (3,) around ``center``."""
     x, y, z = (float(s) / 2 for s in size)
     return Primitive(BOX, (x, y, z), pose(center, yaw, pitch), material)
 
@@ -146,7 +146,7 @@ def _along(start: Vector, end: Vector) -> tuple[Matrix, float]:
 
 
 def capsule(start: Vector, end: Vector, radius: float, material: Material) -> Primitive:
-    """All points within ``radius`` of the segment from ``start`` to ``end``."""
+    """Capsule: all points within ``radius`` of the segment from ``start`` to ``end``."""
     T, length = _along(start, end)
     return Primitive(CAPSULE, (radius, radius, length / 2), T, material)
 
@@ -158,7 +158,7 @@ def cylinder(start: Vector, end: Vector, radius: float, material: Material) -> P
 
 
 def torus(center: Vector, axis: Vector, ring: float, tube: float, material: Material) -> Primitive:
-    """Ring of radius ``ring`` around ``axis``, with a tube of radius ``tube``."""
+    """Torus of ring radius ``ring`` around ``axis`` and tube radius ``tube``."""
     T, _ = _along(center, np.asarray(center, float) + np.asarray(axis, float))
     T[:3, 3] = center
     return Primitive(TORUS, (ring, ring, tube), T, material)
@@ -166,7 +166,7 @@ def torus(center: Vector, axis: Vector, ring: float, tube: float, material: Mate
 
 @dataclass(frozen=True)
 class Light:
-    """Point light: position (world, m), strength, and fall-off per square metre."""
+    """Point light: position (world frame, metres), strength, and fall-off per square metre."""
 
     position: tuple[float, float, float]
     strength: float = 0.6
@@ -175,24 +175,24 @@ class Light:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A static world with the places that camera paths and movers need; z is up, the floor is z = 0.
+    """Static scene with the places that camera paths and movers need; z is up, the floor is z = 0.
 
     Attributes:
-        name: Its name.
-        primitives: The static solids, in the world frame.
-        home: Middle pose T_world_camera (4, 4) of the built-in camera paths.
-        target: Point (world) that the camera looks at on the whole.
-        space: ((3,), (3,)) corners of the free box in which a camera may be.
-        extent: ((3,), (3,)) corners of the free world; surfaces outside are nobody's business.
+        name: Name of the scene.
+        primitives: Static solids in the world frame.
+        home: Central pose T_world_camera (4, 4) of the built-in camera paths.
+        target: Point (world frame) at which the camera is aimed.
+        space: ((3,), (3,)) corners of the box in which the camera may move.
+        extent: ((3,), (3,)) corners of the scene; surfaces outside are not part of the reference surface.
         walk_line: Two floor points; walkers cross the view from the first to the second.
-        rest: Pose T_world_body (4, 4) of the place where boxes are put down or taken away (middle of the bottom).
-        hinge: Pose of a door's hinge at the ground; the closed door leaf runs along +x of it and opens against +y.
+        rest: Pose T_world_body (4, 4) at which boxes are put down or taken away (centre of the bottom face).
+        hinge: Pose of a door hinge at the floor; the closed leaf extends along its +x axis and opens against +y.
         lights: Point lights.
         ambient: Hemisphere light.
-        sky: Colour (0..1) where nothing is.
-        detail: Edge length in metres of the triangles of the reference surface.
-        mover_scale: Factor on the size of movers (small worlds such as a desk have small movers).
-        ground: Height in metres of what the movers stand on.
+        sky: Colour (0..1) of rays that hit nothing.
+        detail: Edge length of the triangles of the reference surface, metres.
+        mover_scale: Factor on the size of movers (a small scene such as a desk has small movers).
+        ground: Height on which the movers stand, metres.
     """
 
     name: str

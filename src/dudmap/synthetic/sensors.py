@@ -1,4 +1,4 @@
-"""Depth and colour sensors: what is lost and blurred between the world and the images."""
+"""Noise models of depth and colour sensors."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,20 +15,20 @@ NOISE_SIZE = 1024
 
 @dataclass(frozen=True)
 class SensorModel:
-    """A sensor that measures disparity ``d = fx b / z`` and errs in it, so that sigma_z = sigma z^2 / (fx b) (3.91).
+    """Sensor with noise in the disparity ``d = fx b / z``, so that sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
 
     Attributes:
-        baseline: Metres between camera and projector (or second camera), which stands to the right.
-        depth_noise: Standard deviation in metres at 1 m, with the rounding to ``step`` included.
-        step: Quantum of the disparity in pixels.
-        lateral: Standard deviation in pixels of the sideways jitter of a reading.
-        nearest, fade, farthest: Metres; no reading outside, ever fewer between fade and farthest.
-        fatten: Pixels by which near surfaces grow sideways (window matching).
-        grazing: Cosine of incidence below which readings get lost.
+        baseline: Distance from the camera to the projector or second camera on its right, metres.
+        depth_noise: Standard deviation of the depth at 1 m including the quantisation by ``step``, metres.
+        step: Quantisation step of the disparity, pixels.
+        lateral: Standard deviation of the lateral noise, pixels.
+        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
+        fatten: Width by which near surfaces are dilated (foreground fattening of window matching), pixels.
+        grazing: Cosine of the angle of incidence below which readings are lost.
         edge_loss: Share of readings lost on the far side of a depth edge.
-        speckle: Share of readings lost anywhere.
-        correlation: Pixels; standard deviation of the blur that makes neighbouring errors alike.
-        color_noise: Standard deviation in grey values.
+        speckle: Share of readings lost at random.
+        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
+        color_noise: Standard deviation of the colour noise, grey values.
     """
 
     baseline: float
@@ -46,9 +46,9 @@ class SensorModel:
     color_noise: float
 
     def row(self, focal: float) -> NDArray[np.float64]:
-        """The numbers that the kernel reads, for a focal length in pixels.
+        """Parameters in the order of the kernel, for a focal length in pixels.
 
-        The quantum's own variance step^2 / 12 is part of the stated noise.
+        The variance step^2 / 12 of the quantisation is part of ``depth_noise``.
         """
         total = self.depth_noise * focal * self.baseline
         sigma = np.sqrt(max(total**2 - self.step**2 / 12, (0.3 * total) ** 2))
@@ -64,11 +64,11 @@ SENSORS: dict[str, SensorModel | None] = {
 
 
 class Sensor:
-    """Turns ideal images into measured ones; the same seed and frame number give the same errors.
+    """Simulated sensor that adds noise to ideal images; equal seeds and frame numbers give equal errors.
 
     Args:
-        name: One of SENSORS.
-        seed: Chooses the noise.
+        name: One of ``SENSORS``.
+        seed: Seed of the noise.
 
     Raises:
         ConfigError: The name is unknown.
@@ -101,7 +101,7 @@ class Sensor:
 
 @lru_cache(maxsize=2)
 def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Repeating correlated noise (S, S) of unit variance, and 65536 unit Gaussian samples."""
+    """Periodic correlated noise (S, S) of unit variance, and 65536 samples of the unit Gaussian."""
     rng = np.random.default_rng(7)
     frequency = np.fft.fftfreq(NOISE_SIZE)
     gain = np.exp(-2 * (np.pi * correlation) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))

@@ -1,4 +1,4 @@
-"""Situations that break trackers, each a small change to an ordinary sequence."""
+"""Difficult situations, each a modification of an ordinary sequence."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,23 +9,24 @@ from numpy.typing import NDArray
 from dudmap.errors import ConfigError
 from dudmap.geometry import se3
 from dudmap.synthetic.motion import smooth_step
-from dudmap.synthetic.movers import Mover, rigid
+from dudmap.synthetic.movers import SyntheticMover, rigid
 from dudmap.synthetic.scene import Material, Scene, box, pose
 
 Array = NDArray[np.float64]
-CAP_DISTANCE = 0.16  # metres in front of the camera
+CAP_DISTANCE = 0.16
+"""Distance of the cover from the camera, metres."""
 
 
 @dataclass(frozen=True)
 class Situation:
-    """What differs from an ordinary sequence.
+    """Modification of an ordinary sequence.
 
     Attributes:
-        movers: The movers, unless others are asked for.
-        camera_path: The camera path, unless another is asked for.
-        start_dynamic: Movers in view at the first frame.
-        covered: Spans, as shares of the duration, in which something covers the camera.
-        elsewhere: Spans, as shares, in which the camera is turned to another part of the world.
+        movers: Default movers.
+        camera_path: Default camera path.
+        start_dynamic: Whether movers are in view in the first frame.
+        covered: Intervals, as shares of the duration, in which the camera is covered.
+        elsewhere: Intervals, as shares of the duration, in which the camera looks at another part of the scene.
     """
 
     movers: tuple[str, ...]
@@ -48,10 +49,10 @@ SITUATIONS: dict[str, Situation] = {
 
 
 def find_situation(name: str) -> Situation:
-    """Situation by name.
+    """Situation of the given name.
 
     Raises:
-        ConfigError: There is none of this name.
+        ConfigError: The name is unknown.
     """
     if name not in SITUATIONS:
         raise ConfigError(f"unknown situation {name!r}; known situations: {', '.join(SITUATIONS)}")
@@ -59,7 +60,7 @@ def find_situation(name: str) -> Situation:
 
 
 def carried_elsewhere(Ts: Array, scene: Scene, times: Array, spans: tuple[tuple[float, float], ...]) -> Array:
-    """Poses (N, 4, 4) turned by 150 degrees about the vertical through home during the spans (shares of the time)."""
+    """Poses (N, 4, 4) rotated by 150 degrees about the vertical at home in the intervals (shares of the duration)."""
     around = pose(scene.home[:3, 3], yaw=150.0) @ se3.inverse(pose(scene.home[:3, 3]))
     out = Ts.copy()
     for begin, end in spans:
@@ -68,13 +69,15 @@ def carried_elsewhere(Ts: Array, scene: Scene, times: Array, spans: tuple[tuple[
     return out
 
 
-def cover(times: Array, T_world_camera: Callable[[float], Array], spans: tuple[tuple[float, float], ...]) -> Mover:
-    """A dark sheet that slides in front of the camera, closer than any sensor measures, during the spans (shares)."""
+def cover(
+    times: Array, T_world_camera: Callable[[float], Array], spans: tuple[tuple[float, float], ...]
+) -> SyntheticMover:
+    """Dark sheet in front of the camera, closer than the sensor range, in the intervals (shares of the duration)."""
     sheet = box((0, 0, 0), (0.5, 0.4, 0.01), Material("denim", (2.0, 2.0), tint=(0.35, 0.3, 0.3)))
     duration = float(times[-1])
 
     def aside(t: float) -> float:
-        """1 out of view, 0 covering."""
+        """Position of the sheet: 1 out of view, 0 covering the view."""
         closed = [
             smooth_step((t - begin * duration) / 0.15 + 1.0) - smooth_step((t - end * duration) / 0.15)
             for begin, end in spans

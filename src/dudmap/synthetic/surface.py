@@ -1,4 +1,4 @@
-"""The true static surface as a triangle mesh, and which part of it the camera saw."""
+"""Triangle mesh of the true static surface, and the part of it that the camera saw."""
 
 from collections.abc import Iterable
 
@@ -179,7 +179,7 @@ def _world_bounds(primitive: Primitive) -> tuple[Points, Points]:
 
 
 def with_faces(mesh: Mesh, keep: NDArray[np.bool_]) -> Mesh:
-    """The mesh of the chosen faces (F,) only, without vertices that no face uses."""
+    """Mesh of the selected faces (F,) only, without unused vertices."""
     faces = mesh.faces[keep]
     used = np.zeros(len(mesh.vertices), dtype=bool)
     used[faces.ravel()] = True
@@ -194,14 +194,14 @@ def count_views(
     depth_range: tuple[float, float],
     grazing: float,
 ) -> NDArray[np.int32]:
-    """In how many views each vertex (V,) is seen.
+    """Number of views (V,) in which each vertex is seen.
 
     Args:
         mesh: Surface in the world frame.
         camera: Intrinsics.
         views: Pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres.
-        depth_range: Nearest and farthest depth in metres that counts.
-        grazing: Cosine of incidence below which a surface does not count as seen.
+        depth_range: Smallest and largest depth that counts, metres.
+        grazing: Cosine of the angle of incidence below which a surface does not count as seen.
     """
     counts = np.zeros(len(mesh.vertices), dtype=np.int32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])

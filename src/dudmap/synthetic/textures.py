@@ -1,4 +1,4 @@
-"""Procedural textures: rich in gradients at every scale, band-limited, the same on every machine for one seed."""
+"""Procedural textures: band-limited, with gradients at every scale, and reproducible from a seed."""
 
 from collections.abc import Callable
 
@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 Image = NDArray[np.float64]
 
-SIZE = 512  # must equal kernels.scenes.TEXTURE_SIZE
+SIZE = 512  # must equal kernels.raytracing.TEXTURE_SIZE
 LEVELS = 10
 
 
@@ -16,7 +16,7 @@ def fractal(
 ) -> Image:
     """Periodic noise (SIZE, SIZE) of unit variance with amplitude ~ frequency^-slope between two frequencies.
 
-    Frequencies are in cycles per texture; ``stretch`` > 1 draws the grain out along the columns.
+    Frequencies are in cycles per texture; ``stretch`` > 1 elongates the pattern along the columns.
     """
     fx = np.fft.fftfreq(SIZE, 1 / SIZE)[None, :]
     fy = np.fft.fftfreq(SIZE, 1 / SIZE)[:, None]
@@ -253,7 +253,7 @@ TEXTURES = tuple(_MAKERS)
 
 
 def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.int32]:
-    """Textures with their mip maps, (number of textures, texels of all levels) int32; unused ones stay empty.
+    """Textures with mip maps, (number of textures, texels of all levels) int32; unused textures stay zero.
 
     A texel is red | green << 8 | blue << 16, each 0..255.
     """

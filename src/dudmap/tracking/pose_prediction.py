@@ -97,10 +97,10 @@ class PosePredictor:
             self._single_frame_map = False
             moving = motion.moving_after
             if not exceeds_noise_share(moving, view.labelled):  # else the pose is too uncertain for slow motion
-                moving = moving | self.ego_motion.slow(timestamp, T_image, pyramid, view.segmentation())
-            young = self.ego_motion.young(timestamp)
+                moving = moving | self.ego_motion.slow_movers(timestamp, T_image, pyramid, view.segmentation())
+            young = self.ego_motion.map_is_young(timestamp)
             self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
-            unverified = ~motion.resting_after if self._crowded_start else None
+            unverified = ~motion.static_after if self._crowded_start else None
             if not young:  # where the map is known, it labels better than two images
                 moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
         return PosePrediction(T_image, by_velocity.image_pose, moving, moving_before, unverified)
@@ -110,11 +110,11 @@ class PosePredictor:
         if self.ego_motion.seconds == 0:
             return
         if view.blind:
-            self.ego_motion.forget()
+            self.ego_motion.reset()
             return
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
         T = estimate.T_world_camera
-        self.ego_motion.remember(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+        self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
         """Motion of the static world from the previous image to this one."""

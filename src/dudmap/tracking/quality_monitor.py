@@ -15,8 +15,8 @@ HISTORY = 30
 """Accepted registrations that are remembered."""
 MIN_HISTORY = 5
 """Accepted registrations before new ones are compared with them."""
-SMALL_RESIDUAL = 0.0015
-"""Residual, metres at one metre depth, that is good with any sensor."""
+SMALL_RESIDUAL_SIGMAS = 0.5
+"""Root mean square residual, in standard deviations of the sensor, that is good."""
 SMALL_COLOR_RESIDUAL = 0.005
 """Intensity difference (0..1) that is good with any sensor."""
 UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
@@ -33,7 +33,7 @@ class QualityMonitor:
     so the comparison is stricter until a frame has been accepted again.
 
     Args:
-        config: ``dynamics.max_share``.
+        config: ``dynamics.max_share`` and the sensor's noise.
         motion: Velocity of the camera.
     """
 
@@ -79,7 +79,7 @@ class QualityMonitor:
         residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
         worst = 2.5 if recognized else 1.6 if self.recovering else 4.0
         if crowded and not strict:
-            worst, residual = 2.0, max(residual, SMALL_RESIDUAL)
+            worst, residual = 2.0, max(residual, SMALL_RESIDUAL_SIGMAS * self.config.sensor.sigma(1.0))
         if tracking.residual > worst * residual:
             return f"readings lie {1000 * tracking.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
         if self.recovering and not recognized and tracking.inlier_share < 0.6 * share:

@@ -16,8 +16,6 @@ from dudmap.mapping.volume import TsdfVolume
 
 PIXELS_PER_BAND = 4800
 """What a thread is woken for; the coarsest level is one band."""
-COARSE = 2
-"""The coarser levels end with a step below this many times ``stop``: they only lead to the next."""
 SHORT = 4
 """Only steps shorter than this many times that end a level by how little they gain."""
 EXPOSURE_NOISE = 0.01
@@ -35,7 +33,7 @@ class LinearSystem:
         num_inliers: Readings on the map.
         readings: Sum of the static weights of all readings.
         weight: Sum of the static weights of the readings on the map.
-        chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
+        chi_square: Robustly weighted sum of squared distances, m^2; at one metre if they are weighted by the noise.
         residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
     """
 
@@ -59,11 +57,11 @@ class TrackingResult:
         converged: Whether all checks passed.
         reason: The failed check, empty if none.
         inlier_share: Share of the static readings that fall on the map.
-        residual: Root mean square distance residual, metres at one metre depth.
+        residual: Root mean square distance residual, scaled by sigma(1 m) / sigma(z): metres at one metre depth.
         condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
         iterations: Linearisations over all levels.
-        color_residual: Median absolute intensity difference (0..1) to the map at the static readings; NaN where the
-            image shows nothing.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings, a change of
+            exposure apart; NaN where the image shows nothing.
         settled: Whether the last level ended with a step too small to matter, not for want of iterations.
     """
 
@@ -107,7 +105,7 @@ class Tracker:
         """
         volume.look_at(T_init)
         T, iterations, system, settled = T_init, 0, None, True
-        weights = np.ones_like(levels[-1].depth)
+        lit, weights = levels[-1], np.ones_like(levels[-1].depth)
         for index, level in enumerate(levels):
             limit = self.config.iterations[first_level + index]
             if limit == 0:
@@ -124,14 +122,14 @@ class Tracker:
                     system = self.linearize(volume, lit, T, weights)
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
-            stop = self.config.stop if finest else COARSE * self.config.stop
+            stop = self.config.stop if finest else self.config.stop_coarse
             T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop)
             iterations += used
         if system is None:  # every level is left out: judge the first guess
-            system = self.linearize(volume, levels[-1], T, weights)
+            system = self.linearize(volume, lit, T, weights)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return replace(self._judge(T, exposure, system, weights, iterations), settled=settled)
+        return replace(self._judge(T, exposure, system, lit, weights, iterations), settled=settled)
 
     def _optimize(
         self,
@@ -211,13 +209,20 @@ class Tracker:
         T: NDArray[np.float64],
         exposure: tuple[float, float],
         system: LinearSystem,
+        level: Level,
         weights: NDArray[np.float32],
         iterations: int,
     ) -> TrackingResult:
-        """Name the first check that a registration fails: readings on the map, residual level, degenerate H."""
+        """Name the first check that a registration fails: readings on the map, residual level, degenerate H.
+
+        The figures mean the same in every configuration: distances are judged in units of the sensor's noise also where
+        the registration does not weigh by it, and intensities apart from a change of exposure also where the
+        registration does not compensate it.
+        """
         config = self.config
         share = system.weight / max(system.readings, 1.0)
-        residual = float(np.sqrt(system.chi_square / max(system.weight, 1e-9)))
+        chi_square = system.chi_square if config.noise_weighting else self._chi_square(system, level, weights)
+        residual = float(np.sqrt(chi_square / max(system.weight, 1e-9)))
         scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
@@ -231,7 +236,25 @@ class Tracker:
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
-        difference = system.residuals[1, ::4, ::4][weights[::4, ::4] > 0.5]
+        differences = system.residuals[1]
+        if not config.exposure:
+            gain, offset = fit_exposure(level.intensity, differences, weights)
+            differences = differences + np.float32(1 - gain) * level.intensity - np.float32(offset)
+        difference = differences[::4, ::4][weights[::4, ::4] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
         return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
+
+    def _chi_square(self, system: LinearSystem, level: Level, weights: NDArray[np.float32]) -> float:
+        """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
+        computes with ``noise_weighting``."""
+        config, sensor = self.config, self.sensor
+        valid = np.isfinite(system.residuals[1])
+        sigma = sensor.sigma(level.depth[valid])
+        scale = np.minimum(sensor.sigma(1.0) / np.maximum(sigma, 1e-6), 1)
+        residual = np.abs(system.residuals[0][valid]) * scale
+        if config.robust == "tukey":
+            robust = (1 - np.minimum(residual / config.tukey, 1) ** 2) ** 2  # eq. 4.45
+        else:
+            robust = config.huber / np.maximum(residual, config.huber)  # eq. 4.44
+        return float(np.sum(weights[valid] * robust * residual**2, dtype=np.float64))

@@ -1,4 +1,4 @@
-"""What a depth and colour sensor makes of ideal images: noise that a seed fixes, steps, shadows and holes."""
+"""Simulation of a depth and colour sensor: seeded noise, quantisation, occlusion shadows and missing readings."""
 
 import numpy as np
 from numba import njit
@@ -6,7 +6,7 @@ from numba import njit
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def _mix(a, b, key):
-    """64 well-mixed bits from two whole numbers and a key (splitmix64 finaliser)."""
+    """Hash of two integers and a key, 64 bits (splitmix64 finaliser)."""
     x = np.uint64(a) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(b) * np.uint64(0xC2B2AE3D27D4EB4F) + np.uint64(key)
     x = (x ^ (x >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
     x = (x ^ (x >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
@@ -15,10 +15,10 @@ def _mix(a, b, key):
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal, model, depth):
-    """What a disparity sensor reads in the rows [row_from, row_to); see sensors.SensorModel for ``model``.
+    """Depth readings of a disparity sensor in the rows [row_from, row_to); ``model`` is ``sensors.SensorModel.row``.
 
-    exact, cosines (H, W) float32; smooth (S, S) float32 correlated noise of unit variance that repeats, S a power of
-    two; offsets (4, 2) where this frame reads it; key uint64; depth (H, W) float32 output, 0 = no reading.
+    exact, cosines (H, W) float32; smooth (S, S) float32 periodic correlated noise of unit variance, S a power of two;
+    offsets (4, 2) into it for this frame; key uint64; depth (H, W) float32 output, 0 = no reading.
     """
     height, width = exact.shape
     wrap = smooth.shape[0] - 1
@@ -30,20 +30,20 @@ def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal,
     lit = np.empty(2 * width + 2, np.float32)
     for v in range(row_from, row_to):
         for u in range(width):
-            # Lateral noise: the reading belongs to a ray a fraction of a pixel aside.
+            # Lateral noise: the reading belongs to a ray shifted by a fraction of a pixel.
             a = smooth[(v + offsets[0, 0]) & wrap, (u + offsets[0, 1]) & wrap]
             b = smooth[(v + offsets[1, 0]) & wrap, (u + offsets[1, 1]) & wrap]
             x = min(max(int(np.floor(u + lateral * a + 0.5)), 0), width - 1)
             y = min(max(int(np.floor(v + lateral * b + 0.5)), 0), height - 1)
             z = exact[y, x]
-            if fatten > 0:  # window matching lets near surfaces grow over far ones
+            if fatten > 0:  # foreground fattening of window matching
                 for k in range(-fatten, fatten + 1):
                     other = exact[y, min(max(x + k, 0), width - 1)]
                     if other > 0 and (z == 0 or other < z):
                         z = other
             seen[u] = z
-        # A point is lit (or seen by the second camera) if nothing nearer lies on the projector's ray; the projector
-        # stands one baseline to the right, so its image is shifted left by the disparity.
+        # A point is lit (or seen by the second camera) if no nearer point lies on the ray of the projector, which
+        # is one baseline to the right: its image is shifted to the left by the disparity.
         lit[:] = 0
         for u in range(width):
             if seen[u] > 0:
@@ -93,7 +93,7 @@ def measure_depth(row_from, row_to, exact, cosines, smooth, offsets, key, focal,
 
 @njit(nogil=True, cache=True, error_model="numpy")
 def measure_color(row_from, row_to, exact, table, key, sigma, color):
-    """Add sensor noise of ``sigma`` grey values to exact (H, W, 3) float32 and round into color (H, W, 3) uint8.
+    """Add noise of ``sigma`` grey values to exact (H, W, 3) float32 and round into color (H, W, 3) uint8.
 
     table (65536,) float32 holds unit Gaussian samples.
     """

@@ -119,7 +119,7 @@ def primitive_depth(kind, ox, oy, oz, dx, dy, dz, hx, hy, hz):
 
 @njit(inline="always", nogil=True, cache=True, fastmath=_MATHS, error_model="numpy")
 def trace_row(depth_of, p, u0, fx, cx, origin, ray, step, half, out):
-    """Take primitive p over in one line of a tile, from column u0 on, where it is nearer than what was found before."""
+    """Update one line of a tile, from column u0 on, where primitive p is nearer than the hits so far."""
     best, found = out
     for k in range(best.size):
         x = (u0 + k - cx) / fx

@@ -1,0 +1,66 @@
+"""SIFT features of a frame (Lowe 2004), found in a reduced grey image."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def reduced_grey(rgb: NDArray[np.uint8], width: int) -> NDArray[np.uint8]:
+    """Grey image (h, w) uint8 of a colour image (H, W, 3), reduced to ``width`` if it is wider."""
+    import cv2
+
+    grey = np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2GRAY), dtype=np.uint8)
+    if width >= grey.shape[1]:
+        return grey
+    height = max(1, round(grey.shape[0] * width / grey.shape[1]))
+    return np.asarray(cv2.resize(grey, (width, height), interpolation=cv2.INTER_AREA), dtype=np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class ImageFeatures:
+    """SIFT features of one image.
+
+    Attributes:
+        pixels: (n, 2) float64, u and v in the image; pixel centres lie at whole numbers.
+        responses: (n,) float64, strength.
+        descriptors: (n, 128) float32.
+        image_shape: (height, width) of the image.
+    """
+
+    pixels: NDArray[np.float64]
+    responses: NDArray[np.float64]
+    descriptors: NDArray[np.float32]
+    image_shape: tuple[int, int]
+
+    def __len__(self) -> int:
+        return len(self.pixels)
+
+
+class SiftExtractor:
+    """Extracts SIFT features; the detector is created on first use. Not for concurrent calls.
+
+    Args:
+        max_features: Number of strongest features that are kept (OpenCV may return a few more of equal strength).
+    """
+
+    def __init__(self, max_features: int) -> None:
+        self.max_features = max_features
+        self._detector: Any = None
+
+    def extract(self, grey: NDArray[np.uint8]) -> ImageFeatures:
+        """Features of a grey image (h, w) uint8."""
+        import cv2
+
+        if self._detector is None:
+            self._detector = cv2.SIFT.create(nfeatures=self.max_features)
+        keypoints, descriptors = self._detector.detectAndCompute(grey, None)
+        if descriptors is None:
+            keypoints, descriptors = (), np.empty((0, 128), np.float32)
+        return ImageFeatures(
+            np.array([point.pt for point in keypoints], dtype=np.float64).reshape(-1, 2),
+            np.array([point.response for point in keypoints], dtype=np.float64),
+            descriptors,
+            (grey.shape[0], grey.shape[1]),
+        )
