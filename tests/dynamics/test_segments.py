@@ -6,7 +6,7 @@ import pytest
 from dudmap import synthetic
 from dudmap.config import DynamicsConfig
 from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
-from dudmap.dynamics.temporal_memory import DYNAMIC_PIXEL, DYNAMIC_SEGMENT, TemporalMemory
+from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
@@ -91,10 +91,11 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        marks = memory.last_marks(image, np.eye(4), 0.1)
+        before = memory.last_dynamic(image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
-        assert (marks[inner] == DYNAMIC_PIXEL | DYNAMIC_SEGMENT).mean() > 0.9
+        assert before[inner].mean() > 0.9
+        assert not before[~board].any()
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
     assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
@@ -189,17 +190,35 @@ def test_an_object_that_stops_becomes_static_after_the_settle_time():
     assert 0.8 < (released - rest) / 30 < slam.config.dynamics.settle_time + 0.7
 
 
-@pytest.mark.parametrize(("moved", "mismatch", "whole"), [(0.5, 0.27, True), (0.0, 0.27, False), (0.5, 0.1, False)])
-def test_motion_is_decided_per_segment(moved, mismatch, whole):
-    """A segment half of which goes on moving is dynamic if its static half fits less well than static segments do."""
-    one, many = np.array([0.0, 500.0]), np.array([0.0, 20000.0])
+@pytest.mark.parametrize(
+    ("share", "distance", "mismatch", "whole"),
+    [
+        (0.5, 0.3, 0.4, True),  # the rest has moved by 0.4 pixels
+        (0.5, 1.1, 0.1, True),  # and by 1.1 standard deviations
+        (0.5, 0.3, 0.1, False),
+        (0.1, 1.1, 0.4, False),  # nothing moves by itself
+        (0.9, 0.3, 0.1, True),
+    ],
+)
+def test_motion_is_decided_per_segment(share, distance, mismatch, whole):
+    """A segment some of which moves is dynamic if the rest of it fits less well than static segments do."""
     evidence = SegmentEvidence(
-        size=np.append(one, many[1]),
+        size=np.array([0, 500.0, 20000]),
         compared=np.ones(3),
-        dynamic=np.array([0, 0.5, 0]),
-        static=np.array([0, 250.0, 20000]),
-        distance=np.array([0, 0.3, 0.1]),
+        dynamic=np.array([0, share, 0]),
+        distance=np.array([0, distance, 0.1]),
         mismatch=np.array([0, mismatch, 0.05]),
-        texture=np.array([0, 0.07, 0.07]),
     )
-    assert classify_segments(evidence, np.array([0, moved, 0])).tolist() == [False, whole, False]
+    assert classify_segments(evidence).tolist() == [False, whole, False]
+
+
+def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
+    for share, whole in ((0.5, False), (0.9, True)):
+        evidence = SegmentEvidence(
+            size=np.array([0, 5000.0, 15000]),
+            compared=np.ones(3),
+            dynamic=np.array([0, share, 0]),
+            distance=np.array([0, 3.0, 0.1]),
+            mismatch=np.array([0, 1.0, 0.05]),
+        )
+        assert classify_segments(evidence).tolist() == [False, whole, False]

@@ -19,7 +19,7 @@ from dudmap.dynamics.segments import (
     segment_evidence,
     split_mixed_segments,
 )
-from dudmap.dynamics.temporal_memory import DYNAMIC_PIXEL, DYNAMIC_SEGMENT, TemporalMemory
+from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.kernels import labeling
@@ -35,15 +35,21 @@ DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
 per
 pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
 MAX_LOG_ODDS = 6
-"""Log odds static : dynamic of a pixel that is certain: a probability of 0.25 %."""
+"""Log odds static : dynamic of a pixel that is certain: an error probability of 0.25 %."""
 COUPLING = 4
-"""Log odds that the eight neighbours together can add to those of a pixel."""
+"""Log odds that the eight neighbours together can add to those of a pixel: less than certainty, so that they cannot
+outvote it; the sum of both is the range of the mean field's hyperbolic tangent."""
 SWEEPS = 4
 """Sweeps of the mean field over the image."""
 MIN_REGION = 0.0008
-"""Smallest region that moves, as a share of the image."""
+"""Smallest region that moves, as a share of the image: 15 pixels of an image of 160x120."""
 SEEDED_SHARE = 0.25
-"""Share of a grown region that must be seeds for all of it to move."""
+"""Share of a grown region that must be seeds for it to move."""
+STARTED_SHARE = 0.1
+"""Share of a segment that must be seeds for its pixels in unknown space to move."""
+EROSION, DILATION, FLOOD_STEP = 15 / 640, 10 / 640, 0.007
+"""Radii of the threshold rule's structuring elements, as shares of the image width, and the largest depth step to a
+neighbouring pixel in its flood, as a share of the depth, in an image 640 pixels wide (Palazzolo et al. 2019, code)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,17 +235,14 @@ class DynamicDetector:
     ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
         """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown, and pixels (h, w) seen to be static.
 
-        Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57), and at
-        least 0 where the map has a surface in front of the reading: what the map holds there is gone, so the map errs
-        and not the reading. In known free space they are -MAX_LOG_ODDS.
+        Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
+        free space they are -MAX_LOG_ODDS.
         """
         surface, sample, depth = frame.surface, frame.sample, frame.level.depth
         evidence = np.zeros(depth.shape, dtype=np.float32)
         evidence[surface] = np.clip(mixture.log_odds(residual[surface]), -MAX_LOG_ODDS, MAX_LOG_ODDS)
         within_noise = surface & (np.abs(sample.distance) < frame.noise)
         evidence[within_noise] = np.maximum(evidence[within_noise], 1)
-        behind = surface & (sample.distance < 0)
-        evidence[behind] = np.maximum(evidence[behind], 0)
         if not self.config.free_space:
             return evidence, np.zeros(depth.shape, dtype=bool)
         unknown = float(np.mean(frame.unknown[depth > 0])) if depth.any() else 0.0
@@ -255,15 +258,14 @@ class DynamicDetector:
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) of regions that grow from moving seeds over the surface, up to depth edges and static pixels.
 
-        A region of at least MIN_REGION is dynamic as a whole if SEEDED_SHARE of it are seeds; else its seeds are.
+        A region of at least MIN_REGION is dynamic if at least SEEDED_SHARE of it are seeds.
         """
         labels, count = labeling.grow_regions(seeds, evidence < 1, frame.level.depth, frame.tolerance)
         areas = np.bincount(labels.reshape(-1), minlength=count + 1)
         seeded = np.bincount(labels[seeds], minlength=count + 1)
-        large = areas >= MIN_REGION * seeds.size
-        large[0] = False
-        whole = large & (seeded >= SEEDED_SHARE * areas)
-        return whole[labels] | ((large & ~whole)[labels] & seeds)
+        dynamic = (areas >= MIN_REGION * seeds.size) & (seeded >= SEEDED_SHARE * areas)
+        dynamic[0] = False
+        return dynamic[labels]
 
     def _segments(
         self,
@@ -274,26 +276,23 @@ class DynamicDetector:
     ) -> tuple[NDArray[np.bool_], Segmentation]:
         """Dynamic pixels (h, w) decided by segment, and the segments.
 
-        1. Pixels in unknown space are dynamic only in a segment at least a tenth of which are seeds, or where they
-           were dynamic in the last frame and the known part of their segment is not static.
+        1. Pixels in unknown space are dynamic only in a segment at least STARTED_SHARE of which are seeds.
         2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
         3. Segments that have settled are static.
         """
         level, T_world_camera, sample = frame.level, frame.T_world_camera, frame.sample
-        marks = self.memory.last_marks(level, T_world_camera, MAX_DISPLACEMENT)
-        before = (marks & DYNAMIC_PIXEL) > 0
-        segmentation = split_mixed_segments(segmentation, (marks & DYNAMIC_SEGMENT) > 0)
+        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
+        segmentation = split_mixed_segments(segmentation, before)
         known = ~frame.unknown
-        started = segmentation.share(seeds) >= 0.1
-        static = segmentation.share(known & ~dynamic) > np.maximum(0.5, 9 * segmentation.share(known & dynamic))
+        started = segmentation.share(seeds) >= STARTED_SHARE
         labels = segmentation.labels
-        dynamic = dynamic & (known | started[labels] | (before & ~static[labels]))
+        dynamic = dynamic & (known | started[labels])
         gain, offset = frame.exposure
         correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = np.asarray(sample.difference + correction, np.float32)
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
         evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
-        dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]
+        dynamic = dynamic | classify_segments(evidence)[labels]
         settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 
@@ -306,10 +305,11 @@ class DynamicDetector:
 
         level = frame.level
         distance = np.abs(np.nan_to_num(frame.sample.distance))
-        marked = (distance > min(self.config.threshold, 0.95 * truncation)) | frame.free
-        scale = level.camera.width / 640
-        core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(15 * scale)) > 0
-        tolerance = np.float32(0.007 / scale) * level.depth
+        rim = 0.95 * truncation  # a stored distance never exceeds the truncation
+        marked = (distance > min(self.config.threshold, rim)) | frame.free
+        width = level.camera.width
+        core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(EROSION * width)) > 0
+        tolerance = np.float32(FLOOD_STEP * 640 / width) * level.depth
         open_pixels = (distance > frame.noise) | frame.free
         labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
-        return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(10 * scale)) > 0
+        return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0

@@ -20,10 +20,13 @@ MIN_PIXELS = 60
 MAX_SHARE = 0.15
 """Segments that cover more than this share of the readings belong to the room: they are dynamic only if nearly all of
 their pixels are."""
-DISTANCE_SCALE = 2.8
-"""Mean distance to the map of a segment that surely moved, standard deviations of a reading."""
-MISMATCH_SCALE = 0.48
-"""Intensity mismatch of a segment that surely moved, pixels of motion at REFERENCE_WIDTH."""
+MIN_DYNAMIC, NEARLY_ALL = 0.2, 0.8
+"""Shares of the pixels of a segment that must be dynamic by themselves for all of it to be: with evidence that the
+others have moved as well, and without."""
+DISTANCE_SCALE = 1.0
+"""Mean distance to the map of a segment that has moved, standard deviations of a reading."""
+MISMATCH_SCALE = 1 / 3
+"""Intensity mismatch of a segment that has moved, pixels of motion at REFERENCE_WIDTH."""
 COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
 """Upper quartiles of both over the static segments of a well registered frame; where the quartiles of a frame are
 larger, the scales grow in proportion."""
@@ -67,22 +70,18 @@ class SegmentEvidence:
         size: Number of pixels.
         compared: Share of the pixels that are compared.
         dynamic: Share of the pixels that are dynamic by themselves.
-        static: Number of static pixels.
         distance: Mean of distance / sigma over the static pixels.
         mismatch: Intensity mismatch of the static pixels in pixels of motion: the mean absolute deviation D of their
             intensity difference from its mean, over their mean gradient G, damped where G is no larger than noise:
             D G / (G + GRADIENT_NOISE)^2.
-        texture: Mean intensity gradient G of the static pixels.
         min_pixels: Fewest pixels of a segment that is classified as a whole.
     """
 
     size: NDArray[np.float64]
     compared: NDArray[np.float64]
     dynamic: NDArray[np.float64]
-    static: NDArray[np.float64]
     distance: NDArray[np.float64]
     mismatch: NDArray[np.float64]
-    texture: NDArray[np.float64]
     min_pixels: float = MIN_PIXELS
 
 
@@ -164,51 +163,38 @@ def segment_evidence(
         size=sums.pixels,
         compared=sums.compared / size,
         dynamic=sums.moving / size,
-        static=sums.static,
         distance=sums.distance / static,
         mismatch=sums.deviation / static * texture / (texture + GRADIENT_NOISE) ** 2,
-        texture=texture,
         min_pixels=segmentation.min_pixels,
     )
 
 
-def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.float64]) -> NDArray[np.bool_]:
+def classify_segments(evidence: SegmentEvidence) -> NDArray[np.bool_]:
     """Which segments (count + 1,) move as a whole.
 
-    Let d be a segment's share of dynamic pixels, b the same in the last frame, s and m the mean distance and the
-    intensity mismatch of its static pixels, and S and M the scales of both: DISTANCE_SCALE and MISMATCH_SCALE, larger
-    in a frame whose static segments have large quartiles. With
+    A segment of at least ``min_pixels`` is dynamic if
 
-        strong = (max(s, 0) / S)^2 + (m / M)^2    and    weak = (s / (0.35 S))^2 + (m / (0.7 M))^2
+    - at least NEARLY_ALL of its pixels are dynamic by themselves, or
+    - it covers at most MAX_SHARE of the readings, at least MIN_DYNAMIC of its pixels are dynamic by themselves, and
+      the mean distance s and the intensity mismatch m of its static pixels say that these have moved as well:
 
-    a segment of at least ``min_pixels`` is dynamic if d >= 0.8, or if it covers at most MAX_SHARE of the readings and
+          (s / S)^2 + (m / M)^2 >= 1
 
-    - d >= 0.1 and strong >= 1, where at least half of it is compared, or
-    - d >= 0.2 and weak >= 1, or d >= 0.6 where it has too little texture or too few static pixels for evidence, or
-    - b >= 0.7, d >= 0.2 and weak >= 0.4, or
-    - b >= 0.4, d >= 0.4 and weak >= 0.5.
+    with S = DISTANCE_SCALE and M = MISMATCH_SCALE, larger in a badly registered frame: in proportion to the upper
+    quartiles of |s| and m over the static segments of the frame, where these exceed COMMON_DISTANCE and
+    COMMON_MISMATCH.
 
     Args:
         evidence: Evidence of each segment.
-        dynamic_before: (count + 1,) share of the pixels that were dynamic in the last frame.
     """
-    counted = np.flatnonzero((evidence.compared > 0.5) & (evidence.size >= evidence.min_pixels))
-    static = counted[evidence.dynamic[counted] < 0.5]
+    large = evidence.size >= evidence.min_pixels
+    static = large & (evidence.compared > 0.5) & (evidence.dynamic < 0.5)
+    static[0] = False
     distance_scale = DISTANCE_SCALE * max(1.0, upper_quartile(np.abs(evidence.distance[static])) / COMMON_DISTANCE)
     mismatch_scale = MISMATCH_SCALE * max(1.0, upper_quartile(evidence.mismatch[static]) / COMMON_MISMATCH)
-    strong = np.zeros(len(evidence.size))
-    strong[counted] = (
-        (np.maximum(evidence.distance, 0) / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2
-    )[counted]
-    weak = (evidence.distance / (0.35 * distance_scale)) ** 2 + (evidence.mismatch / (0.7 * mismatch_scale)) ** 2
-    informative = (evidence.texture > GRADIENT_NOISE) & (evidence.static >= 0.5 * evidence.min_pixels)
-    dynamic = (strong >= 1) & (evidence.dynamic >= 0.1)
-    dynamic |= np.where(informative, (evidence.dynamic >= 0.2) & (weak >= 1), evidence.dynamic >= 0.6)
-    dynamic |= (dynamic_before >= 0.7) & (evidence.dynamic >= 0.2) & (weak >= 0.4)
-    dynamic |= (dynamic_before >= 0.4) & (evidence.dynamic >= 0.4) & (weak >= 0.5)
-    dynamic &= evidence.size <= MAX_SHARE * evidence.size[1:].sum()
-    dynamic |= evidence.dynamic >= 0.8
-    dynamic &= evidence.size >= evidence.min_pixels
+    moved = (evidence.distance / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2 >= 1
+    small = evidence.size <= MAX_SHARE * evidence.size[1:].sum()
+    dynamic = large & ((evidence.dynamic >= NEARLY_ALL) | (small & moved & (evidence.dynamic >= MIN_DYNAMIC)))
     dynamic[0] = False
     return dynamic
 

@@ -30,8 +30,8 @@ SEAM = 1
 """Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
 STATIC_RADIUS = 2
 """Radius of the median filter of static pixels, pixels at REFERENCE_WIDTH."""
-DYNAMIC_PIXEL, DYNAMIC_SEGMENT = 1, 2
-"""Bits of a pixel's mark in a remembered frame: it was dynamic; it belonged to a segment with dynamic pixels."""
+DYNAMIC_SHARE = 0.2
+"""Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,13 +42,13 @@ class RememberedFrame:
         timestamp: Seconds.
         level: The image.
         T_world_camera: (4, 4).
-        marks: (h, w) uint8, DYNAMIC_PIXEL and DYNAMIC_SEGMENT.
+        dynamic: (h, w) uint8, 1 for pixels of dynamic segments, else 0.
     """
 
     timestamp: float
     level: Level
     T_world_camera: NDArray[np.float64]
-    marks: NDArray[np.uint8]
+    dynamic: NDArray[np.uint8]
 
 
 class TemporalMemory:
@@ -104,11 +104,11 @@ class TemporalMemory:
             dynamic: (h, w) bool.
             segmentation: Segments of the image; None where motion is not decided by segment.
         """
-        marks = dynamic.astype(np.uint8)
+        marks = np.zeros(dynamic.shape, dtype=np.uint8)
         if segmentation is not None:
-            dynamic_segments = segmentation.share(dynamic) >= 0.2
+            dynamic_segments = segmentation.share(dynamic) >= DYNAMIC_SHARE
             dynamic_segments[0] = False
-            marks[dynamic_segments[segmentation.labels]] |= DYNAMIC_SEGMENT
+            marks[dynamic_segments[segmentation.labels]] = 1
         settle_time, start_seconds = self.config.settle_time, self.config.start_seconds
         self._last = frame = RememberedFrame(timestamp, level, T_world_camera, marks)
         settle_frames, recent_frames = self._settle_frames, self._recent_frames
@@ -130,20 +130,18 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_marks(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.uint8]:
-        """Marks (h, w) uint8 of the last frame at the points of an image.
+    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+        """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
             level: The image.
             T_world_camera: (4, 4) its pose.
-            max_gap: Largest depth difference between a point and the last frame's reading of it, metres; points
-                farther away have the mark 0.
+            max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
         """
-        if self._last is None or not self._last.marks.any():
-            return np.zeros(level.depth.shape, dtype=np.uint8)
+        if self._last is None or not self._last.dynamic.any():
+            return np.zeros(level.depth.shape, dtype=bool)
         ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
-        marks[~(np.abs(gap) < max_gap)] = 0
-        return marks
+        return (marks > 0) & (np.abs(gap) < max_gap)
 
     def free_and_static(
         self,
@@ -247,7 +245,7 @@ def reproject(
     """Differences of an image at a pose (4, 4) to remembered frames, one for each."""
     targets = [
         kernels.ReprojectionTarget(
-            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.marks
+            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
         )
         for frame in frames
     ]
