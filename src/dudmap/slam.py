@@ -127,7 +127,7 @@ class Slam:
         """The moving bodies so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
         if self.fusion is None:
             return []
-        return self.fusion.bodies({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
+        return self.fusion.objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
 
     def prepare(self, frame: Frame) -> Prepared:
         """The part of a frame's work that needs no other frame, for ``process`` to go on with.

@@ -156,7 +156,7 @@ def _save_bodies(folder: Path, bodies: "list[RigidObject]") -> list[dict[str, An
     """Write mesh and trajectory of every rigid body; what metrics.json says of all of them."""
     out = []
     for body in bodies:
-        row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
+        row = {"id": body.id, "rigid": body.rigid, "why_not": body.reason or None, "frames": body.frames}
         if body.mesh is not None and body.trajectory is not None:
             folder.mkdir(exist_ok=True)
             body.mesh.save(folder / f"{body.id}.ply")
