@@ -12,11 +12,11 @@ from dudmap.frames.pyramid import halved
 from dudmap.objects.object_tracker import Mover
 
 MIN_PIXELS = 60
-"""Fewest pixels, at the resolution of the labels, of an object that is registered."""
+"""Fewest readings of an object that is registered: ten per degree of freedom of its pose."""
 MAX_PIXELS = 16000
 """Most pixels of an object that are registered and fused; a larger view is halved."""
-MIN_SIZE = 128
-"""Smallest width and height of the crop, pixels of the full image."""
+MIN_SIZE = 16 << 3
+"""Smallest width and height of the crop, pixels: at most three halvings of it leave an image of at least 16 pixels."""
 RIM = 0.05
 """Width of the border of the mask that is left out, as a share of its size: readings at grazing angles are noisy."""
 
