@@ -1,4 +1,4 @@
-"""What a hole in the depth hides: points carried from image to image against plain geometry."""
+"""Background behind pixels without a reading: points carried from image to image against plain geometry."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Labels: the mixture against EM on raw samples, the labelling loops against plain Python, whole frames."""
+"""Labels: the mixture against EM on raw samples, the label kernels against plain Python, whole frames."""
 
 from collections import deque
 from dataclasses import replace
@@ -9,7 +9,7 @@ import pytest
 from dudmap import synthetic
 from dudmap.benchmark.systems import systems
 from dudmap.config import Config
-from dudmap.dynamics.mixture import BINS, LARGEST, Mixture, fit_mixture
+from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling
@@ -25,8 +25,8 @@ def test_mixture_recovers_what_the_samples_were_drawn_from(share, sigmas):
     n = 20_000
     static = rng.random(n) < share
     samples = np.abs(rng.normal(0, np.where(static, *sigmas)))
-    samples = samples[samples < LARGEST]
-    histogram, edges = np.histogram(samples, bins=BINS, range=(0, LARGEST))
+    samples = samples[samples < MAX_RESIDUAL]
+    histogram, edges = np.histogram(samples, bins=BINS, range=(0, MAX_RESIDUAL))
     found = fit_mixture(histogram, edges, iterations=300)
     prior, sigma = half_normal_mixture_em(samples)
     assert found.prior[0] == pytest.approx(prior[0], abs=0.04)
@@ -44,7 +44,7 @@ def test_log_odds_are_the_ratio_of_the_densities():
 
 
 def test_no_residuals_give_the_prior_mixture():
-    assert fit_mixture(np.zeros(BINS, np.int64), np.linspace(0, LARGEST, BINS + 1)).prior[0] > 0.5
+    assert fit_mixture(np.zeros(BINS, np.int64), np.linspace(0, MAX_RESIDUAL, BINS + 1)).prior[0] > 0.5
 
 
 def grown(seeds, open_pixels, depth, tolerance):
@@ -80,7 +80,7 @@ def test_regions_grow_like_a_breadth_first_search():
         assert np.array_equal(labels, expected)
 
 
-def test_neighbours_pull_a_doubtful_pixel_over_but_not_across_a_depth_edge():
+def test_the_mean_field_couples_neighbours_but_not_across_a_depth_edge():
     evidence = np.full((5, 6), 3.0, np.float32)
     evidence[2, 2] = -1.0
     flat = np.ones((5, 6), np.float32)

@@ -1,12 +1,12 @@
-"""Segmentation of surface: how images are cut, what stands still, and whole slow, starting and stopping things."""
+"""Surface segmentation, what has settled, and the labels of slow, starting and stopping objects."""
 
 import numpy as np
 import pytest
 
 from dudmap import synthetic
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment, split
-from dudmap.dynamics.temporal_memory import BODY, MOVED, TemporalMemory
+from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
+from dudmap.dynamics.temporal_memory import DYNAMIC_PIXEL, DYNAMIC_SEGMENT, TemporalMemory
 from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
@@ -32,19 +32,19 @@ def large(surface):
     return [n for n in range(1, surface.count + 1) if np.count_nonzero(surface.labels == n) > 200]
 
 
-def test_a_hollow_cuts_and_a_ridge_does_not():
+def test_a_concave_edge_cuts_and_a_convex_one_does_not():
     left, right = plane([-1, 0, 1], [0, 0, 2]), plane([1, 0, 1], [0, 0, 2])
     assert len(large(segment(level(np.maximum(left, right)), TOLERANCE))) == 1  # the ridge faces the camera
-    hollow = segment(level(np.minimum(left, right)), TOLERANCE)
-    # every reading belongs to a piece, and the seam lies in the hollow
-    assert len(large(hollow)) == 2
-    assert (hollow.labels > 0).mean() > 0.99
-    assert np.all(hollow.labels[:, :70] == hollow.labels[60, 20])
-    assert np.all(hollow.labels[:, 90:] == hollow.labels[60, 140])
+    concave = segment(level(np.minimum(left, right)), TOLERANCE)
+    # every reading belongs to a segment, and the boundary lies in the concave edge
+    assert len(large(concave)) == 2
+    assert (concave.labels > 0).mean() > 0.99
+    assert np.all(concave.labels[:, :70] == concave.labels[60, 20])
+    assert np.all(concave.labels[:, 90:] == concave.labels[60, 140])
 
 
 def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
-    """Two boards 5 cm apart are two pieces, although a slanted floor has larger steps between its pixels."""
+    """Two boards 5 cm apart are two segments, although a slanted floor has larger steps between its pixels."""
     depth = np.full(CAMERA.shape, 2.0)
     depth[:, 80:] = 2.05
     boards = segment(level(depth), TOLERANCE).labels
@@ -57,16 +57,16 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
     assert len(large(segment(level(floor), TOLERANCE))) == 1
 
 
-def test_pieces_that_met_are_split_by_what_they_were():
+def test_segments_that_have_merged_are_split_by_their_last_labels():
     whole = segment(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
     body = np.zeros(CAMERA.shape, bool)
-    assert split(whole, body) is whole
+    assert split_mixed_segments(whole, body) is whole
     body[:, :60] = True
-    two = split(whole, body)
+    two = split_mixed_segments(whole, body)
     assert two.count == whole.count + 1
     assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
     body[:, 6:60] = False  # a strip that came into view
-    assert split(whole, body) is whole
+    assert split_mixed_segments(whole, body) is whole
 
 
 def scene(x):
@@ -80,28 +80,28 @@ def scene(x):
 
 
 @pytest.mark.parametrize(("speed", "stands"), [(0.0, True), (0.05, False)])
-def test_what_stood_still_for_the_settle_time_stands(speed, stands):
+def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stands):
     memory = TemporalMemory(DynamicsConfig(settle_time=1.0))
     sigma = np.full(CAMERA.shape, 0.01, np.float32)
     for i in range(35):
         image, board = scene(speed * i / 30)
         surface = segment(image, TOLERANCE)
-        still = memory.standing(i / 30, image, np.eye(4), surface, sigma, board)
+        still = memory.settled(i / 30, image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        marks = memory.marks(image, np.eye(4), 0.1)
+        marks = memory.last_marks(image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
-        assert (marks[inner] == MOVED | BODY).mean() > 0.9
+        assert (marks[inner] == DYNAMIC_PIXEL | DYNAMIC_SEGMENT).mean() > 0.9
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
-    assert not memory.standing(i / 30, image, np.eye(4), surface, sigma, board).any()
+    assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
-def test_single_frames_tell_who_stands_where_they_saw_farther():
-    """A board that walks through a room, seen by a camera that walks too, against where both are."""
+def test_single_frames_give_free_space_and_static_points():
+    """A moving board in front of a wall, seen by a moving camera, against where both are."""
     memory = TemporalMemory(DynamicsConfig())
     noise = np.full(CAMERA.shape, 0.1, np.float32)
     v, u = np.indices(CAMERA.shape)
@@ -119,7 +119,7 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
         T[0, 3] = camera_x
         if i == 0:
             memory.start(0.0)
-        free, rested = memory.views(i / 30, seen, T, noise)
+        free, rested = memory.free_and_static(i / 30, seen, T, noise)
         assert not free[~board].any()
         memory.update(i / 30, seen, T, np.zeros_like(board), None)
     new = board & (X > -0.3 + 0.2 + 0.03)  # where it was not in the first frame
@@ -127,22 +127,22 @@ def test_single_frames_tell_who_stands_where_they_saw_farther():
     assert rested[new].mean() < 0.05
     wall = ~board & (u > 8) & (u < 150) & (X < -0.6)  # never hidden
     assert rested[wall].mean() > 0.95
-    # another pass over the same frames knows also what comes later
+    # another pass over the same frames also compares later ones
     again = TemporalMemory(DynamicsConfig())
     again.import_from(
         memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
     )
     seen, board, X = image(0.0, -0.3)
-    free, _ = again.views(0.0, seen, np.eye(4), noise)
+    free, _ = again.free_and_static(0.0, seen, np.eye(4), noise)
     assert free[board].mean() > 0.8
     assert not free[~board].any()
-    # a grown map knows free space itself, unless the camera has turned to where it knows nothing
-    assert not np.any(again.views(10.0, seen, np.eye(4), noise, unknown=0.05))
-    assert not np.any(again.views(10.0, seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
+    # an older map knows free space itself, unless the camera has turned towards unknown space
+    assert not np.any(again.free_and_static(10.0, seen, np.eye(4), noise, unknown=0.05))
+    assert not np.any(again.free_and_static(10.0, seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
     for i in range(16):
         seen, board, X = image(0.0, -0.3 + 0.05 * i)
-        free, _ = again.views(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.5)
-        assert not again.views(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.05)[0].any()
+        free, _ = again.free_and_static(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.5)
+        assert not again.free_and_static(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.05)[0].any()
         again.update(10.0 + i / 30, seen, np.eye(4), np.zeros_like(board), None)
     assert free[board & (X > -0.3 + 0.2 + 0.03)].mean() > 0.9
     assert not free[~board].any()
@@ -159,7 +159,7 @@ def overlaps(sequence, frames):
 
 
 @pytest.mark.slow
-def test_a_slow_creeper_is_labelled_whole():
+def test_a_slow_object_is_labelled_whole():
     sequence = synthetic.sequence("yard", movers=("creeper",), frames=80, seed=2, noise="realsense", camera=SMALL)
     score, _ = overlaps(sequence, 80)
     seen = np.flatnonzero(~np.isnan(score))[0]
@@ -167,7 +167,7 @@ def test_a_slow_creeper_is_labelled_whole():
 
 
 @pytest.mark.slow
-def test_a_mapped_thing_that_starts_is_labelled_whole():
+def test_a_mapped_object_that_starts_is_labelled_whole():
     sequence = synthetic.sequence("room", situation="starts", frames=90, camera=SMALL)
     score, wrong = overlaps(sequence, 75)
     begun = np.flatnonzero(~np.isnan(score))[0]
@@ -176,7 +176,7 @@ def test_a_mapped_thing_that_starts_is_labelled_whole():
 
 
 @pytest.mark.slow
-def test_a_thing_that_stops_becomes_map_after_the_settle_time():
+def test_an_object_that_stops_becomes_static_after_the_settle_time():
     sequence = synthetic.sequence("room", situation="stops", frames=160, camera=SMALL)
     slam, rest, released = Slam(sequence.camera), None, None
     for i in range(160):
@@ -190,11 +190,16 @@ def test_a_thing_that_stops_becomes_map_after_the_settle_time():
 
 
 @pytest.mark.parametrize(("moved", "mismatch", "whole"), [(0.5, 0.27, True), (0.0, 0.27, False), (0.5, 0.1, False)])
-def test_a_thing_does_not_move_by_halves(moved, mismatch, whole):
-    """Half of a piece goes on moving: so does all of it, if the rest fits less well than what rests usually does."""
+def test_motion_is_decided_per_segment(moved, mismatch, whole):
+    """A segment half of which goes on moving is dynamic if its static half fits less well than static segments do."""
     one, many = np.array([0.0, 500.0]), np.array([0.0, 20000.0])
-    verdict = SegmentEvidence(
-        size=np.append(one, many[1]), known=np.ones(3), moving=np.array([0, 0.5, 0]), rest=np.array([0, 250.0, 20000]),
-        shift=np.array([0, 0.3, 0.1]), mismatch=np.array([0, mismatch, 0.05]), texture=np.array([0, 0.07, 0.07]),
-    )  # fmt: skip
-    assert classify_segments(verdict, np.array([0, moved, 0])).tolist() == [False, whole, False]
+    evidence = SegmentEvidence(
+        size=np.append(one, many[1]),
+        compared=np.ones(3),
+        dynamic=np.array([0, 0.5, 0]),
+        static=np.array([0, 250.0, 20000]),
+        distance=np.array([0, 0.3, 0.1]),
+        mismatch=np.array([0, mismatch, 0.05]),
+        texture=np.array([0, 0.07, 0.07]),
+    )
+    assert classify_segments(evidence, np.array([0, moved, 0])).tolist() == [False, whole, False]

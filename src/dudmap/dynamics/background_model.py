@@ -1,110 +1,127 @@
-"""What the static world looked like where a sensor reads nothing now: too near, too dark, in a shadow of its light."""
+"""The static background behind pixels without a reading: things too near, too dark, or in a shadow of the sensor."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
+from dudmap.dynamics.label_scale import scaled_length
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels import splatting
+from dudmap.kernels.splatting import PointImage, overwrite, splat
 
-DIFFERENT = 0.15
-"""Intensities that differ by more, from all around, are not of the same thing."""
-RESTED = 0.3
-"""What has not been read at its place for this long, seconds, may be a passer-by."""
-AROUND = 7
-"""Side of the square in which pixels without a reading decide together, pixels that are asked."""
-KNOWN = 0.2
-"""Share of them behind which the world must be known."""
+SAME_INTENSITY = 0.15
+"""Largest difference of a pixel's intensity to those of the background around it."""
+MIN_AGE = 0.3
+"""Time for which a surface must have been seen to be background, seconds."""
+VOTING_SIDE = 7
+"""Side of the square in which pixels without a reading vote, subsampled pixels."""
+MIN_KNOWN = 0.2
+"""Share of that square behind which the background must be known."""
 STRIDE = 2
-"""Every so many pixels of the image are asked, across and down."""
-SMALLEST = 0.005
-"""Share of the image that is left out if nothing larger is hidden."""
+"""Pixels of the label image per subsampled pixel, across and down, at REFERENCE_WIDTH."""
+MIN_AREA = 0.005
+"""Smallest region without readings that is examined, as a share of the image."""
 
 
 class BackgroundModel:
     """The last static reading of every pixel, as a point in the world that is carried from image to image.
 
-    A thing that gives no reading hides what is known to be behind it: its pixels look unlike that. A shadow of the
-    sensor's own light, a screen and a window look as they did.
+    A thing that gives no reading hides the background known to be behind it, and looks different; the sensor's own
+    shadow, a screen or a window looks as the background did.
 
     Args:
-        config: ``settle_time``; what has not been read for longer is not known any more.
+        config: ``settle_time``: background that has not been seen for longer is dropped.
     """
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._known: splatting.PointImage | None = None
+        self._background: PointImage | None = None
 
     def reset(self) -> None:
-        """What was seen is in another world, or nobody knows where."""
-        self._known = None
+        """Drop the background: it belongs to another world, or the pose was lost."""
+        self._background = None
 
     def hidden(self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.bool_]:
-        """Pixels (h, w) without a reading that look unlike the static world behind them.
+        """Pixels (h, w) without a reading in front of known background.
+
+        A pixel without a reading votes if the background is known within 3x3 pixels, and votes for hidden if its
+        intensity lies outside of the range of the background's there, extended by SAME_INTENSITY. A pixel is hidden
+        by majority within VOTING_SIDE, where at least MIN_KNOWN of the pixels vote.
 
         Args:
             timestamp: Seconds.
-            level: The image, its intensities as the map has them.
+            level: The image, with the exposure of the map.
             T_world_camera: (4, 4).
         """
         import cv2
 
-        depth, intensity = _asked(level)
-        nothing = np.zeros(level.depth.shape, dtype=bool)
-        if self._known is None:
-            return nothing
-        _, shades, times = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
-        farthest = cv2.dilate(level.depth, np.ones((STRIDE, STRIDE), np.uint8))
-        hole = farthest[STRIDE - 1 :: STRIDE, STRIDE - 1 :: STRIDE] <= 0
-        missing = np.isnan(shades)
+        depth, intensity = _subsampled(level)
+        none = np.zeros(level.depth.shape, dtype=bool)
+        if self._background is None:
+            return none
+        _, background, times = self._seen_from(timestamp, level, depth.shape, T_world_camera)
+        rows, columns = (np.arange(0, size, _stride(level)) for size in level.depth.shape)
+        hole = np.maximum.reduceat(np.maximum.reduceat(level.depth, rows, axis=0), columns, axis=1) <= 0
+        missing = np.isnan(background)
         square = np.ones((3, 3), np.uint8)
-        darkest = cv2.erode(np.where(missing, np.float32(9), shades), square)
-        brightest = cv2.dilate(np.where(missing, np.float32(-9), shades), square)
-        rested = ~missing & (times[..., 1] - times[..., 0] >= RESTED)
-        known = hole & (cv2.dilate(rested.astype(np.uint8), square) > 0)
-        limit = np.float32(DIFFERENT)
-        unlike = known & ((intensity < darkest - limit) | (intensity > brightest + limit))
-        solid = cv2.morphologyEx(unlike.astype(np.uint8), cv2.MORPH_OPEN, square)  # not the seam along an edge
-        if not solid.any():
-            return nothing
-        votes = cv2.blur(solid.astype(np.float32), (AROUND, AROUND))
-        asked = cv2.blur(known.astype(np.float32), (AROUND, AROUND))
-        hidden = (hole & (asked >= np.float32(KNOWN)) & (votes > np.float32(0.5) * asked)).astype(np.uint8)
+        darkest = cv2.erode(np.where(missing, np.float32(9), background), square)
+        brightest = cv2.dilate(np.where(missing, np.float32(-9), background), square)
+        static = ~missing & (times[..., 1] - times[..., 0] >= MIN_AGE)
+        known = hole & (cv2.dilate(static.astype(np.uint8), square) > 0)
+        limit = np.float32(SAME_INTENSITY)
+        different = known & ((intensity < darkest - limit) | (intensity > brightest + limit))
+        different = cv2.morphologyEx(different.astype(np.uint8), cv2.MORPH_OPEN, square)  # without seams along edges
+        if not different.any():
+            return none
+        votes = cv2.blur(different.astype(np.float32), (VOTING_SIDE, VOTING_SIDE))
+        voters = cv2.blur(known.astype(np.float32), (VOTING_SIDE, VOTING_SIDE))
+        hidden = (hole & (voters >= np.float32(MIN_KNOWN)) & (votes > np.float32(0.5) * voters)).astype(np.uint8)
         _, numbers, stats, _ = cv2.connectedComponentsWithStats(hidden, connectivity=4)
-        large = stats[:, cv2.CC_STAT_AREA] >= SMALLEST * hidden.size
+        large = stats[:, cv2.CC_STAT_AREA] >= MIN_AREA * hidden.size
         large[0] = False
         found = large[np.asarray(numbers, np.int32)].astype(np.uint8)
-        found = cv2.resize(found, nothing.shape[::-1], interpolation=cv2.INTER_NEAREST)
+        found = cv2.resize(found, none.shape[::-1], interpolation=cv2.INTER_NEAREST)
         return (found > 0) & (level.depth <= 0)
 
     def update(
-        self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
+        self, timestamp: float, level: Level, T_world_camera: NDArray[np.float64], dynamic: NDArray[np.bool_]
     ) -> None:
-        """Take over the readings of an image that rest; ``moving`` (h, w) bool do not."""
-        depth, intensity = _asked(level)
-        self._known = self._seen_from(timestamp, level, (depth.shape[0], depth.shape[1]), T_world_camera)
-        splatting.overwrite(
-            self._known, depth, intensity, ~moving[::STRIDE, ::STRIDE], timestamp, T_world_camera, _intrinsics(level)
-        )
+        """Replace the background by the static readings of an image.
+
+        Args:
+            timestamp: Seconds.
+            level: The image, with the exposure of the map.
+            T_world_camera: (4, 4).
+            dynamic: (h, w) bool, pixels whose readings are left out.
+        """
+        depth, intensity = _subsampled(level)
+        self._background = self._seen_from(timestamp, level, depth.shape, T_world_camera)
+        stride = _stride(level)
+        static = ~dynamic[::stride, ::stride]
+        overwrite(self._background, depth, intensity, static, timestamp, T_world_camera, _intrinsics(level))
 
     def _seen_from(
-        self, timestamp: float, level: Level, shape: tuple[int, int], T_world_camera: NDArray[np.float64]
-    ) -> splatting.PointImage:
-        """The known points as the image's camera sees them."""
-        if self._known is None:
-            return splatting.PointImage.empty(shape)
+        self, timestamp: float, level: Level, shape: tuple[int, ...], T_world_camera: NDArray[np.float64]
+    ) -> PointImage:
+        """The background in a subsampled image at a pose."""
+        if self._background is None:
+            return PointImage.empty(shape)
         since = timestamp - self.config.settle_time
-        return splatting.splat(self._known, se3.inverse(T_world_camera), _intrinsics(level), since)
+        return splat(self._background, se3.inverse(T_world_camera), _intrinsics(level), since)
 
 
-def _asked(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Depth of the pixels that are asked, and intensity around them."""
+def _subsampled(level: Level) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Depth of one pixel per stride across and down, and mean intensity around it."""
     import cv2
 
-    depth = level.depth[::STRIDE, ::STRIDE]
+    depth = level.depth[:: _stride(level), :: _stride(level)]
     return depth, np.asarray(cv2.resize(level.intensity, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.float32)
 
 
 def _intrinsics(level: Level) -> NDArray[np.float32]:
-    return level.camera.intrinsics / np.float32(STRIDE)
+    return level.camera.intrinsics / np.float32(_stride(level))
+
+
+def _stride(level: Level) -> int:
+    """Pixels of the label image per subsampled pixel: subsampled images are about 80 pixels wide."""
+    return scaled_length(STRIDE, level)

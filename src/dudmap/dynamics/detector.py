@@ -1,6 +1,7 @@
-"""Which pixels move: mixture of residual densities, known free space, regions (thesis section 4.6, algorithm 3)."""
+"""Which pixels of a frame move: mixture of residual densities, known free space, segments (thesis section 4.6)."""
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
@@ -8,22 +9,94 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.dynamics.background_model import BackgroundModel
-from dudmap.dynamics.masks import Labels, elliptical_kernel, opened
-from dudmap.dynamics.mixture import BINS, LARGEST, fit_mixture
-from dudmap.dynamics.segments import Segmentation, classify_segments, judge, segment, split
-from dudmap.dynamics.temporal_memory import BODY, MOVED, TemporalMemory
+from dudmap.dynamics.label_scale import pixel_scale
+from dudmap.dynamics.masks import Labels, elliptical_kernel, opened_mask
+from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture, residual_histogram
+from dudmap.dynamics.segments import (
+    Segmentation,
+    classify_segments,
+    segment,
+    segment_evidence,
+    split_mixed_segments,
+)
+from dudmap.dynamics.temporal_memory import DYNAMIC_PIXEL, DYNAMIC_SEGMENT, TemporalMemory
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.kernels import labeling
 from dudmap.kernels.threads import submit
 from dudmap.mapping.volume import FREE, SURFACE, UNKNOWN, MapSample, TsdfVolume
 
-REACH = 0.1
-"""Farthest that a point may be from its reading in the last frame to be what that was, metres."""
+MAX_DISPLACEMENT = 0.1
+"""Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
+MAP_ROUGHNESS = 0.4
+"""Standard deviation of the map's surface, voxels."""
+DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
+"""Largest depth step to a neighbour of the same surface: standard deviations of a reading, plus a share of the depth
+per
+pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
+MAX_LOG_ODDS = 6
+"""Log odds static : dynamic of a pixel that is certain: a probability of 0.25 %."""
+COUPLING = 4
+"""Log odds that the eight neighbours together can add to those of a pixel."""
+SWEEPS = 4
+"""Sweeps of the mean field over the image."""
+MIN_REGION = 0.0008
+"""Smallest region that moves, as a share of the image."""
+SEEDED_SHARE = 0.25
+"""Share of a grown region that must be seeds for all of it to move."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Comparison:
+    """A frame compared with the map.
+
+    Attributes:
+        timestamp: Seconds.
+        level: The image.
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that make the image's intensities those of the map.
+        sample: The map at the points of the image.
+        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+        noise: (h, w) float32, distance below which nothing is called motion (theta in eq. 4.57), metres.
+        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+    """
+
+    timestamp: float
+    level: Level
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    sample: MapSample
+    sigma: NDArray[np.float32]
+    noise: NDArray[np.float32]
+    tolerance: NDArray[np.float32]
+
+    @property
+    def surface(self) -> NDArray[np.bool_]:
+        """(h, w) bool, pixels near a surface of the map."""
+        return self.sample.place == SURFACE
+
+    @property
+    def free(self) -> NDArray[np.bool_]:
+        """(h, w) bool, pixels in space the map knows to be free."""
+        return self.sample.place == FREE
+
+    @property
+    def unknown(self) -> NDArray[np.bool_]:
+        """(h, w) bool, pixels in space the map does not know."""
+        return self.sample.place == UNKNOWN
 
 
 class DynamicDetector:
-    """Labels the pixels of a registered frame as static or moving, from how badly they fit the map."""
+    """Labels the pixels of registered frames as static or dynamic.
+
+    Args:
+        config: Method and thresholds.
+        sensor: Noise of the depth readings.
+
+    Attributes:
+        memory: Remembered frames.
+        background: The static background behind pixels without a reading.
+    """
 
     def __init__(self, config: DynamicsConfig, sensor: SensorConfig) -> None:
         self.config = config
@@ -32,10 +105,10 @@ class DynamicDetector:
         self.background = BackgroundModel(config)
 
     def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
-        """Begin to segment the surface of an image, which needs no map.
+        """Begin to segment the surface an image shows; needs no map.
 
         Args:
-            level: The image, at the size of the labels.
+            level: The image, at the resolution of the labels.
             voxel_size: Edge of the map's voxels, metres.
 
         Returns:
@@ -44,7 +117,7 @@ class DynamicDetector:
         """
 
         def compute() -> Segmentation:
-            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level.depth))
+            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
@@ -62,7 +135,7 @@ class DynamicDetector:
         self.memory.update(timestamp, level, T_world_camera, np.zeros(level.depth.shape, dtype=bool), None)
 
     def import_from(self, other: "DynamicDetector", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
-        """Import what the detector of a first pass over the same frames remembers; see ``TemporalMemory``."""
+        """Import the remembered frames of a first pass over the same recording; see ``TemporalMemory.import_from``."""
         self.memory.import_from(other.memory, Ts_world_camera)
 
     def detect(
@@ -75,12 +148,12 @@ class DynamicDetector:
         moving: NDArray[np.bool_] | None = None,
         exposure: tuple[float, float] = (1.0, 0.0),
     ) -> Labels:
-        """Labels of a frame that has been registered to ``volume`` at a pose.
+        """Labels of a frame that has been registered to a map.
 
         Args:
             volume: The map.
-            level: The image.
-            T_world_camera: (4, 4).
+            level: The image, at the resolution of the labels.
+            T_world_camera: (4, 4) pose of the registration.
             timestamp: Seconds.
             segmentation: Waits for the segments of the image, as ``segment`` returns it.
             moving: (h, w) bool, pixels that two consecutive images show to move; None where they were not compared.
@@ -88,48 +161,32 @@ class DynamicDetector:
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
         sigma = self._sigma(level.depth, volume.voxel_size)
-        tolerance = self._tolerance(sigma, level.depth)
-        residual = np.abs(sample.distance) / sigma
-        counted = residual[sample.place == SURFACE]
-        edges = np.linspace(0, LARGEST, BINS + 1)
-        cells = np.minimum(counted, np.float32(LARGEST - 1e-3)) * np.float32(BINS / LARGEST)
-        histogram = np.bincount(cells.astype(np.int64), minlength=BINS)
         noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
+        tolerance = self._tolerance(sigma, level)
+        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise, tolerance)
+        residual = np.asarray(np.abs(sample.distance) / sigma, np.float32)
+        histogram = residual_histogram(residual[frame.surface])
         if self.config.method == "threshold":
-            dynamic = self._threshold_and_flood(volume, level, sample, noise)
+            dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
-        mixture = fit_mixture(histogram, edges)
-        rested = np.zeros(level.depth.shape, dtype=bool)
-        evidence = np.zeros(level.depth.shape, dtype=np.float32)
-        near = sample.place == SURFACE
-        evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
-        fits = near & (np.abs(sample.distance) < noise)  # eq. 4.57: below the noise nothing is called motion
-        evidence[fits] = np.maximum(evidence[fits], 1)
-        behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
-        evidence[behind] = np.maximum(evidence[behind], 0)
-        if self.config.free_space:
-            unknown = float(np.mean(sample.place[level.depth > 0] == UNKNOWN)) if level.depth.any() else 0.0
-            reach = np.float32(1.5) * noise.astype(np.float32)
-            seen_free, rested = self.memory.views(timestamp, level, T_world_camera, reach, unknown)
-            evidence[(sample.place == FREE) | seen_free] = -6
-        probability = labeling.mean_field(evidence, level.depth, tolerance, 4, 4)
+        mixture = fit_mixture(histogram, np.linspace(0, MAX_RESIDUAL, BINS + 1))
+        evidence, seen_static = self._evidence(frame, residual, mixture)
+        probability = labeling.mean_field(evidence, level.depth, tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
-        surface = None
+        segments = None
         if self.config.regions:
-            seeds = opened(dynamic) | (dynamic & (sample.place == FREE))
-            dynamic = self._regions(seeds, evidence, level, tolerance)
+            seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
+            dynamic = self._regions(frame, seeds, evidence)
             if self.config.pieces:
-                dynamic, surface = self._whole(
-                    dynamic, seeds, sample, sigma, segmentation(), level, T_world_camera, timestamp, exposure
-                )
+                dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None:
-                dynamic = dynamic | (moving & ~rested)
-            # what is no region fits the map badly for another reason: the robust weights deal with it
+                dynamic = dynamic | (moving & ~seen_static)
+            # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
         if self.config.free_space:
             hidden = self.background.hidden(timestamp, exposed(level, exposure), T_world_camera)
-        return Labels(probability, dynamic, mixture, histogram, sample, surface, hidden)
+        return Labels(probability, dynamic, mixture, histogram, sample, segments, hidden)
 
     def update(
         self,
@@ -139,82 +196,120 @@ class DynamicDetector:
         exposure: tuple[float, float],
         labels: Labels,
     ) -> None:
-        """Take over a frame that was tracked: what the next one is compared with."""
-        self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.surface)
+        """Remember a tracked frame, which the next ones are compared with.
+
+        Args:
+            timestamp: Seconds.
+            level: The image, at the resolution of the labels.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset that make the image's intensities those of the map.
+            labels: Labels of the frame.
+        """
+        self.memory.update(timestamp, level, T_world_camera, labels.dynamic, labels.segmentation)
         if self.config.free_space:
             self.background.update(timestamp, exposed(level, exposure), T_world_camera, labels.dynamic)
 
     def reset(self) -> None:
-        """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
+        """Forget the remembered frames after a loss of tracking."""
         self.memory.reset()
         self.background.reset()
 
     def _sigma(self, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-        """Standard deviation (h, w) of the distance of a static point: sensor noise and the map's own roughness."""
-        sensor = self.sensor.sigma_base + self.sensor.sigma_scale * depth**2
-        return np.hypot(sensor, 0.4 * voxel_size).astype(np.float32)
+        """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
+        return np.hypot(self.sensor.sigma(depth), MAP_ROUGHNESS * voxel_size).astype(np.float32)
 
     @staticmethod
-    def _tolerance(sigma: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    def _tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
         """Largest depth step (h, w) to a neighbour of the same surface, metres."""
-        return np.asarray(3 * sigma + np.float32(0.02) * depth, np.float32)
+        slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
+        return np.asarray(DEPTH_EDGE_SIGMAS * sigma + slope * level.depth, np.float32)
+
+    def _evidence(
+        self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture
+    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+        """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown, and pixels (h, w) seen to be static.
+
+        Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57), and at
+        least 0 where the map has a surface in front of the reading: what the map holds there is gone, so the map errs
+        and not the reading. In known free space they are -MAX_LOG_ODDS.
+        """
+        surface, sample, depth = frame.surface, frame.sample, frame.level.depth
+        evidence = np.zeros(depth.shape, dtype=np.float32)
+        evidence[surface] = np.clip(mixture.log_odds(residual[surface]), -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        within_noise = surface & (np.abs(sample.distance) < frame.noise)
+        evidence[within_noise] = np.maximum(evidence[within_noise], 1)
+        behind = surface & (sample.distance < 0)
+        evidence[behind] = np.maximum(evidence[behind], 0)
+        if not self.config.free_space:
+            return evidence, np.zeros(depth.shape, dtype=bool)
+        unknown = float(np.mean(frame.unknown[depth > 0])) if depth.any() else 0.0
+        max_gap = np.float32(1.5) * frame.noise.astype(np.float32)
+        seen_free, seen_static = self.memory.free_and_static(
+            frame.timestamp, frame.level, frame.T_world_camera, max_gap, unknown
+        )
+        evidence[frame.free | seen_free] = -MAX_LOG_ODDS
+        return evidence, seen_static
 
     def _regions(
-        self, seeds: NDArray[np.bool_], evidence: NDArray[np.float32], level: Level, tolerance: NDArray[np.float32]
+        self, frame: _Comparison, seeds: NDArray[np.bool_], evidence: NDArray[np.float32]
     ) -> NDArray[np.bool_]:
-        """Grow each moving spot over the surface it belongs to, up to what fits the map or a depth edge."""
-        labels, count = labeling.grow_regions(seeds, evidence < 1, level.depth, tolerance)
+        """Pixels (h, w) of regions that grow from moving seeds over the surface, up to depth edges and static pixels.
+
+        A region of at least MIN_REGION is dynamic as a whole if SEEDED_SHARE of it are seeds; else its seeds are.
+        """
+        labels, count = labeling.grow_regions(seeds, evidence < 1, frame.level.depth, frame.tolerance)
         areas = np.bincount(labels.reshape(-1), minlength=count + 1)
         seeded = np.bincount(labels[seeds], minlength=count + 1)
-        smallest = 0.0008 * seeds.size
-        whole = (areas >= smallest) & (seeded >= 0.25 * areas)
-        some = (areas >= smallest) & ~whole
-        whole[0] = some[0] = False
-        return whole[labels] | (some[labels] & seeds)
+        large = areas >= MIN_REGION * seeds.size
+        large[0] = False
+        whole = large & (seeded >= SEEDED_SHARE * areas)
+        return whole[labels] | ((large & ~whole)[labels] & seeds)
 
-    def _whole(
+    def _segments(
         self,
+        frame: _Comparison,
         dynamic: NDArray[np.bool_],
         seeds: NDArray[np.bool_],
-        sample: MapSample,
-        sigma: NDArray[np.float32],
-        surface: Segmentation,
-        level: Level,
-        T_world_camera: NDArray[np.float64],
-        timestamp: float,
-        exposure: tuple[float, float],
+        segmentation: Segmentation,
     ) -> tuple[NDArray[np.bool_], Segmentation]:
-        """Decide piece by piece: all of a thing moves, or it has stood still for some time and none of it does."""
-        marks = self.memory.marks(level, T_world_camera, REACH)
-        moved = (marks & MOVED) > 0
-        surface = split(surface, (marks & BODY) > 0)
-        # what the map does not know begins to move with the piece it belongs to, not with what is beside it
-        known = sample.place != UNKNOWN
-        begun = surface.share(seeds) >= 0.1
-        at_rest = surface.share(known & ~dynamic) > np.maximum(0.5, 9 * surface.share(known & dynamic))
-        dynamic = dynamic & (known | begun[surface.labels] | (moved & ~at_rest[surface.labels]))
-        gain, offset = exposure
-        exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = np.asarray(sample.difference + exposed, np.float32)
-        noise = np.maximum(np.float32(self.config.noise_threshold / 3), sigma)
-        verdict = judge(surface, sample.place == SURFACE, dynamic, sample.distance, noise, difference)
-        moving = dynamic | classify_segments(verdict, surface.share(moved))[surface.labels]
-        return moving & ~self.memory.standing(timestamp, level, T_world_camera, surface, noise, moving), surface
+        """Dynamic pixels (h, w) decided by segment, and the segments.
 
-    def _threshold_and_flood(
-        self, volume: TsdfVolume, level: Level, sample: MapSample, noise: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """The simple rule: far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019).
+        1. Pixels in unknown space are dynamic only in a segment at least a tenth of which are seeds, or where they
+           were dynamic in the last frame and the known part of their segment is not static.
+        2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
+        3. Segments that have settled are static.
+        """
+        level, T_world_camera, sample = frame.level, frame.T_world_camera, frame.sample
+        marks = self.memory.last_marks(level, T_world_camera, MAX_DISPLACEMENT)
+        before = (marks & DYNAMIC_PIXEL) > 0
+        segmentation = split_mixed_segments(segmentation, (marks & DYNAMIC_SEGMENT) > 0)
+        known = ~frame.unknown
+        started = segmentation.share(seeds) >= 0.1
+        static = segmentation.share(known & ~dynamic) > np.maximum(0.5, 9 * segmentation.share(known & dynamic))
+        labels = segmentation.labels
+        dynamic = dynamic & (known | started[labels] | (before & ~static[labels]))
+        gain, offset = frame.exposure
+        correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
+        difference = np.asarray(sample.difference + correction, np.float32)
+        sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
+        evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
+        dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]
+        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
+        return dynamic & ~settled, segmentation
+
+    def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
+        """Pixels (h, w) far from the surface, eroded, flooded over depth, dilated (Palazzolo et al. 2019).
 
         The flood stops at what fits the map: over depth alone it runs from a foot over the floor through the room.
         """
         import cv2
 
-        distance = np.abs(np.nan_to_num(sample.distance))
-        free = sample.place == FREE
-        marked = (distance > min(self.config.threshold, 0.95 * volume.truncation)) | free
+        level = frame.level
+        distance = np.abs(np.nan_to_num(frame.sample.distance))
+        marked = (distance > min(self.config.threshold, 0.95 * truncation)) | frame.free
         scale = level.camera.width / 640
         core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(15 * scale)) > 0
         tolerance = np.float32(0.007 / scale) * level.depth
-        labels, _ = labeling.grow_regions(core & (level.depth > 0), (distance > noise) | free, level.depth, tolerance)
+        open_pixels = (distance > frame.noise) | frame.free
+        labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(10 * scale)) > 0

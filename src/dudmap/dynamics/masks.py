@@ -1,10 +1,11 @@
-"""Labels of a frame and the masks that are made from them."""
+"""Labels of a frame, and the masks derived from them."""
 
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.dynamics.label_scale import pixel_scale, scaled_side
 from dudmap.dynamics.mixture import Mixture
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
@@ -14,16 +15,16 @@ from dudmap.mapping.volume import MapSample
 
 @dataclass(frozen=True, eq=False)
 class Labels:
-    """Outcome for one frame, at the resolution of the label level.
+    """Static and dynamic pixels of one frame, at the resolution of the label level.
 
     Attributes:
-        static_probability: (h, w) float32 in [0, 1]; the weight of the second registration.
+        static_probability: (h, w) float32 in [0, 1]; the weights of the second registration.
         dynamic: (h, w) bool.
-        mixture: The fitted densities, None for methods that fit none.
-        histogram: (BINS,) normalised residuals.
-        sample: What the map says at the points.
-        surface: Segmentation of surface, None where they are not asked.
-        hidden: (h, w) bool, pixels without a reading that hide something static; None where they are not asked for.
+        mixture: The fitted densities; None for methods that fit none.
+        histogram: (BINS,) counts of the normalised residuals.
+        sample: Distance, intensity difference and occupancy of the map at the points of the frame.
+        segmentation: Surface segments of the frame; None where motion is not decided by segment.
+        hidden: (h, w) bool, pixels without a reading in front of known background; None where that is not examined.
     """
 
     static_probability: NDArray[np.float32]
@@ -31,22 +32,36 @@ class Labels:
     mixture: Mixture | None
     histogram: NDArray[np.int64]
     sample: MapSample
-    surface: Segmentation | None = None
+    segmentation: Segmentation | None = None
     hidden: NDArray[np.bool_] | None = None
 
 
-def opened(mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask without what is thinner than three pixels: the seams along depth edges, where readings fit no map."""
+SEAM = 1
+"""Half width of the seams along depth edges where readings fit no map, pixels at REFERENCE_WIDTH."""
+CLOSING_RADIUS = 2
+"""Half width of the holes in the depth that belong to the dynamic region around them, pixels at REFERENCE_WIDTH."""
+
+
+def opened_mask(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
+    """Mask (h, w) of an image without parts as thin as the seams along its depth edges."""
     import cv2
 
-    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8)) > 0
+    side = scaled_side(SEAM, level)
+    return cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
 
 def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Moving pixels (H, W) bool at full size; holes in the depth inside a moving region belong to it."""
+    """Dynamic pixels (H, W) bool at full resolution, with the holes of the depth inside of a dynamic region.
+
+    Args:
+        labels: Labels of the frame.
+        level: The image they belong to.
+        depth: (H, W) float32, metres, 0 = none.
+    """
     import cv2
 
-    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, elliptical_kernel(2))
+    element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
+    low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
     if labels.hidden is not None:
         low[labels.hidden] = 1
@@ -54,12 +69,19 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
 
 
 def full_size(low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32]) -> NDArray[np.bool_]:
-    """Mask (h, w) at the size (H, W) of a depth image: a pixel takes after the nearby one whose depth is most alike."""
-    return labeling.upsample_labels(low, low_depth, depth, depth.shape[1] // low.shape[1])
+    """Mask (h, w) of a pyramid level at the resolution (H, W) of its depth image; see ``labeling.upsample_labels``.
+
+    Args:
+        low: (h, w) bool; a level is made by halvings, which round odd sizes down.
+        low_depth: (h, w) float32, metres, 0 = none.
+        depth: (H, W) float32, metres, 0 = none.
+    """
+    halvings = round(np.log2(depth.shape[1] / low.shape[1]))
+    return labeling.upsample_labels(low, low_depth, depth, 1 << halvings)
 
 
 def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
-    """Mask (H, W) widened by some pixels."""
+    """Mask (H, W) dilated by some pixels."""
     import cv2
 
     if pixels == 0 or not mask.any():

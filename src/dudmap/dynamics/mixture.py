@@ -8,21 +8,27 @@ from numpy.typing import NDArray
 from dudmap.kernels import labeling
 
 BINS = 128
-LARGEST = 16.0
-"""Normalised residuals are counted in BINS bins from 0 to LARGEST standard deviations."""
+"""Bins of the histogram of normalised residuals."""
+MAX_RESIDUAL = 16.0
+"""Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
 START = 0.1, 1.0, 6.0
-"""Where the expectation maximisation starts: prior of the dynamic density, standard deviations of both."""
+"""Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
 PRIOR_BOUNDS = 0.02, 0.98
-"""Bounds of the prior of the dynamic density."""
+"""Bounds of the prior of the dynamic density; they keep its logarithm finite."""
 STATIC_BOUNDS = 0.5, 2.0
-"""Bounds of the standard deviation of the static density: 1 if the sensor model were exact."""
+"""Bounds of the standard deviation of the static density, which is 1 where the sensor model is exact."""
 SEPARATION = 3.0
-"""Least ratio of the standard deviations, dynamic : static."""
+"""Least ratio of the standard deviations, dynamic : static, so that the components cannot swap."""
 
 
 @dataclass(frozen=True)
 class Mixture:
-    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56): static and dynamic."""
+    """Two half-normal densities of the normalised residual (eq. 4.52, 4.56), static and dynamic.
+
+    Attributes:
+        prior: Prior probabilities of both components.
+        sigma: Their standard deviations.
+    """
 
     prior: tuple[float, float]
     sigma: tuple[float, float]
@@ -44,14 +50,22 @@ class Mixture:
         )
 
 
+def residual_histogram(residuals: NDArray[np.float32]) -> NDArray[np.int64]:
+    """Histogram (BINS,) of normalised residuals (n,) >= 0 up to MAX_RESIDUAL."""
+    bins = np.minimum(residuals, np.float32(MAX_RESIDUAL - 1e-3)) * np.float32(BINS / MAX_RESIDUAL)
+    return np.bincount(bins.astype(np.int64), minlength=BINS)
+
+
 def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = 30) -> Mixture:
     """Expectation maximisation on a histogram of normalised residuals (eq. 4.52-4.56; Dempster et al. 1977).
 
-    The static density is kept at one to two standard deviations of the sensor and the dynamic one at no less than
-    three times the static one, so that the names of the components cannot swap.
+    Args:
+        histogram: (n,) counts.
+        edges: (n + 1,) edges of the bins.
+        iterations: Most iterations.
     """
     centers = (edges[:-1] + edges[1:]) / 2
     prior, static, dynamic = labeling.fit_mixture(
-        histogram.astype(np.float64), centers, iterations, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION, LARGEST
+        histogram.astype(np.float64), centers, iterations, START, PRIOR_BOUNDS, STATIC_BOUNDS, SEPARATION, MAX_RESIDUAL
     )
     return Mixture((1 - prior, prior), (static, dynamic))

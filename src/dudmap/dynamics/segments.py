@@ -1,76 +1,93 @@
-"""Whether a whole piece of surface moves: what its pixels say of it together, and how long it has stood still."""
+"""Surface segments of an image, and the decision whether a whole segment moves."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.frames.observation import Level
-from dudmap.kernels import segmentation
+from dudmap.kernels import segmentation as kernels
 
-REACH = 3
-"""Pixels to either side of a hollow."""
+EDGE_REACH = 3
+"""Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
+NORMAL_REACH = 2
+"""Pixels to either side over which a normal is estimated, at REFERENCE_WIDTH."""
 CONCAVITY = 0.2
-"""Sine of half the angle by which the surface turns in a hollow."""
-SMALLEST = 60
-"""Segments of fewer pixels are not judged as a whole."""
-LARGEST = 0.15
-"""Segments larger than this share of the image belong to the room and move only if nearly all their pixels do."""
-SHIFT = 2.8
-"""Mean distance to the map, in standard deviations of a reading, of a piece that surely moved."""
-MISMATCH = 0.48
-"""Mean difference of intensity over mean gradient of intensity of a piece that surely moved: pixels of motion."""
-ORDINARY_SHIFT, ORDINARY_MISMATCH = 0.4, 0.17
-"""What three of four pieces of a good frame stay below; where they have more, so must one that moved."""
-FLOOR = 0.03
-"""Gradients smaller than this tell nothing, intensity per pixel."""
+"""Sine of half the smallest angle between the normals across a concave edge: 23 degrees."""
+MIN_PIXELS = 60
+"""Segments of fewer pixels are not classified as a whole, at REFERENCE_WIDTH: 0.3 % of an image of 4:3."""
+MAX_SHARE = 0.15
+"""Segments that cover more than this share of the readings belong to the room: they are dynamic only if nearly all of
+their pixels are."""
+DISTANCE_SCALE = 2.8
+"""Mean distance to the map of a segment that surely moved, standard deviations of a reading."""
+MISMATCH_SCALE = 0.48
+"""Intensity mismatch of a segment that surely moved, pixels of motion at REFERENCE_WIDTH."""
+COMMON_DISTANCE, COMMON_MISMATCH = 0.4, 0.17
+"""Upper quartiles of both over the static segments of a well registered frame; where the quartiles of a frame are
+larger, the scales grow in proportion."""
+GRADIENT_NOISE = 0.03
+"""Intensity gradient of noise, per pixel at REFERENCE_WIDTH: smaller ones give no evidence."""
 
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Segmentation of surface of one image.
+    """Surface segments of one image.
 
     Attributes:
-        labels: (h, w) int32 numbers from 1, 0 = no reading.
-        count: How many there are.
-        gradient: (h, w) float32, intensity per pixel, mean over 3x3.
+        labels: (h, w) int32 segment numbers from 1, 0 = no reading.
+        count: Number of segments.
+        gradient: (h, w) float32, local mean of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
+        window: Side of the window for local means of intensities, pixels.
     """
 
     labels: NDArray[np.int32]
     count: int
     gradient: NDArray[np.float32]
+    min_pixels: float = MIN_PIXELS
+    window: int = 3
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
-        """Share (count + 1,) of the pixels of each piece that are among these (h, w) bool; entry 0 means nothing."""
+        """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""
         total = np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
         return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(total, 1)
 
 
 @dataclass(frozen=True, eq=False)
 class SegmentEvidence:
-    """What the pixels of each piece say together; all (count + 1,), entry 0 means nothing.
+    """Evidence of motion per segment, gathered over its pixels; all arrays (count + 1,) float64, entry 0 is
+    meaningless.
+
+    A pixel of a segment is compared where the map (or an older frame) has a surface near it, and counts as static
+    where it is compared and is not dynamic by itself.
 
     Attributes:
-        size: Pixels.
-        known: Share of the pixels that could be compared.
-        moving: Share of the pixels that move by themselves.
-        rest: Number of pixels that could be compared and do not move by themselves.
-        shift: Of these, mean distance over its standard deviation,
-        mismatch: mean difference of the intensities from their mean difference, in pixels of motion,
-        texture: and mean gradient of the intensity.
+        size: Number of pixels.
+        compared: Share of the pixels that are compared.
+        dynamic: Share of the pixels that are dynamic by themselves.
+        static: Number of static pixels.
+        distance: Mean of distance / sigma over the static pixels.
+        mismatch: Intensity mismatch of the static pixels in pixels of motion: the mean absolute deviation D of their
+            intensity difference from its mean, over their mean gradient G, damped where G is no larger than noise:
+            D G / (G + GRADIENT_NOISE)^2.
+        texture: Mean intensity gradient G of the static pixels.
+        min_pixels: Fewest pixels of a segment that is classified as a whole.
     """
 
     size: NDArray[np.float64]
-    known: NDArray[np.float64]
-    moving: NDArray[np.float64]
-    rest: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    compared: NDArray[np.float64]
+    dynamic: NDArray[np.float64]
+    static: NDArray[np.float64]
+    distance: NDArray[np.float64]
     mismatch: NDArray[np.float64]
     texture: NDArray[np.float64]
+    min_pixels: float = MIN_PIXELS
 
 
 def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
-    """Cut an image's surface along depth edges and concave_edges.
+    """Cut the surface an image shows along depth edges and concave edges (Stein et al. 2014).
 
     Args:
         level: The image.
@@ -78,98 +95,124 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
     """
     import cv2
 
-    labels, count = segmentation.segment_surface(level.depth, level.camera.intrinsics, tolerance, REACH, 2, CONCAVITY)
-    du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=1 / 8)
-    dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=1 / 8)
-    gradient = cv2.blur(cv2.magnitude(du, dv), (3, 3))
-    return Segmentation(labels, count, np.asarray(gradient, dtype=np.float32))
+    edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
+    labels, count = kernels.segment_surface(
+        level.depth, level.camera.intrinsics, tolerance, edge_reach, normal_reach, CONCAVITY
+    )
+    scale, window = pixel_scale(level), scaled_side(1, level)
+    du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=scale / 8)
+    dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=scale / 8)
+    gradient = np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
+    return Segmentation(labels, count, gradient, scaled_area(MIN_PIXELS, level), window)
 
 
-def split(surface: Segmentation, body: NDArray[np.bool_]) -> Segmentation:
-    """Segmentation in which a moving and a resting piece of the last frame have met, as two.
+def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.bool_]) -> Segmentation:
+    """Segmentation in which segments that were separate in the last frame, a dynamic and a static one, stay separate.
+
+    A segment is split where each part holds at least a fifth of its pixels; a smaller part has merely come into view.
 
     Args:
-        surface: The pieces.
-        body: (h, w) bool, pixels that belonged to a moving piece.
+        segmentation: The segments.
+        dynamic_before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
     """
-    total = np.bincount(surface.labels.reshape(-1), minlength=surface.count + 1)
-    part = np.bincount(surface.labels[body], minlength=surface.count + 1)
-    mixed = np.minimum(part, total - part) >= np.maximum(SMALLEST, 0.2 * total)  # less is what came into view
+    total = np.bincount(segmentation.labels.reshape(-1), minlength=segmentation.count + 1)
+    part = np.bincount(segmentation.labels[dynamic_before], minlength=segmentation.count + 1)
+    mixed = np.minimum(part, total - part) >= np.maximum(segmentation.min_pixels, 0.2 * total)
     mixed[0] = False
     if not mixed.any():
-        return surface
-    number = np.zeros(surface.count + 1, dtype=np.int32)
-    number[mixed] = np.arange(surface.count + 1, surface.count + 1 + np.count_nonzero(mixed))
-    labels = np.where(body & mixed[surface.labels], number[surface.labels], surface.labels)
-    return Segmentation(labels, surface.count + int(np.count_nonzero(mixed)), surface.gradient)
+        return segmentation
+    count = segmentation.count + int(np.count_nonzero(mixed))
+    number = np.zeros(segmentation.count + 1, dtype=np.int32)
+    number[mixed] = np.arange(segmentation.count + 1, count + 1)
+    split = dynamic_before & mixed[segmentation.labels]
+    labels = np.where(split, number[segmentation.labels], segmentation.labels)
+    return replace(segmentation, labels=labels, count=count)
 
 
-def judge(
-    surface: Segmentation,
-    used: NDArray[np.bool_],
-    moving: NDArray[np.bool_],
+def segment_evidence(
+    segmentation: Segmentation,
+    compared: NDArray[np.bool_],
+    dynamic: NDArray[np.bool_],
     distance: NDArray[np.float32],
     sigma: NDArray[np.float32],
     difference: NDArray[np.float32],
 ) -> SegmentEvidence:
-    """Evidence of each piece as a whole.
+    """Evidence of motion of each segment.
 
     Args:
-        surface: The pieces.
-        used: (h, w) bool, pixels whose distance and difference are known.
-        moving: (h, w) bool, pixels that move by themselves.
-        distance: (h, w) float32, metres; anything where not used.
-        sigma: (h, w) float32, metres.
-        difference: (h, w) float32, of intensities; anything where not used.
+        segmentation: The segments.
+        compared: (h, w) bool, pixels whose distance and difference are known.
+        dynamic: (h, w) bool, pixels that are dynamic by themselves.
+        distance: (h, w) float32, metres; arbitrary where not compared.
+        sigma: (h, w) float32, standard deviation of the distance, metres.
+        difference: (h, w) float32, of intensities; arbitrary where not compared.
     """
     import cv2
 
-    ones = used.astype(np.float32)
-    mean = cv2.blur(np.where(used, difference, np.float32(0)), (3, 3)) / np.maximum(
-        cv2.blur(ones, (3, 3)), np.float32(1e-3)
+    ones = compared.astype(np.float32)
+    window = segmentation.window, segmentation.window
+    mean_difference = cv2.blur(np.where(compared, difference, np.float32(0)), window) / np.maximum(
+        cv2.blur(ones, window), np.float32(1e-3)
     )
-    sums = segmentation.segment_sums(
-        surface.labels, surface.count, used, moving, distance, sigma, np.asarray(mean, np.float32), surface.gradient
-    )
-    size, known = np.maximum(sums.pixels, 1), np.maximum(sums.static, 1)
-    texture = sums.gradient / known
-    return SegmentEvidence(
-        sums.pixels, sums.compared / size, sums.moving / size, sums.static, sums.distance / known,
-        sums.deviation / known * texture / (texture + FLOOR) ** 2, texture,
+    sums = kernels.segment_sums(
+        segmentation.labels, segmentation.count, compared, dynamic, distance, sigma,
+        np.asarray(mean_difference, np.float32), segmentation.gradient,
     )  # fmt: skip
+    size, static = np.maximum(sums.pixels, 1), np.maximum(sums.static, 1)
+    texture = sums.gradient / static
+    return SegmentEvidence(
+        size=sums.pixels,
+        compared=sums.compared / size,
+        dynamic=sums.moving / size,
+        static=sums.static,
+        distance=sums.distance / static,
+        mismatch=sums.deviation / static * texture / (texture + GRADIENT_NOISE) ** 2,
+        texture=texture,
+        min_pixels=segmentation.min_pixels,
+    )
 
 
-def classify_segments(verdict: SegmentEvidence, moved: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which pieces (count + 1,) move, all of each.
+def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which segments (count + 1,) move as a whole.
 
-    A piece moves if nearly all of its pixels do by themselves. A piece that is not too large also moves if a part of it
-    does and the rest fits badly, by its distances and intensities together and by more than is common in this frame;
-    the larger the part, the less will do, and still less where it moved in the last frame: a thing does not move by
-    halves.
+    Let d be a segment's share of dynamic pixels, b the same in the last frame, s and m the mean distance and the
+    intensity mismatch of its static pixels, and S and M the scales of both: DISTANCE_SCALE and MISMATCH_SCALE, larger
+    in a frame whose static segments have large quartiles. With
+
+        strong = (max(s, 0) / S)^2 + (m / M)^2    and    weak = (s / (0.35 S))^2 + (m / (0.7 M))^2
+
+    a segment of at least ``min_pixels`` is dynamic if d >= 0.8, or if it covers at most MAX_SHARE of the readings and
+
+    - d >= 0.1 and strong >= 1, where at least half of it is compared, or
+    - d >= 0.2 and weak >= 1, or d >= 0.6 where it has too little texture or too few static pixels for evidence, or
+    - b >= 0.7, d >= 0.2 and weak >= 0.4, or
+    - b >= 0.4, d >= 0.4 and weak >= 0.5.
 
     Args:
-        verdict: Evidence of each piece.
-        moved: (count + 1,) share of the pixels that moved in the last frame.
+        evidence: Evidence of each segment.
+        dynamic_before: (count + 1,) share of the pixels that were dynamic in the last frame.
     """
-    counted = np.flatnonzero((verdict.known > 0.5) & (verdict.size >= SMALLEST))
-    resting = counted[verdict.moving[counted] < 0.5]
-    shift = SHIFT * max(1.0, upper_quartile(np.abs(verdict.shift[resting])) / ORDINARY_SHIFT)
-    mismatch = MISMATCH * max(1.0, upper_quartile(verdict.mismatch[resting]) / ORDINARY_MISMATCH)
-    score = np.zeros(len(verdict.size))
-    score[counted] = ((np.maximum(verdict.shift, 0) / shift) ** 2 + (verdict.mismatch / mismatch) ** 2)[counted]
-    doubt = (verdict.shift / (0.35 * shift)) ** 2 + (verdict.mismatch / (0.7 * mismatch)) ** 2
-    telling = (verdict.texture > FLOOR) & (verdict.rest >= 0.5 * SMALLEST)
-    whole = (score >= 1) & (verdict.moving >= 0.1)
-    whole |= np.where(telling, (verdict.moving >= 0.2) & (doubt >= 1), verdict.moving >= 0.6)
-    whole |= (moved >= 0.7) & (verdict.moving >= 0.2) & (doubt >= 0.4)
-    whole |= (moved >= 0.4) & (verdict.moving >= 0.4) & (doubt >= 0.5)
-    whole &= verdict.size <= LARGEST * verdict.size[1:].sum()
-    whole |= verdict.moving >= 0.8
-    whole &= verdict.size >= SMALLEST
-    whole[0] = False
-    return whole
+    counted = np.flatnonzero((evidence.compared > 0.5) & (evidence.size >= evidence.min_pixels))
+    static = counted[evidence.dynamic[counted] < 0.5]
+    distance_scale = DISTANCE_SCALE * max(1.0, upper_quartile(np.abs(evidence.distance[static])) / COMMON_DISTANCE)
+    mismatch_scale = MISMATCH_SCALE * max(1.0, upper_quartile(evidence.mismatch[static]) / COMMON_MISMATCH)
+    strong = np.zeros(len(evidence.size))
+    strong[counted] = (
+        (np.maximum(evidence.distance, 0) / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2
+    )[counted]
+    weak = (evidence.distance / (0.35 * distance_scale)) ** 2 + (evidence.mismatch / (0.7 * mismatch_scale)) ** 2
+    informative = (evidence.texture > GRADIENT_NOISE) & (evidence.static >= 0.5 * evidence.min_pixels)
+    dynamic = (strong >= 1) & (evidence.dynamic >= 0.1)
+    dynamic |= np.where(informative, (evidence.dynamic >= 0.2) & (weak >= 1), evidence.dynamic >= 0.6)
+    dynamic |= (dynamic_before >= 0.7) & (evidence.dynamic >= 0.2) & (weak >= 0.4)
+    dynamic |= (dynamic_before >= 0.4) & (evidence.dynamic >= 0.4) & (weak >= 0.5)
+    dynamic &= evidence.size <= MAX_SHARE * evidence.size[1:].sum()
+    dynamic |= evidence.dynamic >= 0.8
+    dynamic &= evidence.size >= evidence.min_pixels
+    dynamic[0] = False
+    return dynamic
 
 
 def upper_quartile(values: NDArray[np.float64]) -> float:
-    """What three of four values stay below; 0 if there is none."""
+    """75th percentile; 0 of no values."""
     return float(np.percentile(values, 75)) if len(values) else 0.0

@@ -1,4 +1,4 @@
-"""Recent frames that tell what moved a moment ago and what has stood still since."""
+"""Recent frames: what moved in the last one, what they have seen through, and what has stood still since."""
 
 from collections import deque
 from collections.abc import Sequence
@@ -8,71 +8,83 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.segments import ORDINARY_MISMATCH, SMALLEST, Segmentation, judge, upper_quartile
+from dudmap.dynamics.label_scale import scaled_side
+from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, segment_evidence, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels import segmentation
+from dudmap.kernels import segmentation as kernels
 
-MEMORIES = 4
-"""Frames that are kept of the time in which a thing must stand still."""
-YOUTH = 3.0
-"""Times `start_seconds` for which space that was seen free from single frames counts; later the map knows it."""
-ALIKE = 0.08
-"""Intensities that differ by less are the same."""
-RESTED = 0.3
-"""Share of `start_seconds` in which a thing must have been seen at its place to have rested there."""
-SEAM = 3
-"""What is thinner, pixels, may come from a pose that is a little off along a depth edge."""
-VIEWS = 6
-"""Frames that are kept of `start_seconds` to know that."""
+SETTLE_FRAMES = 4
+"""Frames kept of ``settle_time``, in which a segment must stand still to be released."""
+START_FRAMES = 6
+"""Frames kept of ``start_seconds``, whose lines of sight are free space."""
+YOUNG_PERIODS = 3.0
+"""Age of the map, in units of ``start_seconds``, up to which single frames give free space; later the map does."""
 YOUNG_UNKNOWN_SHARE = 0.1
-"""Share of the readings in space the map has not seen from which on an old map counts as young, too."""
-MOVED, BODY = 1, 2
-"""Bits of a pixel of the last frame: it was called moving; a part of its piece was."""
+"""Share of the readings in space unknown to the map from which on single frames give free space at any age."""
+SAME_INTENSITY = 0.08
+"""Largest intensity difference of two readings of one static point."""
+STATIC_PERIOD = 0.3
+"""Time, in units of ``start_seconds``, over which a point must have been seen in place to count as static."""
+SEAM = 1
+"""Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+STATIC_RADIUS = 2
+"""Radius of the median filter of static pixels, pixels at REFERENCE_WIDTH."""
+DYNAMIC_PIXEL, DYNAMIC_SEGMENT = 1, 2
+"""Bits of a pixel's mark in a remembered frame: it was dynamic; it belonged to a segment with dynamic pixels."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Memory:
+class RememberedFrame:
+    """A tracked frame with its labels.
+
+    Attributes:
+        timestamp: Seconds.
+        level: The image.
+        T_world_camera: (4, 4).
+        marks: (h, w) uint8, DYNAMIC_PIXEL and DYNAMIC_SEGMENT.
+    """
+
     timestamp: float
     level: Level
     T_world_camera: NDArray[np.float64]
-    marks: NDArray[np.uint8]  # MOVED, BODY
+    marks: NDArray[np.uint8]
 
 
 class TemporalMemory:
-    """The last frames, to tell what moved a moment ago and what has stood still since.
+    """Remembered frames that new ones are compared with.
 
     Args:
-        config: ``settle_time``.
+        config: ``settle_time`` and ``start_seconds``.
     """
 
     def __init__(self, config: DynamicsConfig) -> None:
         self.config = config
-        self._last: _Memory | None = None
-        self._memories: deque[_Memory] = deque()
+        self._last: RememberedFrame | None = None
+        self._settle_frames: deque[RememberedFrame] = deque()
+        self._recent_frames: deque[RememberedFrame] = deque()
+        self._start_frames: list[RememberedFrame] = []
+        self._imported = False  # the frames of the first seconds come from another pass
         self._young_until = -np.inf
-        self._views: list[_Memory] = []  # of the first seconds
-        self._recent: deque[_Memory] = deque()  # of the last moments
-        self._complete = False  # those of the first seconds come from another pass
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map, of this time in seconds."""
-        self._young_until = timestamp + YOUTH * self.config.start_seconds
-        self._views = []
-        self._recent.clear()
+        self._young_until = timestamp + YOUNG_PERIODS * self.config.start_seconds
+        self._start_frames = []
+        self._recent_frames.clear()
 
     def import_from(self, other: "TemporalMemory", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
-        """Take over what another pass over the same frames has seen in the first seconds.
+        """Import the frames of the first seconds from another pass over the same recording.
 
         Args:
-            other: Its memory.
-            Ts_world_camera: (4, 4) by time, where it saw the frames; others are left out.
+            other: The memory of that pass.
+            Ts_world_camera: (4, 4) poses of its frames by timestamp; frames without one are left out.
         """
-        self._young_until, self._complete = other._young_until, True
-        self._views = [
-            replace(view, T_world_camera=Ts_world_camera[view.timestamp])
-            for view in other._views
-            if view.timestamp in Ts_world_camera
+        self._young_until, self._imported = other._young_until, True
+        self._start_frames = [
+            replace(frame, T_world_camera=Ts_world_camera[frame.timestamp])
+            for frame in other._start_frames
+            if frame.timestamp in Ts_world_camera
         ]
 
     def update(
@@ -80,41 +92,60 @@ class TemporalMemory:
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
-        moving: NDArray[np.bool_],
-        surface: Segmentation | None,
+        dynamic: NDArray[np.bool_],
+        segmentation: Segmentation | None,
     ) -> None:
-        """Keep the frame, which was tracked, its labels (h, w) bool and its pieces."""
-        marks = moving.astype(np.uint8)
-        if surface is not None:
-            marks[((surface.share(moving) >= 0.2) & (np.arange(surface.count + 1) > 0))[surface.labels]] |= BODY
-        self._last = _Memory(timestamp, level, T_world_camera, marks)
-        if not self._memories or timestamp - self._memories[-1].timestamp >= self.config.settle_time / MEMORIES:
-            self._memories.append(self._last)
-        if not self._recent or timestamp - self._recent[-1].timestamp >= self.config.start_seconds / VIEWS:
-            self._recent.append(self._last)
-            if timestamp < self._young_until and not self._complete:
-                self._views.append(self._last)
-        while timestamp - self._recent[0].timestamp > self.config.start_seconds:
-            self._recent.popleft()
-        while len(self._memories) > 1 and timestamp - self._memories[1].timestamp >= self.config.settle_time:
-            self._memories.popleft()
+        """Remember a tracked frame.
+
+        Args:
+            timestamp: Seconds.
+            level: The image.
+            T_world_camera: (4, 4).
+            dynamic: (h, w) bool.
+            segmentation: Segments of the image; None where motion is not decided by segment.
+        """
+        marks = dynamic.astype(np.uint8)
+        if segmentation is not None:
+            dynamic_segments = segmentation.share(dynamic) >= 0.2
+            dynamic_segments[0] = False
+            marks[dynamic_segments[segmentation.labels]] |= DYNAMIC_SEGMENT
+        settle_time, start_seconds = self.config.settle_time, self.config.start_seconds
+        self._last = frame = RememberedFrame(timestamp, level, T_world_camera, marks)
+        settle_frames, recent_frames = self._settle_frames, self._recent_frames
+        if not settle_frames or timestamp - settle_frames[-1].timestamp >= settle_time / SETTLE_FRAMES:
+            settle_frames.append(frame)
+        if not recent_frames or timestamp - recent_frames[-1].timestamp >= start_seconds / START_FRAMES:
+            recent_frames.append(frame)
+            if timestamp < self._young_until and not self._imported:
+                self._start_frames.append(frame)
+        while timestamp - recent_frames[0].timestamp > start_seconds:
+            recent_frames.popleft()
+        while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
+            settle_frames.popleft()
 
     def reset(self) -> None:
-        """Tracking was lost: what was seen before says nothing of what stood still meanwhile."""
+        """Forget all frames after a loss of tracking; those imported from another pass stay."""
         self._last = None
-        self._memories.clear()
-        self._recent.clear()
-        self._views = self._views if self._complete else []
+        self._settle_frames.clear()
+        self._recent_frames.clear()
+        self._start_frames = self._start_frames if self._imported else []
 
-    def marks(self, level: Level, T_world_camera: NDArray[np.float64], reach: float) -> NDArray[np.uint8]:
-        """What each pixel (h, w) was in the last frame, MOVED and BODY, if its point is nearer than ``reach`` (m)."""
+    def last_marks(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.uint8]:
+        """Marks (h, w) uint8 of the last frame at the points of an image.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            max_gap: Largest depth difference between a point and the last frame's reading of it, metres; points
+                farther away have the mark 0.
+        """
         if self._last is None or not self._last.marks.any():
             return np.zeros(level.depth.shape, dtype=np.uint8)
-        ((gap, _, marks),) = reproject_difference(level, T_world_camera, [self._last])
-        marks[~(np.abs(gap) < reach)] = 0
+        ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
+        marks[~(np.abs(gap) < max_gap)] = 0
         return marks
 
-    def views(
+    def free_and_static(
         self,
         timestamp: float,
         level: Level,
@@ -122,85 +153,102 @@ class TemporalMemory:
         noise: NDArray[np.float32],
         unknown: float = 0.0,
     ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """What single frames of the last moments say of each pixel, while the map is young, or knows little of what is
-        in view; else nothing.
+        """Pixels in space that single frames have seen to be free, and pixels seen to be static.
 
-        In the first seconds a second pass also asks the frames of the next moments.
+        Single frames are compared while the map is young, and where it does not know much of what is in view;
+        otherwise both masks are empty. In the first seconds of a second pass later frames are compared, too.
+
+        A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
+        at least half as many frames have as have seen a surface at it. A point is static if all frames that see it,
+        two at least, have seen the same surface and intensity there, over STATIC_PERIOD at least.
 
         Args:
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
-            noise: (h, w) float32, largest gap between two readings of one point, metres.
-            unknown: Share of the readings that lie in space the map has not seen.
+            noise: (h, w) float32, largest depth difference between two readings of one point, metres.
+            unknown: Share of the readings that lie in space unknown to the map.
 
         Returns:
-            (h, w) bool, pixels whose point lies in space through which those frames have seen farther,
-            (h, w) bool, pixels whose point was there in all of them, and looked the same.
+            (h, w) bool in free space, (h, w) bool static.
         """
         import cv2
 
-        free, there, alike, known, age = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(5))
+        shape = level.depth.shape
+        num_free, num_surface, num_same, num_seen, age = (np.zeros(shape, dtype=np.float32) for _ in range(5))
         if timestamp < self._young_until:
-            views = self._views if self._complete else self._recent
+            candidates = self._start_frames if self._imported else self._recent_frames
         else:
-            views = self._recent if unknown >= YOUNG_UNKNOWN_SHARE else ()
-        asked = [view for view in views if 0 < abs(timestamp - view.timestamp) <= self.config.start_seconds]
-        answers = reproject_difference(level, T_world_camera, asked)
-        for view, (gap, difference, _) in zip(asked, answers, strict=True):
-            apart = abs(timestamp - view.timestamp)
-            seen, close = ~np.isnan(gap), np.abs(gap) <= noise
-            free += gap > noise
-            there += close
-            alike += close & (np.abs(difference) < ALIKE)
-            known += seen
-            age[seen] = np.maximum(age[seen], apart)
-        rested = (known >= 2) & (alike == known) & (age >= RESTED * self.config.start_seconds)
-        rested = cv2.medianBlur(rested.astype(np.uint8), 5) > 0
-        freed = ((free > 0) & (2 * free >= there)).astype(np.uint8)
-        freed = cv2.morphologyEx(freed, cv2.MORPH_OPEN, np.ones((SEAM, SEAM), np.uint8)) > 0
-        return freed, rested
+            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
+        frames = [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
+        for frame, (gap, difference, _) in zip(frames, reproject(level, T_world_camera, frames), strict=True):
+            seen, surface = ~np.isnan(gap), np.abs(gap) <= noise
+            num_free += gap > noise
+            num_surface += surface
+            num_same += surface & (np.abs(difference) < SAME_INTENSITY)
+            num_seen += seen
+            age[seen] = np.maximum(age[seen], abs(timestamp - frame.timestamp))
+        static = (num_seen >= 2) & (num_same == num_seen) & (age >= STATIC_PERIOD * self.config.start_seconds)
+        static = cv2.medianBlur(static.astype(np.uint8), scaled_side(STATIC_RADIUS, level)) > 0
+        free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
+        side = scaled_side(SEAM, level)
+        free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+        return free, static
 
-    def standing(
+    def settled(
         self,
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
-        surface: Segmentation,
+        segmentation: Segmentation,
         sigma: NDArray[np.float32],
-        moving: NDArray[np.bool_],
+        dynamic: NDArray[np.bool_],
     ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of those called ``moving`` whose piece has been where it is for ``settle_time``."""
-        nothing = np.zeros_like(moving)
-        if not self._memories or timestamp - self._memories[0].timestamp < self.config.settle_time or not moving.any():
-            return nothing
-        count = surface.count
-        both = Segmentation(
-            surface.labels + np.where(moving, np.int32(count), np.int32(0)), 2 * count, surface.gradient
-        )
-        still = np.bincount(both.labels.reshape(-1), minlength=2 * count + 1) >= SMALLEST
-        still[: count + 1] = False
-        for memory in self._memories:
-            ((gap, difference, _),) = reproject_difference(level, T_world_camera, [memory])
-            known = ~np.isnan(gap)
-            verdict = judge(both, known, known & (np.abs(np.nan_to_num(gap)) > 4 * sigma), gap, sigma, difference)
-            counted = np.flatnonzero((verdict.known > 0.7) & (verdict.size >= SMALLEST))
-            usual = max(ORDINARY_MISMATCH, upper_quartile(verdict.mismatch[counted]))
-            still &= (verdict.known > 0.7) & (verdict.moving < 0.1) & (np.abs(verdict.shift) < 1)
-            still &= verdict.mismatch < 1.2 * usual
-            if not still.any():
-                return nothing
-        return still[both.labels]
+        """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
+
+        The dynamic part of a segment has settled if, compared with every frame kept of ``settle_time``, more than 0.7
+        of its pixels are visible, less than 0.1 of them lie off by more than 4 sigma, the mean distance is below one
+        sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
+
+        Args:
+            timestamp: Seconds.
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            segmentation: Its segments.
+            sigma: (h, w) float32, standard deviation of a distance, metres.
+            dynamic: (h, w) bool.
+        """
+        none = np.zeros_like(dynamic)
+        frames = self._settle_frames
+        if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
+            return none
+        count = segmentation.count
+        labels = segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0))
+        parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
+        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
+        settled[: count + 1] = False
+        for frame in frames:
+            ((gap, difference, _),) = reproject(level, T_world_camera, [frame])
+            compared = ~np.isnan(gap)
+            displaced = compared & (np.abs(np.nan_to_num(gap)) > 4 * sigma)
+            evidence = segment_evidence(parts, compared, displaced, gap, sigma, difference)
+            visible = evidence.compared > 0.7
+            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
+            settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
+            settled &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
+            if not settled.any():
+                return none
+        return settled[parts.labels]
 
 
-def reproject_difference(
-    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[_Memory]
-) -> list[segmentation.Reprojection]:
-    """Differences of an image to remembered frames, one for each."""
+def reproject(
+    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
+) -> list[kernels.Reprojection]:
+    """Differences of an image at a pose (4, 4) to remembered frames, one for each."""
     targets = [
-        segmentation.ReprojectionTarget(
+        kernels.ReprojectionTarget(
             se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.marks
         )
         for frame in frames
     ]
-    return segmentation.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)
+    return kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)

@@ -27,7 +27,7 @@ class PointImage(NamedTuple):
     times: NDArray[np.float64]
 
     @classmethod
-    def empty(cls, shape: tuple[int, int]) -> "PointImage":
+    def empty(cls, shape: tuple[int, ...]) -> "PointImage":
         """No points."""
         return cls(np.zeros((*shape, 3), np.float32), np.full(shape, np.float32(np.nan)), np.zeros((*shape, 2)))
 

@@ -112,11 +112,11 @@ class RunRecord:
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
         """
-        from dudmap.dynamics.mixture import BINS, LARGEST, fit_mixture
+        from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, fit_mixture
 
         if not self.residuals.any():
             return
-        edges = np.linspace(0, LARGEST, BINS + 1)
+        edges = np.linspace(0, MAX_RESIDUAL, BINS + 1)
         mixture = fit_mixture(self.residuals, edges)
         np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
