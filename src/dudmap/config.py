@@ -8,11 +8,15 @@ import difflib
 import tomllib
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeVar, overload
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from dudmap.errors import ConfigError
+
+Scalar = TypeVar("Scalar", bound=np.floating)
 
 
 class Part(BaseModel):
@@ -28,6 +32,14 @@ class SensorConfig(Part):
     """Standard deviation at the lens, metres."""
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m."""
+
+    @overload
+    def sigma(self, z: float) -> float: ...
+    @overload
+    def sigma(self, z: NDArray[Scalar]) -> NDArray[Scalar]: ...
+    def sigma(self, z: Any) -> Any:
+        """Standard deviation of a depth reading at depth ``z``, metres; it has the shape and precision of ``z``."""
+        return self.sigma_base + self.sigma_scale * z**2
 
 
 class PreprocessConfig(Part):
