@@ -74,7 +74,7 @@ class DynamicDetector:
         sigma = self._sigma(level.depth, volume.voxel_size)
         tolerance = self._tolerance(sigma, level.depth)
         residual = np.abs(sample.distance) / sigma
-        counted = residual[sample.place == SURFACE]
+        counted = residual[sample.occupancy == SURFACE]
         edges = np.linspace(0, LARGEST, BINS + 1)
         cells = np.minimum(counted, np.float32(LARGEST - 1e-3)) * np.float32(BINS / LARGEST)
         histogram = np.bincount(cells.astype(np.int64), minlength=BINS)
@@ -85,22 +85,22 @@ class DynamicDetector:
         mixture = fit_mixture(histogram, edges)
         rested = np.zeros(level.depth.shape, dtype=bool)
         evidence = np.zeros(level.depth.shape, dtype=np.float32)
-        near = sample.place == SURFACE
+        near = sample.occupancy == SURFACE
         evidence[near] = np.clip(mixture.log_odds(residual[near]), -6, 6)
         fits = near & (np.abs(sample.distance) < noise)  # eq. 4.57: below the noise nothing is called motion
         evidence[fits] = np.maximum(evidence[fits], 1)
         behind = near & (sample.distance < 0)  # what the map holds is gone: the map errs, not the reading
         evidence[behind] = np.maximum(evidence[behind], 0)
         if self.config.free_space:
-            unknown = float(np.mean(sample.place[level.depth > 0] == UNKNOWN)) if level.depth.any() else 0.0
+            unknown = float(np.mean(sample.occupancy[level.depth > 0] == UNKNOWN)) if level.depth.any() else 0.0
             reach = np.float32(1.5) * noise.astype(np.float32)
             seen_free, rested = self.memory.views(level, T_world_camera, reach, unknown)
-            evidence[(sample.place == FREE) | seen_free] = -6
+            evidence[(sample.occupancy == FREE) | seen_free] = -6
         probability = labeling.smooth(evidence, level.depth, tolerance, np.float32(4), 4)
         dynamic = (probability < 0.5) & (level.depth > 0)
         surface = None
         if self.config.regions:
-            seeds = opened(dynamic) | (dynamic & (sample.place == FREE))
+            seeds = opened(dynamic) | (dynamic & (sample.occupancy == FREE))
             dynamic = self._regions(seeds, evidence, level, tolerance)
             if self.config.pieces:
                 dynamic, surface = self._whole(
@@ -166,7 +166,7 @@ class DynamicDetector:
         moved = (marks & MOVED) > 0
         surface = split(surface, (marks & BODY) > 0)
         # what the map does not know begins to move with the piece it belongs to, not with what is beside it
-        known = sample.place != UNKNOWN
+        known = sample.occupancy != UNKNOWN
         begun = surface.share(seeds) >= 0.1
         at_rest = surface.share(known & ~dynamic) > np.maximum(0.5, 9 * surface.share(known & dynamic))
         dynamic = dynamic & (known | begun[surface.labels] | (moved & ~at_rest[surface.labels]))
@@ -174,7 +174,7 @@ class DynamicDetector:
         exposed = np.float32(1 - gain) * level.intensity - np.float32(offset)
         difference = np.asarray(sample.difference + exposed, np.float32)
         noise = np.maximum(np.float32(self.config.noise_threshold / 3), sigma)
-        verdict = judge(surface, sample.place == SURFACE, dynamic, sample.distance, noise, difference)
+        verdict = judge(surface, sample.occupancy == SURFACE, dynamic, sample.distance, noise, difference)
         moving = dynamic | classify_segments(verdict, surface.share(moved))[surface.labels]
         return moving & ~self.memory.standing(level, T_world_camera, surface, noise, moving), surface
 
@@ -188,7 +188,7 @@ class DynamicDetector:
         import cv2
 
         distance = np.abs(np.nan_to_num(sample.distance))
-        free = sample.place == FREE
+        free = sample.occupancy == FREE
         marked = (distance > min(self.config.threshold, 0.95 * volume.truncation)) | free
         scale = level.camera.width / 640
         core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(15 * scale)) > 0

@@ -128,7 +128,7 @@ class FrontEnd:
         """Whether so little of what lies on the map moves other than in the last frame that no coarser level need be
         registered again."""
         changed = labels.dynamic if self.moved is None else labels.dynamic != self.moved
-        counted = labels.sample.place == SURFACE  # nothing else has a say in the registration
+        counted = labels.sample.occupancy == SURFACE  # nothing else has a say in the registration
         return bool(np.count_nonzero(changed & counted) <= UNCHANGED_SHARE * np.count_nonzero(counted))
 
     def _detect(self, volume: TsdfVolume, task: RegistrationInput, tracked: TrackingResult) -> Labels:

@@ -122,4 +122,4 @@ class PosePredictor:
 def _place(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
     """What a map knows of the points of an image (h, w): SURFACE, FREE or UNKNOWN."""
     volume.look_at(T_world_camera)
-    return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).place
+    return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).occupancy
