@@ -1,18 +1,18 @@
-"""Fixtures that several wings share."""
+"""Fixtures of several test folders."""
 
 import sys
 import types
 
 import pytest
 
-from fake_slam import StandIn
+from fake_slam import FakeSlam
 
 
 @pytest.fixture
 def slam(monkeypatch):
-    """The stand-in in place of ``dudmap.slam.Slam``; tests set ``slam.script``."""
-    stand_in = type("Slam", (StandIn,), {"script": {}})
+    """Replace ``dudmap.slam.Slam`` by ``FakeSlam``; tests set ``slam.script``."""
+    fake = type("Slam", (FakeSlam,), {"script": {}})
     module = types.ModuleType("dudmap.slam")
-    module.Slam = stand_in
+    module.Slam = fake
     monkeypatch.setitem(sys.modules, "dudmap.slam", module)
-    return stand_in
+    return fake
