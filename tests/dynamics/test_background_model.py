@@ -80,3 +80,18 @@ def test_what_moved_is_no_background():
         background.hidden(i / 30, wall(pose(i)), pose(i))
         background.update(i / 30, wall(pose(i)), pose(i), ~STILL)
     assert not background.hidden(0.5, with_hole(15, 0.05)[0], pose(15)).any()
+
+
+def test_images_of_any_size_are_subsampled():
+    """Label images 120x67, as of cameras of 960x540 and 480x270, and finer and coarser ones."""
+    for camera in (CAMERA.resized(120, 67), CAMERA.resized(53, 41), CAMERA.resized(321, 243)):
+        background = BackgroundModel(DynamicsConfig(settle_time=1.0))
+        board = Level(camera, np.full(camera.shape, 2, np.float32), np.full(camera.shape, 0.5, np.float32))
+        for i in range(15):
+            background.update(i / 30, board, np.eye(4), np.zeros(camera.shape, bool))
+        hole = np.zeros(camera.shape, bool)
+        hole[camera.height // 4 : camera.height * 3 // 4, camera.width // 4 : camera.width * 3 // 4] = True
+        dark = Level(camera, np.where(hole, np.float32(0), board.depth), np.where(hole, np.float32(0), board.intensity))
+        hidden = background.hidden(0.5, dark, np.eye(4))
+        assert not hidden[~hole].any()
+        assert hidden[hole].mean() > 0.85
