@@ -25,7 +25,8 @@ from dudmap.objects.object_map import RigidObject
 from dudmap.objects.object_tracker import Mover, ObjectTracker
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
-from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.loop_closing import LoopCloser
+from dudmap.places.loop_verification import LoopQuery
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.redundancy import RedundantViews
 from dudmap.result import FrameResult
@@ -363,7 +364,7 @@ class Slam:
         with task.clock("loops"):
             levels, labels = task.pyramid.tracked, result.labels
             weights = None if labels is None else static_weights(labels, levels, task.unverified_mask)
-            view = View(observation, levels, weights, ~result.dynamic_mask, tracked)
+            view = LoopQuery(observation, levels, weights, ~result.dynamic_mask, tracked)
             correction = self.loops.close(view, self.health)
         if correction is None:
             return result

@@ -18,7 +18,8 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.run import run
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
-from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.loop_closing import LoopCloser
+from dudmap.places.loop_verification import LoopQuery
 from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
@@ -79,17 +80,17 @@ def test_a_loop_counts_only_if_its_correction_is_finite(monkeypatch, solvable):
     atlas = made_up_atlas([0, 0, 0, 0])
     loops = LoopCloser(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
     if not solvable:
-        monkeypatch.setattr("dudmap.places.loop_closing.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
+        monkeypatch.setattr("dudmap.places.loop_correction.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
     image = np.zeros(TINY.shape, np.float32)
     observation = Observation(3.0, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
     T = atlas.poses[-1].T_world_camera
     tracked = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
-    view = View(observation, [], None, np.ones(TINY.shape, dtype=bool), tracked)
+    query = LoopQuery(observation, [], None, np.ones(TINY.shape, dtype=bool), tracked)
     place = PlaceMatch(atlas.keyframes.keyframes[0], T, 20)
     before = [pose.T_world_camera.copy() for pose in atlas.poses]
-    correction = loops._correct(place, view, T @ shifted(0.002))
+    correction = loops._correct(place, query, T @ shifted(0.002))
     assert (correction is not None) == solvable
-    assert loops.closed == len(loops._edges) == int(solvable)
+    assert loops.closed == len(loops.corrector.edges) == int(solvable)
     moves = [np.abs(pose.T_world_camera - T).max() for pose, T in zip(atlas.poses, before, strict=True)]
     assert np.all(np.isfinite(moves))
     assert (max(moves) > 0) == solvable
