@@ -353,7 +353,7 @@ class Slam:
             return False
         self.atlas.start_submap()
         self.health, self._lost_since = QualityMonitor(), None
-        self.redundant.forget()
+        self.redundant.reset()
         return True
 
     def _close_loop(self, observation: Observation, task: RegistrationInput, result: FrameResult) -> FrameResult:
@@ -369,7 +369,7 @@ class Slam:
         if correction is None:
             return result
         self.motion.moved(correction)
-        self.redundant.moved(correction)
+        self.redundant.apply_correction(correction)
         T = correction @ tracked.T_world_camera
         return replace(result, T_world_camera=T, submap=self.atlas.current, corrected=True)
 
@@ -394,7 +394,7 @@ class Slam:
         self.volume.integrate(fused, T_world_camera, static)
         if self.atlas.history is not None:
             self.atlas.history.add(fused, static, T_world_camera, self.atlas.current)
-        self.redundant.accept(observation.rgb, T_world_camera)
+        self.redundant.set_reference(observation.rgb, T_world_camera)
 
     def _result(
         self,

@@ -14,7 +14,7 @@ from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.frames.observation import Observation
 from dudmap.geometry.alignment import agree, rigid_ransac
 from dudmap.geometry.camera import Camera
-from dudmap.places.features import SiftExtractor, reduced_grey
+from dudmap.places.features import SiftExtractor, match_descriptors, reduced_grey
 
 COMPARED = 64
 """Strongest features of each keyframe that choose the keyframes worth a closer look."""
@@ -171,7 +171,9 @@ class KeyframeDatabase:
             return []
         found: list[PlaceMatch] = []
         for keyframe in _most_similar(features, among):
-            pairs = matches(features.descriptors, keyframe.features.descriptors, self.config.ratio)
+            pairs = match_descriptors(
+                features.descriptors, keyframe.features.descriptors, self.config.ratio, mutual=True
+            )
             if len(pairs) < self.config.min_inliers:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
@@ -234,28 +236,6 @@ def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterab
     best = np.maximum.reduceat(similarity, starts, axis=0)  # per keyframe and feature of the frame
     distinctive = np.clip(best - np.median(best, axis=0), 0, None)
     return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:LOOKED_AT]]
-
-
-def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows of ``a`` and ``b`` that are each other's nearest, clearly nearer than the second in ``b``.
-
-    Args:
-        a: (n, d) unit vectors.
-        b: (k, d) unit vectors.
-        ratio: Largest quotient of the nearest and the second nearest distance (Lowe 2004).
-    """
-    if len(a) == 0 or len(b) < 2:
-        return np.empty((0, 2), dtype=np.int64)
-    cosine = a @ b.T
-    nearest = np.argmax(cosine, axis=1)
-    rows = np.arange(len(a))
-    first = cosine[rows, nearest]
-    mutual = np.argmax(cosine, axis=0)[nearest] == rows
-    cosine[rows, nearest] = -1
-    second = cosine.max(axis=1)
-    distinct = 2 - 2 * first < ratio**2 * (2 - 2 * second)
-    chosen = np.flatnonzero(mutual & distinct)
-    return np.stack([chosen, nearest[chosen]], axis=1)
 
 
 def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
