@@ -16,14 +16,17 @@ from dudmap.geometry.alignment import agree, rigid_ransac
 from dudmap.geometry.camera import Camera
 from dudmap.places.features import SiftExtractor, match_descriptors, reduced_grey
 
-COMPARED = 64
-"""Strongest features of each keyframe that choose the keyframes worth a closer look."""
-LOOKED_AT = 5
-"""KeyframeDatabase per lost frame that get that closer look."""
-SLACK = 0.01
-"""Two places of one feature differ by this beyond the sensor's noise, metres per metre of depth (half a pixel)."""
-SAME_PLACE = 0.1, 5.0
-"""Candidates nearer to each other than this (m, deg) are one."""
+COARSE_FEATURES = 64
+"""Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
+MAX_MATCHED = 5
+"""Keyframes per frame whose features are all matched; it bounds the time of a query."""
+POSITION_ERROR = 0.01
+"""Largest error of a feature's position beyond the sensor's noise, metres per metre of depth.
+
+That are 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
+"""
+DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
+"""Matches in one submap with poses nearer to each other than this (m, deg) are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +180,9 @@ class KeyframeDatabase:
             if len(pairs) < self.config.min_inliers:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
-            T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b))
+            T_keyframe_camera, inliers = rigid_ransac(
+                a, b, self._tolerance(a) + self._tolerance(b), self.config.min_share
+            )
             num_inliers = int(np.count_nonzero(inliers))
             if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
                 found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
@@ -186,7 +191,7 @@ class KeyframeDatabase:
         for match in found:
             if not any(
                 match.keyframe.submap == other.keyframe.submap
-                and agree(match.T_world_camera, other.T_world_camera, *SAME_PLACE)
+                and agree(match.T_world_camera, other.T_world_camera, DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG)
                 for other in distinct
             ):
                 distinct.append(match)
@@ -219,7 +224,7 @@ class KeyframeDatabase:
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest believable error (n,) of the position of a feature, metres."""
         z = points[:, 2]
-        return SLACK * z + 2 * self.sensor.sigma(z)
+        return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
@@ -228,14 +233,14 @@ def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterab
     The score of a keyframe sums, over the frame's features, how far its best cosine similarity exceeds the median of
     all keyframes: features that many places share do not count.
     """
-    if len(among) <= LOOKED_AT:
+    if len(among) <= MAX_MATCHED:
         return among
-    parts = [keyframe.features.descriptors[:COMPARED] for keyframe in among]
+    parts = [keyframe.features.descriptors[:COARSE_FEATURES] for keyframe in among]
     starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
     similarity = np.concatenate(parts) @ features.descriptors.T
     best = np.maximum.reduceat(similarity, starts, axis=0)  # per keyframe and feature of the frame
     distinctive = np.clip(best - np.median(best, axis=0), 0, None)
-    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:LOOKED_AT]]
+    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:MAX_MATCHED]]
 
 
 def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
