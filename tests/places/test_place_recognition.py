@@ -1,4 +1,4 @@
-"""Lost and found: matching, RANSAC and keyframes against made-up truth, and the whole way in a kidnapped camera."""
+"""Place recognition: alignment, RANSAC and keyframes against ground truth, and the recovery of a kidnapped camera."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""The redundant-view test: what it must tell apart, and that it always says the same."""
+"""The redundant-view test: similarity of views, motion gate and back-off."""
 
 import numpy as np
 import pytest

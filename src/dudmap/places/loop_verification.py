@@ -68,7 +68,7 @@ class LoopVerifier:
             for pose in self.atlas.poses
             if pose.submap == self.atlas.current and pose.timestamp >= place.keyframe.last_seen
         ]
-        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path_length(since[::3])
+        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path_length(since[::3])  # every third: less jitter
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
         return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
 
