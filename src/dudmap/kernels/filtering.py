@@ -57,8 +57,8 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
 
     A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
     is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least MIN_NEIGHBOURS
-    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus no depth edge is bridged, whose sides differ
-    by more, and a large hole keeps its border, since its runs are longer in both directions.
+    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus depth edges, whose sides
+    differ by more, are not bridged, and large holes, whose runs are longer in both directions, keep their border.
 
     Args:
         row_start, row_stop: Rows of the band.
