@@ -1,9 +1,9 @@
-"""What each part brings: the default system with one part switched off at a time.
+"""Ablation: the default configuration with one part disabled at a time.
 
     python benchmarks/ablation.py [--data FOLDER] [--only NAME,NAME] [--out DIR]
 
-Runs five synthetic worlds and, with --data, every recording in a folder. Prints ATE, lost frames and mask IoU per part
-and writes ablation.md, .csv and .json.
+Uses five synthetic recordings and, with --data, every recording in a folder. Prints ATE, lost frames and mask IoU per
+part and writes ablation.md, .csv and .json.
 """
 
 import argparse
@@ -31,19 +31,19 @@ PARTS: dict[str, tuple[str, ...]] = {
     "no relocalisation": ("relocalization.enabled=false",),
     "no dynamics": ("dynamics.method=none",),
 }
-"""Name and what it differs in from the default. ``two-passes`` is a system of its own, see ``benchmark/systems.py``."""
+"""Names and differences from the default configuration; for ``two-passes`` see ``benchmark/systems.py``."""
 SMALL = (320, 240)
 WORLDS = (
     Entry("two people", parameters={"movers": ("people",), "frames": 90, "camera": SMALL}),
     Entry("crowd from the start", parameters={"coverage": 0.4, "start_dynamic": True, "frames": 90, "camera": SMALL}),
     Entry("slow creeper", parameters={"movers": ("creeper",), "frames": 90, "camera": SMALL}),
-    Entry("a thing starts to move", parameters={"situation": "starts", "frames": 90, "camera": SMALL}),
+    Entry("an object starts to move", parameters={"situation": "starts", "frames": 90, "camera": SMALL}),
     Entry("kidnapped", parameters={"situation": "kidnapped", "frames": 90, "camera": SMALL}),
 )
 
 
 def cell(row: Row) -> str:
-    """ATE in cm, frames lost and mask IoU of one run."""
+    """ATE in cm, number of lost frames and mask IoU of one run."""
     if "error" in row:
         return "failed"
     ate = row.get("ate_rmse_m")
@@ -54,9 +54,9 @@ def cell(row: Row) -> str:
 
 
 def main() -> None:
-    """Parse, run, print, save."""
+    """Command line of the script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, default=None, help="folder that holds recordings")
+    parser.add_argument("--data", type=Path, default=None, help="folder of recordings")
     parser.add_argument("--only", default="", help="comma-separated names of worlds and recordings")
     parser.add_argument("--out", type=Path, default=Path("runs/ablation"))
     arguments = parser.parse_args()
@@ -69,10 +69,10 @@ def main() -> None:
         for name, assignments in PARTS.items()
     ]
     rows = measure_all(jobs, 1, lambda row: print(row["sequence"], row["system"], row.get("error", "done"), flush=True))
-    by_place = {(row["system"], row["sequence"]): row for row in rows}
+    by_cell = {(row["system"], row["sequence"]): row for row in rows}
     names = [entry.name for entry in entries]
-    lines = [[part, *(cell(by_place[part, name]) for name in names)] for part in PARTS]
-    text = "ATE RMSE in cm (frames lost) / mean mask IoU; * root mean square distance from the first pose, cm.\n\n"
+    lines = [[part, *(cell(by_cell[part, name]) for name in names)] for part in PARTS]
+    text = "ATE RMSE in cm (lost frames) / mean mask IoU; * drift RMSE in cm, first poses aligned.\n\n"
     text += grid(["part", *names], lines, words=1)
     save(rows, text, arguments.out, "ablation", {"machine": machine(), "versions": versions()})
     print(text)

@@ -1,10 +1,9 @@
-"""Put what the benchmarks wrote into the documentation.
+"""Insert the output of the benchmarks into the documentation.
 
     python benchmarks/docs_tables.py runs/benchmark/limits/limits.md runs/benchmark/synthetic/synthetic.md ...
 
-Takes limits.md (with the heat maps beside it), synthetic.md, recordings.md and ablation.md. Each replaces the text
-between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` in docs/limits.md or docs/benchmarks.md; nothing is changed on
-the way.
+Accepts limits.md (with the heat maps in its folder), synthetic.md, recordings.md and ablation.md. Each replaces the
+text between ``<!-- NAME -->`` and ``<!-- end of NAME -->`` in docs/limits.md or docs/benchmarks.md, unchanged.
 """
 
 import re
@@ -16,7 +15,7 @@ DOCS = Path(__file__).parent.parent / "docs"
 
 
 def insert(written: Path) -> None:
-    """Replace one section, and copy the pictures it shows."""
+    """Replace one section, and copy its images."""
     name, text = written.stem, written.read_text(encoding="utf-8")
     page = DOCS / ("limits.md" if name == "limits" else "benchmarks.md")
     text = re.sub(r"\A# .*\n+", "", text)  # the page has its own heading

@@ -1,9 +1,9 @@
-"""Time of ``dudmap evaluate mesh`` on a mesh of a million vertices against another; target: below 20 s on two cores.
+"""Time of ``dudmap evaluate mesh`` for two meshes of a million vertices; target: below 20 s on two cores.
 
     python benchmarks/mesh_evaluation.py [--side 1000]
 
-Two wavy surfaces of ``side`` x ``side`` vertices, one with half a millimetre of noise. Times the scores, the coloured
-error mesh and the registration, each with its own k-d trees.
+Uses two wavy surfaces of ``side`` x ``side`` vertices, one with 0.5 mm of noise. Times the scores, the coloured error
+mesh and the registration, each with its own k-d trees.
 """
 
 import argparse
@@ -18,7 +18,7 @@ from dudmap.geometry.mesh import Mesh
 
 
 def waves(side: int, noise: float, seed: int) -> Mesh:
-    """A wavy square of 10 m x 10 m."""
+    """Wavy surface of 10 m x 10 m."""
     x, y = np.meshgrid(*[np.linspace(0, 10, side)] * 2, indexing="ij")
     z = 0.5 * np.sin(x) * np.cos(y) + noise * np.random.default_rng(seed).normal(size=x.shape)
     vertices = np.stack([x, y, z], axis=-1).reshape(-1, 3).astype(np.float32)
@@ -29,7 +29,7 @@ def waves(side: int, noise: float, seed: int) -> Mesh:
 
 
 def main() -> None:
-    """Print one line per step."""
+    """Command line of the script; prints one line per step."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--side", type=int, default=1000)
     side = parser.parse_args().side

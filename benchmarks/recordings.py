@@ -1,10 +1,10 @@
-"""The development recordings against their targets.
+"""Figures of the development recordings, compared with their targets.
 
     python benchmarks/recordings.py --data FOLDER [--systems dudmap,none] [--only fr1_xyz_static] [--out DIR]
 
-Runs every recording in a folder with every system, each in its own process, one after the other. The semi-synthetic
-recordings fr1_xyz_static, fr1_xyz_confusao, pan_confusao and ist_confusao (by folder name) have targets; any other
-recording is scored all the same. Prints the table and writes recordings.md, .csv and .json.
+Runs every system on every recording of a folder, one after the other, each in its own process. The semi-synthetic
+recordings fr1_xyz_static, fr1_xyz_confusao, pan_confusao and ist_confusao (by folder name) have targets; others are
+scored only. Prints the table and writes recordings.md, .csv and .json.
 """
 
 import argparse
@@ -17,7 +17,7 @@ from dudmap.benchmark.table import COLUMNS, Column, grid, markdown, save
 from dudmap.pipeline.environment import machine, versions
 
 TWINS = {"fr1_xyz_confusao": "fr1_xyz_static"}
-"""The same frames without people."""
+"""Recordings of the same frames without people."""
 TARGETS: dict[str, list[tuple[str, str, float, str]]] = {
     "fr1_xyz_static": [("ate_rmse_m", "ATE RMSE, m", 0.012, "<=")],
     "fr1_xyz_confusao": [
@@ -28,12 +28,12 @@ TARGETS: dict[str, list[tuple[str, str, float, str]]] = {
     "pan_confusao": [("rotation_rmse_deg", "rotation RMSE, deg", 2.0, "<=")],
     "ist_confusao": [("drift_rmse_m", "translation RMSE from the first frame, m", 0.015, "<=")],
 }
-"""Figure, its meaning, bound and direction, by recording."""
+"""Key, meaning, bound and direction of the targets, by recording."""
 EVERYWHERE = [("ms_per_frame_median", "ms per frame, median", 100.0, "<="), ("peak_rss_mb", "peak MB", 2000.0, "<=")]
 
 
 def with_twins(rows: list[Row]) -> None:
-    """Add the ratio of the ATE to that of the same frames without people, same system."""
+    """Add the ratio of the ATE to that of the same system on the same frames without people."""
     ates = {(row["sequence"], row["system"]): row.get("ate_rmse_m") for row in rows}
     for row in rows:
         twin = ates.get((TWINS.get(row["sequence"]), row["system"]))
@@ -42,7 +42,7 @@ def with_twins(rows: list[Row]) -> None:
 
 
 def verdicts(rows: list[Row]) -> str:
-    """Markdown table of every target that a row can be held against."""
+    """Markdown table of all targets for which a row has a value."""
     lines = []
     for row in rows:
         for key, meaning, bound, direction in [*TARGETS.get(row["sequence"], []), *EVERYWHERE]:
@@ -57,14 +57,14 @@ def verdicts(rows: list[Row]) -> str:
 
 
 def main() -> None:
-    """Parse, run, print, save."""
+    """Command line of the script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--data", type=Path, required=True, help="folder that holds the recordings")
+    parser.add_argument("--data", type=Path, required=True, help="folder of the recordings")
     parser.add_argument("--systems", default="dudmap", help="comma-separated; default: dudmap")
     parser.add_argument("--only", default="", help="comma-separated names of recordings")
     parser.add_argument("--out", type=Path, default=Path("runs/recordings"))
     parser.add_argument("--max-frames", type=int, default=None)
-    parser.add_argument("--set", action="append", default=[], help="key=value on top of every system")
+    parser.add_argument("--set", action="append", default=[], help="key=value applied to every system")
     arguments = parser.parse_args()
     wanted = [name for name in arguments.only.split(",") if name]
     entries = [entry for entry in local_entries(arguments.data) if not wanted or entry.name in wanted]

@@ -1,4 +1,4 @@
-"""Look at the map from where no camera was: the thesis' artificial camera view."""
+"""Render the map from a new pose (artificial camera view of the thesis)."""
 
 import numpy as np
 

@@ -1,4 +1,4 @@
-"""Fuse frames whose poses are known: the map alone, without tracking."""
+"""Fuse frames with known poses: mapping without tracking."""
 
 import sys
 

@@ -1,4 +1,4 @@
-"""Feed images of your own: any depth in metres and any colour of the same size."""
+"""Process images of your own: depth in metres and colour of the same size."""
 
 import numpy as np
 
@@ -8,7 +8,7 @@ camera = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 slam = Slam(camera)
 v, u = np.mgrid[:240, :320]
 for number in range(5):
-    z = 1.5 + 0.2 * np.sin(u / 20) * np.cos(v / 25)  # a wavy wall in front of a camera that stands still
+    z = 1.5 + 0.2 * np.sin(u / 20) * np.cos(v / 25)  # a wavy wall in front of a fixed camera
     shade = 128 + 60 * np.sin(u / 7) * np.sin(v / 9)
     color = np.repeat(shade[..., None], 3, axis=2).astype(np.uint8)
     result = slam.process(Frame(timestamp=number / 30, depth=z.astype(np.float32), color=color))

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from fake_slam import StandIn
+from fake_slam import FakeSlam
 
 worker = os.environ.get("PYTEST_XDIST_WORKER")
 if worker is not None:
@@ -28,9 +28,9 @@ if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
 
 @pytest.fixture
 def slam(monkeypatch):
-    """The stand-in in place of ``dudmap.slam.Slam``; tests set ``slam.script``."""
-    stand_in = type("Slam", (StandIn,), {"script": {}})
+    """Replace ``dudmap.slam.Slam`` by ``FakeSlam``; tests set ``slam.script``."""
+    fake = type("Slam", (FakeSlam,), {"script": {}})
     module = types.ModuleType("dudmap.slam")
-    module.Slam = stand_in
+    module.Slam = fake
     monkeypatch.setitem(sys.modules, "dudmap.slam", module)
-    return stand_in
+    return fake

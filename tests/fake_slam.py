@@ -1,4 +1,4 @@
-"""A stand-in for ``dudmap.slam.Slam`` that moves 1 cm per frame and does what a script says."""
+"""Fake of ``dudmap.slam.Slam`` with scripted results, for tests of the pipeline and the command line."""
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -19,7 +19,7 @@ TRIANGLE = Mesh(
 
 
 @dataclass
-class Result:
+class FakeResult:
     timestamp: float
     state: str = "tracked"
     lost_reason: str = ""
@@ -36,7 +36,7 @@ class Result:
     timings: dict = field(default_factory=lambda: {"track": 2.0})
 
 
-class Volume:
+class FakeVolume:
     num_blocks, num_bytes, is_empty = 3, 12345, False
 
     def save(self, path):
@@ -47,16 +47,19 @@ class Volume:
 
 
 SECOND = 1000
-"""Added to a frame number of the script: that frame of a second pass."""
+"""Offset of the frame numbers of a second pass in the script."""
 
 
-class StandIn:
-    """Moves 1 cm per frame along x; ``script`` holds what happens at a frame number."""
+class FakeSlam:
+    """Camera that moves 1 cm per frame along x; ``script`` maps frame numbers to events.
+
+    An event is an exception to raise, ``"lost"`` or ``"similar"``.
+    """
 
     script: ClassVar[dict] = {}
 
     def __init__(self, camera, config, first_pass=None):
-        self.volume, self.poses, self.frames, self.first_pass = Volume(), [], [], first_pass
+        self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
 
     @property
@@ -77,13 +80,13 @@ class StandIn:
         if isinstance(event, BaseException):
             raise event
         if event == "lost":
-            return Result(frame.timestamp, "lost", "too few inliers", fused=False)
+            return FakeResult(frame.timestamp, "lost", "too few inliers", fused=False)
         T = np.eye(4)
         T[0, 3] = 0.01 * index
         self.poses.append((frame.timestamp, T))
         mask = np.zeros((HEIGHT, WIDTH), bool)
         mask[:24, :32] = True
-        return Result(
+        return FakeResult(
             frame.timestamp, T_world_camera=T, fused=event != "similar", skipped_similar=event == "similar",
             dynamic_mask=mask, dynamic_share=0.25,
         )  # fmt: skip

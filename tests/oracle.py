@@ -1,4 +1,4 @@
-"""Slow plain-NumPy restatements of the formulas, written from the thesis' equations and not from the kernels."""
+"""Slow NumPy implementations of the equations of the thesis, written independently of the kernels."""
 
 import numpy as np
 
@@ -9,19 +9,19 @@ def fuse(
     frames, T_camera_world_of, camera: Camera, points, truncation, behind, max_weight,
     sigma=lambda z: 0.0, weights_of=None, max_readings=np.inf,
 ):  # fmt: skip
-    """Running average (eq. 4.18-4.23) of projective distances at world points (N, 3), no faster carving.
+    """Running average of projective distances at world points (N, 3) (thesis eq. 4.18-4.23), without carving.
 
     Args:
-        frames, T_camera_world_of: Depth and colour, and the pose of each.
-        camera: Of the frames.
-        points: (N, 3).
-        truncation, behind, max_weight: Band in front of and behind the surface, metres, and cap of the weight.
-        sigma: Least width of the band around a reading of depth z, metres.
+        frames, T_camera_world_of: Frames and their poses.
+        camera: Camera of the frames.
+        points: (N, 3) world points, metres.
+        truncation, behind, max_weight: Truncation distance in front of and behind a surface, metres; largest weight.
+        sigma: Smallest truncation distance at depth z, metres.
         weights_of: Weight (H, W) of the readings of each frame; 1 if None.
-        max_readings: A reading lifts no weight above this many times its own.
+        max_readings: Largest weight to which a reading can raise a point, in multiples of its own weight.
 
     Returns:
-        Distance (N,) with NaN where never seen, weight (N,), colour (N, 3) float.
+        Distance (N,), NaN where never observed; weight (N,); colour (N, 3) float.
     """
     distance, weight, color = np.zeros(len(points)), np.zeros(len(points)), np.zeros((len(points), 3))
     weights_of = [np.ones(camera.shape)] * len(frames) if weights_of is None else weights_of
@@ -39,7 +39,7 @@ def fuse(
             if s < -max(behind, sigma(d)):
                 continue
             share = gains[v, u] / (weight[n] + gains[v, u])
-            if s >= band:  # seen empty: the voxel is free, its colour stays
+            if s >= band:  # observed as free space; the colour is unchanged
                 near = frame.depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2]
                 nearest = near[near > 0].min()
                 if nearest - z <= max(truncation, sigma(nearest)):
@@ -54,7 +54,7 @@ def fuse(
 
 
 def trilinear(grid, point):
-    """Value at a point (3,) in lattice units of a callable ``grid(i, j, k)``; NaN if a corner is NaN."""
+    """Trilinear interpolation of ``grid(i, j, k)`` at a point (3,) in grid units; NaN if a corner is NaN."""
     base = np.floor(point).astype(int)
     a = point - base
     total = 0.0
@@ -65,7 +65,7 @@ def trilinear(grid, point):
 
 
 def half_normal_mixture_em(samples, iterations=300):
-    """Maximum likelihood of two half-normal densities by EM on the samples themselves (eq. 4.52-4.56)."""
+    """Mixture of two half-normal densities by EM on the samples (thesis eq. 4.52-4.56)."""
     prior, sigma = np.array([0.8, 0.2]), np.array([1.0, 6.0])
     for _ in range(iterations):
         density = prior * np.sqrt(2 / np.pi) / sigma * np.exp(-(samples[:, None] ** 2) / (2 * sigma**2))

@@ -1,4 +1,4 @@
-"""Tiny recordings in TUM layout, made on the fly."""
+"""Writer of tiny recordings in TUM layout."""
 
 from pathlib import Path
 
@@ -9,12 +9,12 @@ WIDTH, HEIGHT = 64, 48
 
 
 def depth_image(index: int = 0) -> np.ndarray:
-    """(H, W) uint16: a slanted plane at 1-2 m, 5000 per metre."""
+    """Slanted plane at 1 to 2 m, (H, W) uint16, 5000 units per metre."""
     return np.tile(np.linspace(5000, 10000, WIDTH), (HEIGHT, 1)).astype(np.uint16) + np.uint16(index)
 
 
 def color_image(index: int = 0) -> np.ndarray:
-    """(H, W, 3) uint8 red green blue; a red ramp, the green channel tells the frame."""
+    """Red ramp, (H, W, 3) uint8 in RGB order; the green channel holds the frame number."""
     image = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
     image[..., 0] = np.arange(WIDTH, dtype=np.uint8) * 2
     image[..., 1] = index
@@ -28,7 +28,7 @@ def write_recording(
     rgb_shift: float = 0.004,
     intrinsics: str | None = "fx 60\nfy 60\ncx 31.5\ncy 23.5\n",
 ) -> Path:
-    """Write ``frames`` frames at 10 Hz; colour is ``rgb_shift`` seconds later than depth."""
+    """Write ``frames`` frames at 10 Hz, with colour ``rgb_shift`` seconds later than depth."""
     (folder / "rgb").mkdir(parents=True)
     (folder / "depth").mkdir()
     rgb, depth = ["# timestamp filename"], ["# timestamp filename"]
@@ -46,6 +46,6 @@ def write_recording(
 
 
 def cut(path: Path, share: float = 0.6) -> None:
-    """Cut a file off."""
+    """Truncate a file to a share of its size."""
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])

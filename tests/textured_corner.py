@@ -1,4 +1,4 @@
-"""Three textured walls that meet in a corner: analytic depth and intensity from any pose."""
+"""Analytic depth and intensity of a corner of three textured walls, from any pose."""
 
 import numpy as np
 
@@ -14,7 +14,7 @@ SENSOR = SensorConfig()
 
 
 def corner(shift: np.ndarray | None = None) -> Frame:
-    """Three walls that meet, with a smooth texture, seen from a camera moved by a twist."""
+    """Frame of the corner from a camera moved by a twist."""
     T = np.eye(4) if shift is None else se3.exp(shift)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], axis=-1) @ T[:3, :3].T
@@ -33,7 +33,7 @@ def level_of(frame: Frame) -> Level:
 
 
 def corner_map() -> TsdfVolume:
-    """The corner after three frames from where it is known."""
+    """Map of the corner after three frames with known pose."""
     volume = TsdfVolume(CAMERA, VolumeConfig(voxel_size=0.02, truncation_noise=0), SENSOR, depth_max=4.0)
     for _ in range(3):
         volume.integrate(corner(), np.eye(4))

@@ -1,4 +1,4 @@
-"""A wavy wall with random colours, and the small camera and map configuration that go with it."""
+"""Frames of a wavy wall with random colours, with a small camera and a map configuration."""
 
 import numpy as np
 
@@ -11,7 +11,7 @@ CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant
 
 
 def wall(distance: float, seed: int = 0, bump: float = 0.1) -> Frame:
-    """A wavy wall in front of the camera with random colours."""
+    """Frame of a wavy wall at ``distance`` metres, with random colours."""
     rng = np.random.default_rng(seed)
     v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
     depth = distance + bump * np.sin(u / 9.0) * np.cos(v / 7.0)

@@ -22,7 +22,8 @@ from dudmap.objects.object_map import RigidObject
 from dudmap.objects.object_tracker import Mover
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
-from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.loop_closing import LoopCloser
+from dudmap.places.loop_verification import LoopQuery
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.prior_map import PriorMap
 from dudmap.places.redundancy import RedundantViews
@@ -148,7 +149,7 @@ class Slam:
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
-        is_redundant = self.redundancy.ask(view.observation.rgb, prediction.T_world_camera)
+        is_redundant = self.redundancy.compare(view.observation.rgb, prediction.T_world_camera)
         estimate = self.front_end.register(self.reference, view, prediction)
         reason = self.monitor.rejection_reason(view, estimate)
         relocalized = self._relocalize(view, prediction) if reason else None
@@ -228,7 +229,7 @@ class Slam:
             self.atlas.start_submap()
             self.monitor.reset()
             self.relocalizer.found()
-            self.redundancy.forget()
+            self.redundancy.reset()
             return self._start_map(replace(view, blind=False))
         return self._result(view, estimate, self._dynamic_mask(view, estimate), reason=reason)
 
@@ -263,7 +264,7 @@ class Slam:
             color = exposed_color(observation.rgb, estimate.exposure)
             frame = Frame(observation.timestamp, observation.depth, color)
             self.atlas.integrate(frame, static, estimate.T_world_camera)
-            self.redundancy.accept(observation.rgb, estimate.T_world_camera)
+            self.redundancy.set_reference(observation.rgb, estimate.T_world_camera)
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -275,12 +276,12 @@ class Slam:
         with view.timer("loops"):
             levels = view.pyramid.tracked
             weights = estimate.static_weights(levels)
-            query = View(view.observation, levels, weights, ~dynamic_mask, estimate.tracking)
+            query = LoopQuery(view.observation, levels, weights, ~dynamic_mask, estimate.tracking)
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
         self.motion.apply_correction(correction)
-        self.redundancy.moved(correction)
+        self.redundancy.apply_correction(correction)
         return correction @ T_world_camera, True
 
     def _result(

@@ -70,7 +70,7 @@ def test_margins_leave_room_in_the_bad_direction_only():
 def test_unrecorded_and_unreadable_figures_are_one_sentence(tmp_path):
     with pytest.raises(ConfigError, match="no recorded figures of somewhere"):
         gate.compare([{"sequence": "somewhere"}], RECORDED)
-    with pytest.raises(ConfigError, match="--record makes the file"):
+    with pytest.raises(ConfigError, match="--record creates the file"):
         gate.load_figures(tmp_path / "none.toml")
     (tmp_path / "gate.toml").write_text("[margins]\n")
     with pytest.raises(ConfigError, match=r"no \[figures\]"):

@@ -21,13 +21,13 @@ def test_the_table_says_what_is_reached():
     lines = speed.markdown(figures).splitlines()
     assert lines[2] == "| frame | <= 33 ms | 20.4 ms | yes |  |"
     assert lines[3] == "| view | <= 40 ms | 41 ms | NO | slow |"
-    assert lines[4] == "| walk | <= 1.1 x | nothing | NO |  |"
+    assert lines[4] == "| walk | <= 1.1 x | none | NO |  |"
 
 
 def test_programs_are_timed_and_a_failing_one_is_a_sentence():
-    assert 0 < speed._of_program(["-c", "pass"], 1) < 5
+    assert 0 < speed.program_seconds(["-c", "pass"], 1) < 5
     with pytest.raises(DudmapError, match="failed: nothing works"):
-        speed._of_program(["-c", "import sys; sys.exit('nothing works')"], 1)
+        speed.program_seconds(["-c", "import sys; sys.exit('nothing works')"], 1)
 
 
 def test_the_passage_is_new_space_all_along():

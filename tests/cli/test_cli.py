@@ -147,7 +147,7 @@ def test_parameters_come_from_file_preset_and_single_assignments(slam, recording
     assert used.preset == "thesis"
     assert used.dynamics.method == "none"
     assert used.tracker.noise_weighting is False
-    assert "exclude each other" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
+    assert "are mutually exclusive" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
 
 
 @pytest.mark.parametrize(

@@ -123,8 +123,7 @@ def test_limits():
     depth = np.full((48, 64), 1.0, np.float32)
     depth[0, :6] = [0.49, 0.51, 2.99, 3.01, np.nan, np.inf]
     result = observe(depth, depth_min=0.5, depth_max=3.0)
-    assert result.raw_depth[0, :7].tolist() == pytest.approx([0, 0.51, 2.99, 0, 0, 0, 1], abs=1e-6)
-    assert np.array_equal(result.depth, result.raw_depth)
+    assert result.depth[0, :7].tolist() == pytest.approx([0, 0.51, 2.99, 0, 0, 0, 1], abs=1e-6)
 
 
 def test_small_holes_are_filled_with_the_mean():
@@ -232,11 +231,11 @@ def test_deterministic_and_independent_of_the_input_afterwards():
     depth = noisy_step()
     preprocess = Preprocessor(CAMERA)
     first = preprocess(frame(depth))
-    kept = first.depth.copy(), first.raw_depth.copy()
+    kept = first.depth.copy(), first.intensity.copy()
     again = preprocess(frame(depth))
     preprocess(frame(noisy_step(2)))
     assert np.array_equal(first.depth, kept[0])
-    assert np.array_equal(first.raw_depth, kept[1])
+    assert np.array_equal(first.intensity, kept[1])
     assert np.array_equal(first.depth, again.depth)
 
 

@@ -98,9 +98,9 @@ def test_slots_that_changed_hands_between_updates(volume):
     slots = volume.active_slots
     volume._frame_number += 1
     volume.blocks.written[slots] = volume._frame_number
-    volume.window.take_voxels(slots, volume.blocks, volume.config.free_after)
+    volume.window.release(slots, volume.blocks, volume.config.free_after)
     volume.integrate(wall(1.5), turned(100))
-    assert not set(volume.blocks._unused) & set(volume.active_slots.tolist())
+    assert not set(volume.blocks._released) & set(volume.active_slots.tolist())
     live.update()
     assert_equal(live, volume)
 

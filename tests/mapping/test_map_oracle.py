@@ -239,7 +239,7 @@ def test_the_index_of_blocks_grows_like_a_dictionary():
         entries = volume.window.entries_of(cells, volume.blocks)
         assert entries.tolist() == [expected.setdefault(int(cell), len(expected)) for cell in cells]
         fresh = np.array([cell for cell in cells[:300].tolist() if cell not in marked], dtype=np.int32)
-        volume.window.give_voxels(fresh, volume.blocks, 1)
+        volume.window.allocate(fresh, volume.blocks, 1)
         volume.blocks.geometry[volume.window.cells[fresh]] = fresh[:, None]
         marked |= {int(cell): batch for cell in fresh}
     assert volume.blocks.num_entries == len(expected) > 4 * (1 << 12)
@@ -305,15 +305,15 @@ def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     assert not np.any(inside & (mesh.vertices[:, 2] < 2.5))
     assert volume.num_free_blocks > 0
     seen = volume.sample(box_before_wall().depth, np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
-    empty = (seen.place == FREE) | (seen.distance > 0.8 * volume.truncation)
+    empty = (seen.occupancy == FREE) | (seen.distance > 0.8 * volume.truncation)
     assert np.mean(empty[18:32, 24:41]) > 0.9
 
 
 def test_blocks_do_not_come_and_go_with_the_noise():
     config, sensor = VolumeConfig(voxel_size=0.02), SensorConfig(sigma_base=0.001, sigma_scale=0.015)
     volume, given = TsdfVolume(CAMERA, config, sensor, depth_max=4.0), []
-    give = volume.blocks.give_voxels
-    volume.blocks.give_voxels = lambda entries, number: given.append(len(entries)) or give(entries, number)
+    give = volume.blocks.allocate
+    volume.blocks.allocate = lambda entries, number: given.append(len(entries)) or give(entries, number)
     for number in range(40):
         frame = wall(2.0)
         noise = np.random.default_rng(number).normal(0, 0.05, CAMERA.shape).astype(np.float32)
@@ -395,7 +395,7 @@ def test_an_occupied_block_costs_little_more_than_its_voxels():
     for blocks in (4_000, 9_000, 16_000):
         cells = np.arange(known, 3 * blocks, dtype=np.int32)
         volume.window.entries_of(cells, volume.blocks)
-        volume.window.give_voxels(cells[: blocks - volume.num_blocks], volume.blocks, 1)
+        volume.window.allocate(cells[: blocks - volume.num_blocks], volume.blocks, 1)
         known = 3 * blocks
         assert volume.num_blocks == blocks
         assert volume.blocks.num_entries == known

@@ -5,6 +5,7 @@ import pytest
 
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.parameters import RaycastParameters, VoxelGrid
 from dudmap.kernels.raycasting import raycast
 
 VOXEL = 0.01
@@ -43,7 +44,10 @@ def mapped(sdf, origin=(-5, -4, 3), shape=(10, 9, 12), shade=None, weight=None, 
 
 def view(field, T=None, camera=CAMERA, depth_min=0.05, depth_max=3.0, min_weight=1):
     T = np.eye(4) if T is None else T
-    return raycast(*field, VOXEL, UNIT, T, camera, depth_min, depth_max, min_weight)
+    window, origin, geometry, colors = field
+    unused = np.empty((0, 3), np.int16), np.empty(0, np.uint8)
+    grid = VoxelGrid(window.reshape(-1), np.array(window.shape), origin, geometry, colors, *unused, VOXEL, UNIT)
+    return raycast(grid, T, camera.intrinsics, camera.shape, RaycastParameters(depth_min, depth_max, min_weight))
 
 
 def pose(*twist):

@@ -1,4 +1,4 @@
-"""Rigid fusion: shape and trajectory of moving bodies against the synthetic truth; what is not rigid is refused."""
+"""Rigid fusion: shape and trajectory of moving objects against the synthetic truth; non-rigid ones are rejected."""
 
 import json
 
@@ -26,7 +26,7 @@ ON = Config().override(["movers.meshes=true"])
 
 
 def fused(sequence, frames):
-    """All bodies of some frames, with the true poses and the true masks of the movers, by the movers' numbers."""
+    """Objects fused from some frames with the true poses and the true masks, by number."""
     fusion, preprocess, last = ObjectFusion(ON), Preprocessor(sequence.camera), {}
     poses = {}
     for i in frames:
@@ -46,18 +46,18 @@ def fused(sequence, frames):
             box = np.stack([points.min(axis=0), points.max(axis=0)])
             movers.append(Mover(int(number), mask, points, centroid, box, velocity, 1.0))
         fusion.update(observation, movers, level, T, (1.0, 0.0))
-    return {body.id: body for body in fusion.bodies(poses)}
+    return {obj.id: obj for obj in fusion.objects(poses)}
 
 
-def errors(body, mover, T_world):
+def errors(obj, mover, T_world):
     """Distances (n,) of the mesh to the true surface after one alignment, and errors (m,) of the positions, metres.
 
     ``T_world`` maps the trajectory's world to that of the truth.
     """
-    estimates = T_world @ body.trajectory.Ts_world_camera
-    truths = np.array([mover.reference(t) for t in body.trajectory.timestamps])
-    X = se3.inverse(estimates[len(truths) // 2]) @ truths[len(truths) // 2]  # true body to ours
-    points = body.mesh.vertices.astype(np.float64)
+    estimates = T_world @ obj.trajectory.Ts_world_camera
+    truths = np.array([mover.reference(t) for t in obj.trajectory.timestamps])
+    X = se3.inverse(estimates[len(truths) // 2]) @ truths[len(truths) // 2]  # true object to ours
+    points = obj.mesh.vertices.astype(np.float64)
 
     def distances(x, points):
         T = se3.inverse(X @ se3.exp(x))
@@ -67,12 +67,12 @@ def errors(body, mover, T_world):
     fit = least_squares(distances, np.zeros(6), args=(points[:: len(points) // 1000],), loss="soft_l1", f_scale=0.005)
     offset = np.median(
         [(se3.inverse(e) @ t)[:3, 3] for e, t in zip(estimates, truths, strict=True)], axis=0
-    )  # of the two origins, in our body frame
+    )  # of the two origins, in our object frame
     places = estimates[:, :3, :3] @ offset + estimates[:, :3, 3]
     return np.abs(distances(fit.x, points)), np.linalg.norm(places - truths[:, :3, 3], axis=1)
 
 
-def test_the_window_stays_with_the_body_and_is_small():
+def test_the_window_stays_around_the_object_and_is_small():
     volume = ObjectVolume(SMALL, VolumeConfig(voxel_size=0.005), SensorConfig(), 6.0)
     T = np.eye(4)
     T[:3, 3] = 0, 0, -3
@@ -86,49 +86,67 @@ def test_the_window_stays_with_the_body_and_is_small():
     assert not volume.config.carving
 
 
+def test_a_cleared_map_is_empty_and_can_be_filled_again():
+    sequence = dudmap.synthetic.sequence("box", [], frames=1, camera=SMALL, camera_path="still", noise="none")
+    volume = ObjectVolume(SMALL, VolumeConfig(voxel_size=0.02), SensorConfig(), 6.0)
+    T = np.eye(4)
+    T[2, 3] = -float(np.median(sequence[0].depth))  # the object's origin lies on the surface in the image
+    counts = []
+    for _ in range(2):
+        assert volume.is_empty
+        volume.look_at(T)
+        volume.integrate(sequence[0], T)
+        counts.append(volume.num_blocks)
+        volume.clear()
+    assert counts[0] == counts[1] > 0
+    assert volume.is_empty
+    assert volume.window.shape.tolist() == ObjectVolume(SMALL, volume.config, SensorConfig(), 6.0).window.shape.tolist()
+    assert not volume.config.carving
+
+
 def test_a_cart_is_rigid_and_gets_its_shape():
     sequence = dudmap.synthetic.sequence(
         "box", ["creeper"], frames=30, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
-    (body,) = fused(sequence, range(4, 30)).values()
-    assert body.rigid, body.why
-    assert body.trajectory is not None
-    assert len(body.trajectory) == body.frames >= 20
-    shape, path = errors(body, sequence._movers[0], np.eye(4))
+    (obj,) = fused(sequence, range(4, 30)).values()
+    assert obj.rigid, obj.reason
+    assert obj.trajectory is not None
+    assert len(obj.trajectory) == obj.frames >= 20
+    shape, path = errors(obj, sequence._movers[0], np.eye(4))
     assert np.median(shape) < 0.003
     assert np.percentile(shape, 90) < 0.01
     assert np.sqrt(np.mean(path**2)) < 0.01
     # the origin is the middle of the mesh
-    np.testing.assert_allclose(body.mesh.vertices.min(axis=0), -body.mesh.vertices.max(axis=0), atol=1e-5)
+    np.testing.assert_allclose(obj.mesh.vertices.min(axis=0), -obj.mesh.vertices.max(axis=0), atol=1e-5)
 
 
-def test_a_walking_person_is_refused_and_it_is_said_why():
+def test_a_walking_person_is_rejected_with_a_reason():
     sequence = dudmap.synthetic.sequence(
         "box", ["person"], frames=36, speed=0.8, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
-    (body,) = fused(sequence, range(36)).values()
-    assert not body.rigid
-    assert body.mesh is None
-    assert body.trajectory is None
-    assert body.why.startswith("not rigid")
+    (obj,) = fused(sequence, range(36)).values()
+    assert not obj.rigid
+    assert obj.mesh is None
+    assert obj.trajectory is None
+    assert obj.reason.startswith("not rigid")
 
 
-def test_what_rests_is_no_moving_body():
+def test_an_object_at_rest_is_not_moving():
     sequence = dudmap.synthetic.sequence(
         "box", ["stopping_cart"], frames=90, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
-    (body,) = fused(sequence, range(70, 90)).values()
-    assert not body.rigid
-    assert body.why.startswith("moved by 0.")
+    (obj,) = fused(sequence, range(70, 90)).values()
+    assert not obj.rigid
+    assert obj.reason.startswith("moved by 0.")
 
 
-def test_a_few_frames_prove_nothing():
+def test_a_few_frames_do_not_prove_an_object_rigid():
     sequence = dudmap.synthetic.sequence(
         "box", ["creeper"], frames=8, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
-    (body,) = fused(sequence, range(4, 8)).values()
-    assert not body.rigid
-    assert body.why.startswith("seen too short: 4 frames")
+    (obj,) = fused(sequence, range(4, 8)).values()
+    assert not obj.rigid
+    assert obj.reason.startswith("seen too short: 4 frames")
 
 
 def test_off_by_default_and_without_influence():
@@ -154,16 +172,16 @@ def test_run_writes_meshes_of_rigid_movers(tmp_path):
         (out / "movers").mkdir(parents=True)
         (out / "movers" / "77.ply").write_text("of an earlier run")
         report = run(sequence, ON, out, progress=False, save_map=False)
-        bodies = json.loads((out / "metrics.json").read_text())["bodies"]
-        assert bodies == report.metrics["bodies"]
-        rigid = [body for body in bodies if body["rigid"]]
+        objects = json.loads((out / "metrics.json").read_text())["bodies"]
+        assert objects == report.metrics["bodies"]
+        rigid = [obj for obj in objects if obj["rigid"]]
         assert len(rigid) == 1
-        assert all(body["why_not"] for body in bodies if not body["rigid"])
+        assert all(obj["why_not"] for obj in objects if not obj["rigid"])
         number = rigid[0]["id"]
         assert sorted(path.name for path in (out / "movers").iterdir()) == [f"{number}.ply", f"{number}.txt"]
         mesh, path = Mesh.load(out / "movers" / f"{number}.ply"), Trajectory.load(out / "movers" / f"{number}.txt")
-        body = RigidObject(number, True, "", rigid[0]["frames"], mesh, path)
-        shape, way = errors(body, sequence._movers[0], sequence.ground_truth.Ts_world_camera[0])
+        obj = RigidObject(number, True, "", rigid[0]["frames"], mesh, path)
+        shape, way = errors(obj, sequence._movers[0], sequence.ground_truth.Ts_world_camera[0])
         assert np.median(shape) < 0.004
         assert np.percentile(shape, 90) < 0.02
         assert np.sqrt(np.mean(way**2)) < rms

@@ -1,4 +1,4 @@
-"""Movers: identity, place, extent and velocity of moving bodies, against made-up images and the synthetic truth."""
+"""Movers: identity, place, extent and velocity of moving objects, against made-up images and the synthetic truth."""
 
 import json
 from types import SimpleNamespace
@@ -78,7 +78,7 @@ def test_velocity_and_identity(velocity, camera_speed):
     assert mover.age == pytest.approx(0.3)
 
 
-def test_velocity_of_a_body_that_enters_the_image():
+def test_velocity_of_an_object_that_enters_the_image():
     """Its visible part grows, so that the centroid moves at half the speed; the surface tells the truth."""
     tracker = ObjectTracker(MoversConfig())
     for i in range(8):
@@ -88,7 +88,7 @@ def test_velocity_of_a_body_that_enters_the_image():
     np.testing.assert_allclose(mover.velocity, [1, 0, 0], atol=0.1)
 
 
-def test_two_bodies_keep_their_numbers():
+def test_two_objects_keep_their_numbers():
     tracker, first = ObjectTracker(MoversConfig()), 0
     for i in range(12):
         shift = 0.03 * i
@@ -100,7 +100,7 @@ def test_two_bodies_keep_their_numbers():
         assert left.id == first
 
 
-def test_bodies_that_touch_stay_two():
+def test_objects_that_touch_stay_two():
     """Two boards meet at one depth, hang together for a while, and part again; each pixel stays with its board."""
     tracker = ObjectTracker(MoversConfig())
     touched = 0
@@ -120,7 +120,7 @@ def test_bodies_that_touch_stay_two():
     assert touched > 10
 
 
-def test_a_body_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
+def test_an_object_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
     tracker = ObjectTracker(MoversConfig(memory=0.5))
     mask, level = board(0.0)
     nothing = np.zeros_like(mask)
@@ -130,7 +130,7 @@ def test_a_body_keeps_its_number_over_a_short_gap_and_not_over_a_long_one():
     assert numbers == [1, 1, 2]
 
 
-def test_fragments_are_one_body_and_specks_none():
+def test_fragments_are_one_object_and_specks_none():
     mask, level = board(0.0)
     split = mask.copy()
     split[90:93] = False  # cut off near the lower end
@@ -140,7 +140,7 @@ def test_fragments_are_one_body_and_specks_none():
     assert movers[0].mask.sum() == (split & mask).sum()
 
 
-def test_far_fragments_are_two_bodies():
+def test_far_fragments_are_two_objects():
     mask, level = joined(board(-0.5), board(0.5, width=0.2))
     assert len(ObjectTracker(MoversConfig()).update(0.0, mask, level, np.eye(4))) == 2
 

@@ -13,7 +13,7 @@ from dudmap.errors import DatasetError
 from dudmap.pipeline.replay import Arrival, LatestSlot, live, replay
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
-from fake_slam import StandIn
+from fake_slam import FakeSlam
 from recordings import cut, write_recording
 
 
@@ -125,7 +125,7 @@ def recording(tmp_path):
 
 
 def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, monkeypatch):
-    fast = StandIn.process
+    fast = FakeSlam.process
 
     def slow(self, frame):
         time.sleep(0.12)

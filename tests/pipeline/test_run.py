@@ -14,7 +14,7 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.frame_source import read_ahead
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
-from fake_slam import SECOND, Volume
+from fake_slam import SECOND, FakeVolume
 from recordings import HEIGHT, WIDTH, cut, write_recording
 
 
@@ -164,7 +164,7 @@ def test_one_file_that_cannot_be_written_does_not_cost_the_others(slam, recordin
     def full(self, path):
         raise OSError(28, "No space left on device", str(path))
 
-    monkeypatch.setattr(Volume, "save", full)
+    monkeypatch.setattr(FakeVolume, "save", full)
     with pytest.raises(DudmapError, match=r"is incomplete: .*No space left"):
         go(recording, tmp_path / "out")
     assert (tmp_path / "out/mesh.ply").exists()

@@ -1,4 +1,4 @@
-"""The store of fused frames: what comes back, what is left out, and the map that is built from it again."""
+"""The frame store: what is stored and how exactly, and the map rebuilt from it."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Loops and submaps: drift that is found and taken out, maps that are joined, and nothing where there is nothing."""
+"""Loop closing and submaps: drift is corrected, submaps are joined, and without a loop nothing changes."""
 
 from dataclasses import replace
 
@@ -18,7 +18,8 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.run import run
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
-from dudmap.places.loop_closing import LoopCloser, View
+from dudmap.places.loop_closing import LoopCloser
+from dudmap.places.loop_verification import LoopQuery, LoopVerifier
 from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
@@ -73,26 +74,42 @@ def test_everything_moves_along_with_a_correction():
     assert atlas.volume.map_id == volume.map_id
 
 
+def query_of(T, timestamp):
+    """A tracked frame without images at a pose."""
+    image = np.zeros(TINY.shape, np.float32)
+    observation = Observation(timestamp, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
+    tracking = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
+    return LoopQuery(observation, [], None, np.ones(TINY.shape, dtype=bool), tracking)
+
+
 @pytest.mark.parametrize("solvable", [True, False])
 def test_a_loop_counts_only_if_its_correction_is_finite(monkeypatch, solvable):
-    """Three frames back at the first, where the loop measures 2 mm of drift."""
+    """The fourth of four frames of one wall recognises the first and measures 2 mm of drift."""
     atlas = made_up_atlas([0, 0, 0, 0])
     loops = LoopCloser(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
     if not solvable:
-        monkeypatch.setattr("dudmap.places.loop_closing.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
-    image = np.zeros(TINY.shape, np.float32)
-    observation = Observation(3.0, TINY, image, image, image, np.zeros((*TINY.shape, 3), np.uint8))
-    T = atlas.poses[-1].T_world_camera
-    tracked = TrackingResult(T, (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
-    view = View(observation, [], None, np.ones(TINY.shape, dtype=bool), tracked)
-    place = PlaceMatch(atlas.keyframes.keyframes[0], T, 20)
+        monkeypatch.setattr("dudmap.places.loop_correction.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
     before = [pose.T_world_camera.copy() for pose in atlas.poses]
-    correction = loops._correct(place, view, T @ shifted(0.002))
+    T = before[-1]
+    place = PlaceMatch(atlas.keyframes.keyframes[0], T, 20)
+    correction = loops._correct(place, query_of(T, 3.0), T @ shifted(0.002))
     assert (correction is not None) == solvable
-    assert loops.closed == len(loops._edges) == int(solvable)
+    assert loops.closed == len(loops.corrector.edges) == int(solvable)
     moves = [np.abs(pose.T_world_camera - T).max() for pose, T in zip(atlas.poses, before, strict=True)]
     assert np.all(np.isfinite(moves))
     assert (max(moves) > 0) == solvable
+
+
+def test_drift_must_be_plausible_for_the_path():
+    """Over a path of 3 cm since the place was seen 5 cm and a tenth of the path are believed."""
+    atlas = made_up_atlas([0, 0, 0, 0])
+    verifier = LoopVerifier(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
+    atlas.keyframes.keyframes[0].last_seen = 0.0
+    T = atlas.poses[-1].T_world_camera
+    turn = se3.exp(np.array([0, 0, 0, 0, 0.06, 0]))
+    for drift, plausible in ((shifted(0.05), True), (shifted(0.06), False), (turn, False)):
+        place = PlaceMatch(atlas.keyframes.keyframes[0], T @ drift, 20)
+        assert verifier.is_plausible(place, T) == plausible
 
 
 def test_join_brings_one_map_into_the_other():

@@ -1,4 +1,4 @@
-"""Lost and found: matching, RANSAC and keyframes against made-up truth, and the whole way in a kidnapped camera."""
+"""Place recognition: alignment, RANSAC and keyframes against ground truth, and the recovery of a kidnapped camera."""
 
 import numpy as np
 import pytest
@@ -11,7 +11,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree, kabsch, rigid_ransac
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.places.place_recognition import KeyframeDatabase, matches
+from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.slam import Slam
 from dudmap.synthetic.recording import SyntheticSequence
 
@@ -61,19 +61,6 @@ def test_ransac_of_nothing():
     assert not rigid_ransac(a[:2], b[:2], np.full(2, 0.01))[1].any()
     line = np.outer(np.linspace(0, 0.05, 30), [1, 0, 0])  # too short to define a pose
     assert not rigid_ransac(line, line, np.full(30, 0.01))[1].any()
-
-
-def test_matches_are_mutual_and_distinct():
-    rng = np.random.default_rng(3)
-    b = rng.normal(size=(50, 128)).astype(np.float32)
-    b /= np.linalg.norm(b, axis=1, keepdims=True)
-    order = rng.permutation(50)[:20]
-    a = b[order] + 0.02 * rng.normal(size=(20, 128)).astype(np.float32)
-    a /= np.linalg.norm(a, axis=1, keepdims=True)
-    np.testing.assert_array_equal(matches(a, b, 0.8), np.stack([np.arange(20), order], axis=1))
-    twins = np.concatenate([b, b])  # every feature there twice: none is distinct
-    assert len(matches(a, twins, 0.8)) == 0
-    assert len(matches(a[:0], b, 0.8)) == len(matches(a, b[:1], 0.8)) == 0
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""The pose graph against problems whose solution is known."""
+"""Pose graph optimization against problems whose solution is known."""
 
 import numpy as np
 

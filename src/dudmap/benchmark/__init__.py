@@ -1,1 +1,1 @@
-"""Suites of recordings, measured with named systems: one table, a gate against regressions, the limit of dynamics."""
+"""Benchmarks: suites of recordings, the accuracy gate, the limit of dynamics, and speed."""

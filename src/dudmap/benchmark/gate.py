@@ -1,4 +1,4 @@
-"""The accuracy gate: a small fixed set of recordings must not be measured worse than what was recorded."""
+"""Accuracy gate: on a small fixed set of recordings no figure may be worse than the recorded one plus a margin."""
 
 import tomllib
 from collections.abc import Mapping
@@ -19,7 +19,7 @@ WORLDS: dict[str, dict[str, Any]] = {
     "desk-fast-camera": {"frames": 40, "scene": "desk", "movers": (), "camera_path": "fast"},
 }
 EXCERPT = "freiburg1_xyz"
-"""Twelve real frames, in the folder of the test fixtures."""
+"""Twelve real frames among the test fixtures."""
 FIGURES: dict[str, str] = {
     "lost": "<=",
     "ate_rmse_m": "<=",
@@ -29,7 +29,7 @@ FIGURES: dict[str, str] = {
     "mesh_completeness": ">=",
     "ghost_area_m2": "<=",
 }
-"""What is recorded, and whether a good figure is small or large."""
+"""Recorded figures, and whether smaller or larger is better."""
 MARGINS: dict[str, tuple[float, float]] = {
     "lost": (0.0, 0.0),
     "ate_rmse_m": (0.15, 0.001),
@@ -39,14 +39,14 @@ MARGINS: dict[str, tuple[float, float]] = {
     "mesh_completeness": (0.0, 0.01),
     "ghost_area_m2": (0.20, 0.02),
 }
-"""Written into a new file: how much worse a figure may become, as a share of the recorded one plus an absolute part."""
+"""Default margins of a new file: relative to the recorded figure, and absolute."""
 
 
 def gate_entries(fixtures: Path) -> list[Entry]:
-    """The recordings of the gate.
+    """Recordings of the gate.
 
     Args:
-        fixtures: Folder that holds the real excerpt.
+        fixtures: Folder that contains the real excerpt.
     """
     worlds = [Entry(name, parameters={**parameters, "camera": SMALL}) for name, parameters in WORLDS.items()]
     return [*worlds, Entry(EXCERPT, fixtures / EXCERPT)]
@@ -54,14 +54,14 @@ def gate_entries(fixtures: Path) -> list[Entry]:
 
 @dataclass(frozen=True)
 class Check:
-    """One figure against its recorded value.
+    """Comparison of one figure with its recorded value.
 
     Attributes:
         sequence: Name of the recording.
         figure: Key of the figure.
-        recorded: The reviewed value.
-        bound: The worst value that passes.
-        measured: What was measured, None if it could not be.
+        recorded: Recorded value.
+        bound: Worst value that passes.
+        measured: Measured value, None if there is none.
     """
 
     sequence: str
@@ -72,14 +72,14 @@ class Check:
 
     @property
     def passed(self) -> bool:
-        """Whether the measured figure is no worse than the bound."""
+        """Whether the measured value is no worse than the bound."""
         if self.measured is None:
             return False
         return self.measured <= self.bound if FIGURES[self.figure] == "<=" else self.measured >= self.bound
 
 
 def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
-    """Figures of every recording, in this process."""
+    """Figures of every recording, measured in this process."""
     rows = []
     for entry in entries:
         sequence = entry.open()
@@ -88,10 +88,10 @@ def measure_gate(entries: list[Entry], config: Config) -> list[Row]:
 
 
 def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Check]:
-    """Every recorded figure of the measured recordings against what was measured.
+    """Compare every recorded figure of the measured recordings with its measured value.
 
     Raises:
-        ConfigError: A recording, or the margin of a figure, is not recorded.
+        ConfigError: A recording or a margin is missing in the file.
     """
     checks = []
     for row in rows:
@@ -100,7 +100,7 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Check]:
             raise ConfigError(f"the gate has no recorded figures of {name}; record them with --record")
         for figure, value in recorded["figures"][name].items():
             if figure not in FIGURES or figure not in recorded["margins"]:
-                raise ConfigError(f"the gate knows no figure or margin {figure!r}; known are {', '.join(FIGURES)}")
+                raise ConfigError(f"unknown figure or margin {figure!r} of the gate; known are {', '.join(FIGURES)}")
             margin = recorded["margins"][figure]
             slack = margin["relative"] * abs(value) + margin["absolute"]
             bound = value + slack if FIGURES[figure] == "<=" else value - slack
@@ -109,22 +109,22 @@ def compare(rows: list[Row], recorded: Mapping[str, Any]) -> list[Check]:
 
 
 def load_figures(path: Path) -> dict[str, Any]:
-    """The reviewed file: ``margins`` by figure, ``figures`` by recording and figure.
+    """Content of the file: ``margins`` by figure, and ``figures`` by recording and figure.
 
     Raises:
-        ConfigError: It is missing or not what is expected.
+        ConfigError: The file is missing or malformed.
     """
     try:
         content = tomllib.loads(path.read_text(encoding="utf-8"))
     except (OSError, tomllib.TOMLDecodeError) as error:
-        raise ConfigError(f"cannot read the gate's figures {path}: {error}; --record makes the file") from error
+        raise ConfigError(f"cannot read the figures of the gate {path}: {error}; --record creates the file") from error
     if not {"margins", "figures"} <= set(content):
-        raise ConfigError(f"{path} has no [margins] or no [figures]; --record makes the file anew")
+        raise ConfigError(f"{path} has no [margins] or no [figures]; --record creates it")
     return content
 
 
 def save_figures(path: Path, rows: list[Row], margins: Mapping[str, Any] | None = None) -> None:
-    """Write the measured figures as the recorded ones; margins given (those of the old file) are kept."""
+    """Write the measured figures as the recorded ones; given margins replace the default ones."""
     lines = [
         "# Recorded figures of the accuracy gate; written by `dudmap benchmark gate --record`, reviewed by a person.",
         "# A figure may become worse by relative * recorded + absolute.",
@@ -148,7 +148,7 @@ def verdict(checks: list[Check]) -> str:
             check.figure,
             f"{check.recorded:.5g}",
             f"{FIGURES[check.figure]} {check.bound:.5g}",
-            "nothing" if check.measured is None else f"{check.measured:.5g}",
+            "none" if check.measured is None else f"{check.measured:.5g}",
             "yes" if check.passed else "NO",
         ]
         for check in checks

@@ -13,7 +13,7 @@ from dudmap.benchmark.table import grid
 
 
 class Quantity(NamedTuple):
-    """What a row of heat maps shows: figure, heading, factor from the stored unit, range of colours, and the format."""
+    """One row of heat maps: figure, heading, factor from the stored unit, range and scale of the colours, format."""
 
     key: str
     heading: str
@@ -35,7 +35,7 @@ NOT_KNOWN = "#d0d0d0"
 
 
 def values(rows: Listing[Row], sweep: Sweep, system: str, key: str) -> NDArray[np.float64]:
-    """Figures (coverages, xs) of a system, NaN where there is none."""
+    """Array (coverages, xs) of one figure of a system, NaN where there is none."""
     found = {
         (row["coverage"], row["x"]): row.get(key)
         for row in rows
@@ -46,10 +46,10 @@ def values(rows: Listing[Row], sweep: Sweep, system: str, key: str) -> NDArray[n
 
 
 def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path: Path) -> None:
-    """One picture per sweep: a line of maps per figure, a column per system; green is good.
+    """Write the heat maps of a sweep: one row per figure, one column per system; green is good.
 
-    A frame around a cell: the system copes (ATE within the limit and nothing lost). Grey: no figure. A star: some
-    frames were lost, and the error is that of the others.
+    A framed cell is a condition with which the system copes (ATE within the limit, no frame lost). Grey cells have no
+    value. A star marks an ATE that excludes lost frames.
     """
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
@@ -86,7 +86,7 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
 
 
 def _colors(shown: NDArray[np.float64], quantity: Quantity) -> NDArray[np.float64]:
-    """Colours (R, C, 4), green for good, red for bad, transparent where there is no figure."""
+    """Colours (R, C, 4) from green (good) to red (bad), transparent for NaN."""
     from matplotlib import colormaps
 
     if quantity.logarithmic:
@@ -95,13 +95,13 @@ def _colors(shown: NDArray[np.float64], quantity: Quantity) -> NDArray[np.float6
     else:
         share = (shown - quantity.low) / (quantity.high - quantity.low)
     colors = colormaps["RdYlGn_r" if quantity.good_is_low else "RdYlGn"](np.nan_to_num(share))
-    colors[..., :3] = 0.35 + 0.65 * colors[..., :3]  # pale, so that the numbers can be read
+    colors[..., :3] = 0.35 + 0.65 * colors[..., :3]  # lighter, so that the numbers are legible
     colors[np.isnan(shown), 3] = 0.0
     return colors
 
 
 def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
-    """Largest coverage each system copes with, per value of every sweep, as Markdown."""
+    """Markdown table of the largest coverage with which each system copes, per value of every sweep."""
     text = ""
     for sweep in sweeps:
         body = []
@@ -113,7 +113,7 @@ def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[st
 
 
 def cells_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
-    """Every cell of every sweep as Markdown: ATE in cm and the share of frames lost; bold where the system copes."""
+    """Markdown table of all cells: ATE in cm and share of lost frames, bold where the system copes."""
     text = ""
     for sweep in sweeps:
         found = {(row["x"], row["coverage"], row["system"]): row for row in rows if row["sweep"] == sweep.name}

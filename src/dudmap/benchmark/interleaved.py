@@ -1,4 +1,4 @@
-"""Our time per frame beside that of Open3D's dense SLAM: the same frames, run in turn on the same machine."""
+"""Comparison of the time per frame with Open3D's dense SLAM: same frames, alternating runs on the same machine."""
 
 import importlib.util
 import json
@@ -22,19 +22,19 @@ if TYPE_CHECKING:
     from dudmap.sequences import Sequence
 
 ROUNDS = 3
-"""Times that each system runs, in turn, so that both meet the machine in the same moods."""
+"""Number of alternating runs of each system, so that a varying load affects both."""
 WARM_UP = 10
-"""First frames of a run that are not timed."""
+"""Number of frames at the start of a run that are not timed."""
 
 
 class Comparison(NamedTuple):
-    """Median milliseconds per frame over all rounds, and ATE RMSE in metres of the last one.
+    """Result of the comparison.
 
     Attributes:
-        ours_ms, theirs_ms: Time per frame.
-        ours_ate, theirs_ate: Accuracy; None without a ground truth.
-        frames: Length of the recording.
-        version: Of Open3D.
+        ours_ms, theirs_ms: Median time per frame over all rounds, milliseconds.
+        ours_ate, theirs_ate: ATE RMSE of the last round, metres; None without a ground truth.
+        frames: Number of frames.
+        version: Version of Open3D.
     """
 
     ours_ms: float
@@ -46,10 +46,10 @@ class Comparison(NamedTuple):
 
 
 def find_open3d(python: Path | None) -> str | None:
-    """The Python that has open3d: the given one, else this one if it has it, else None.
+    """Python interpreter with open3d: the given one, else this one if it has open3d, else None.
 
     Raises:
-        DudmapError: The given one has no usable open3d.
+        DudmapError: The given interpreter cannot import open3d.
     """
     if python is None:
         return sys.executable if importlib.util.find_spec("open3d") else None
@@ -67,10 +67,10 @@ def find_open3d(python: Path | None) -> str | None:
 
 
 def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = ROUNDS) -> Comparison:
-    """Run both systems in turn over the first frames of a recording, each run in a process of its own.
+    """Run both systems alternately on the first frames of a recording, each run in its own process.
 
-    Both get decoded images, and both are timed from there to pose and fused map: ours with the default configuration,
-    labels and all, theirs at the same voxel size and the same farthest depth.
+    Both receive decoded images and are timed until the pose is estimated and the frame is fused: ours with the default
+    configuration including dynamic labels, theirs with the same voxel size and largest depth.
 
     Raises:
         DudmapError: A run failed.
@@ -90,7 +90,7 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
 
 
 def _save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
-    """Write frames as the arrays that open3d_slam.py reads; gives the ground truth and their times (n,)."""
+    """Write the arrays that open3d_slam.py reads; returns the ground truth and the timestamps (n,)."""
     camera = sequence.camera
     count = min(frames, len(sequence))
     chosen = []

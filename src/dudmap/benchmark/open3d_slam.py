@@ -1,4 +1,4 @@
-"""Open3D's dense SLAM (t.pipelines.slam) on frames in a folder; a program of its own that needs only open3d and numpy.
+"""Open3D's dense SLAM (t.pipelines.slam) on frames in a folder; a separate program that needs only open3d and numpy.
 
     python open3d_slam.py FOLDER VOXEL_SIZE DEPTH_MAX
 
@@ -16,7 +16,7 @@ import numpy as np
 
 
 def main() -> None:
-    """Run over all frames."""
+    """Process all frames."""
     import open3d as o3d  # type: ignore[import-not-found]
 
     folder, voxel_size, depth_max = Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])

@@ -1,4 +1,4 @@
-"""A long passage that a camera walks through: space that is always new."""
+"""Synthetic recording of a walk through a long passage, in which the camera always sees new space."""
 
 import numpy as np
 
@@ -6,20 +6,23 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.synthetic.scene import Light, Material, Scene, box, cylinder, look_at, pose
 
-SPEED, FPS = 0.3, 30.0  # m/s, frames per second
+SPEED, FPS = 0.3, 30.0
+"""Speed of the camera, m/s, and frame rate, Hz."""
 LAP = 194
-"""Frames after which the camera has swayed once, and the walls come again but for their pattern of three.
+"""Period in frames of the sway of the camera and of the objects along the walls (up to their pattern of three).
 
-60 frames to warm up and ten laps are 2000 frames: the first and the last tenth see the same, nine laps apart.
+60 frames of warm-up and ten periods are 2000 frames: the first and the last tenth show the same, nine periods apart.
 """
 SPACING = SPEED * LAP / FPS
-BEYOND = 8.0  # metres of passage beyond the last camera position: the end is never seen
+"""Distance that the camera covers in one period, metres."""
+BEYOND = 8.0
+"""Length of the passage beyond the last camera position, metres; its end is out of range."""
 
 
 def passage(frames: int) -> SyntheticSequence:
-    """A recording of ``frames`` frames in which the camera walks straight on, looking at one wall, then at the other.
+    """Recording of ``frames`` frames in which the camera moves straight on and looks at either wall in turn.
 
-    The passage is 3 m wide and as long as the walk; pilasters, boxes and columns stand along both walls.
+    The passage is 3 m wide and as long as the walk, with pilasters, boxes and columns along both walls.
     """
     times = np.arange(frames) / FPS
     length = SPEED * float(times[-1]) + BEYOND

@@ -1,4 +1,4 @@
-"""Published figures of other systems, from the data file beside this module."""
+"""Published figures of other systems, from published.toml."""
 
 import math
 import tomllib
@@ -8,14 +8,14 @@ from typing import NamedTuple
 
 
 class Published(NamedTuple):
-    """One printed figure.
+    """One published figure.
 
     Attributes:
-        sequence: Name of the recording, as its data set calls the folder.
-        system: Who was measured.
+        sequence: Name of the recording: that of its folder in the data set.
+        system: Name of the system.
         metric: Key of the figure in our tables.
-        value: In the unit our tables store: metres, m/s, deg/s.
-        source: Where it is printed.
+        value: Value in the unit of our tables: metres, m/s, deg/s.
+        source: Publication.
     """
 
     sequence: str
@@ -26,7 +26,7 @@ class Published(NamedTuple):
 
 
 def published(sequences: Collection[str] | None = None) -> list[Published]:
-    """All published figures, or those of some recordings, in the order of the data file."""
+    """Published figures of all or of the given recordings, in the order of the data file."""
     content = tomllib.loads(files("dudmap.benchmark").joinpath("published.toml").read_text(encoding="utf-8"))
     sources = content["sources"]
     return [

@@ -1,4 +1,4 @@
-"""A suite from start to end: measure, score what others computed, put all in one table with what was published."""
+"""Report of a suite: measured figures, results of other systems and published figures in one document."""
 
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -28,10 +28,10 @@ def run_suite(
     Args:
         suite: The recordings.
         systems: Configurations by name.
-        others: Folders of results by the name of who computed them: FOLDER/<sequence>/trajectory.txt and mesh.ply.
-        out: Folder for the tables, and the runs in runs/<system>/<sequence>.
-        workers: Processes at a time.
-        done: Called with every row as soon as it is there.
+        others: Folders with results of other systems, by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
+        out: Folder for the tables, and for the runs in runs/<system>/<sequence>.
+        workers: Number of processes at a time.
+        done: Called with every row as soon as it is complete.
     """
     jobs = [
         Job(entry, name, config, out / "runs" / name / entry.name)
@@ -47,7 +47,7 @@ def run_suite(
     rows.sort(key=lambda row: order[row["sequence"]])
     printed = published(suite.names())
     table = markdown(rows) if rows else "None of its recordings was found.\n"
-    text = f"# Suite {suite.name}\n\n{table}\n{_missing(suite)}{beside(rows, printed, suite)}"
+    text = f"# Suite {suite.name}\n\n{table}\n{_missing(suite)}{comparison_tables(rows, printed, suite)}"
     if workers > 1:
         text += f"\n{workers} runs at a time: the times per frame are not those of an otherwise idle machine.\n"
     cpu = machine()
@@ -64,10 +64,10 @@ def run_suite(
 
 
 def named_folders(assignments: list[str]) -> dict[str, Path]:
-    """``NAME=FOLDER`` pairs.
+    """Parse ``NAME=FOLDER`` pairs.
 
     Raises:
-        ConfigError: One is malformed or its folder is missing.
+        ConfigError: A pair is malformed or its folder is missing.
     """
     found = {}
     for assignment in assignments:
@@ -81,7 +81,7 @@ def named_folders(assignments: list[str]) -> dict[str, Path]:
 
 
 def _scored(entry: Entry, folder: Path) -> Row:
-    """Figures of the trajectory and mesh that another system left in a folder."""
+    """Figures of the trajectory and mesh of another system."""
     from dudmap.geometry.mesh import Mesh
     from dudmap.geometry.trajectory import Trajectory
 
@@ -105,14 +105,15 @@ def _scored(entry: Entry, folder: Path) -> Row:
 
 
 def _missing(suite: Suite) -> str:
+    """List of the recordings that were not found, with their addresses."""
     if not suite.missing:
         return ""
     lines = [f"- {entry.name}: {entry.address}" for entry in suite.missing]
-    return "Not found and skipped; each can be downloaded from the address beside it:\n\n" + "\n".join(lines) + "\n"
+    return "Not found and skipped; they can be downloaded from these addresses:\n\n" + "\n".join(lines) + "\n"
 
 
-def beside(rows: list[Row], printed: list[Published], suite: Suite) -> str:
-    """One Markdown table per published figure: our systems in bold, then those of the literature with their source."""
+def comparison_tables(rows: list[Row], printed: list[Published], suite: Suite) -> str:
+    """One Markdown table per published figure: measured systems in bold, then published ones with their source."""
     text, sources = "", list(dict.fromkeys(value.source for value in printed))
     for column in COLUMNS:
         values = [value for value in printed if value.metric == column.key]

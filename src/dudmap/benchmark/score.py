@@ -1,4 +1,4 @@
-"""Figures of one result against the truth, whoever computed it."""
+"""Errors of a trajectory and a mesh, of any system, against the ground truth."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -10,9 +10,9 @@ if TYPE_CHECKING:
     from dudmap.geometry.mesh import Mesh
 
 COMPLETE_WITHIN = 0.02
-"""A point of the true surface counts as mapped if the mesh is this near, metres."""
+"""Largest distance to the mesh of a point of the true surface that counts as reconstructed, metres."""
 SAMPLES = 100_000
-"""Points drawn on each surface."""
+"""Number of points sampled on each surface."""
 
 
 def score_trajectory(estimate: Trajectory, truth: Trajectory) -> dict[str, Any]:
@@ -28,18 +28,17 @@ def score_mesh(
     seen: "Mesh | Surface",
     samples: int = SAMPLES,
 ) -> dict[str, Any]:
-    """How the mesh compares with the true static surface.
+    """Accuracy, completeness and ghosts of a mesh.
 
-    The mesh is moved by the motion that brings the first estimated pose onto the true one, and not fitted: a bent or
-    shifted map counts as wrong.
+    The mesh is aligned by the first pose only, so that a bent or shifted map is penalised.
 
     Args:
-        mesh: In the frame of ``estimate``.
-        estimate: The system's trajectory.
-        truth: True poses.
-        whole: True static surface, in the frame of ``truth``; accuracy and ghosts are measured against it.
-        seen: The part of it that the camera saw; completeness is measured on it.
-        samples: Points drawn on each surface.
+        mesh: Estimated mesh in the world frame of ``estimate``.
+        estimate: Estimated trajectory.
+        truth: True trajectory.
+        whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
+        seen: Part of it that the camera saw, for completeness.
+        samples: Number of points sampled on each surface.
 
     Raises:
         DatasetError: The trajectories have fewer than three poses in common.

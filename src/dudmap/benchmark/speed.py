@@ -1,4 +1,4 @@
-"""Speed and memory on this machine, beside what they should be."""
+"""Speed and memory on this machine, compared with their targets."""
 
 import os
 import statistics
@@ -7,32 +7,19 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
-
-import numpy as np
+from typing import Any, NamedTuple
 
 from dudmap.benchmark.entries import Entry
 from dudmap.benchmark.measure import Row, in_own_process
 from dudmap.benchmark.table import grid
-from dudmap.config import Config
+from dudmap.benchmark.timing import time_frames, time_iteration, time_walk
 from dudmap.errors import DudmapError
-
-if TYPE_CHECKING:
-    from dudmap.frames.frame import Frame
-    from dudmap.sequences import Sequence
-    from dudmap.slam import Slam
-
-WARM_UP = 10
-"""First frames of a run that are not timed."""
-IN_TURN = 20
-"""Frames of one system before it is the other's turn."""
 
 
 class Figure(NamedTuple):
-    """One line of the table: what was measured, its unit, the largest value wanted (None = any), what came out."""
+    """One row of the table: quantity, unit, largest acceptable value (None = no target), and measured value."""
 
     what: str
     unit: str
@@ -44,47 +31,48 @@ class Figure(NamedTuple):
 def speed_figures(
     frames: int,
     long_frames: int = 0,
-    say: Callable[[str], None] = lambda text: None,
+    announce: Callable[[str], None] = lambda text: None,
     open3d: str | None = None,
     recording: Path | None = None,
 ) -> list[Figure]:
-    """All figures, each measured in a fresh process.
+    """Measure all figures, each in a new process.
 
     Args:
-        frames: Length of the recordings that are timed.
-        long_frames: Length of the walk through new space that shows whether time per frame grows; 0 leaves it out.
-        say: Called with what is measured next.
-        open3d: A Python that has open3d, whose dense SLAM is then timed beside ours; None leaves it out.
-        recording: Recording for that; None takes a synthetic room in which nothing moves.
+        frames: Number of frames of the timed recordings.
+        long_frames: Number of frames of the walk through unseen space, which shows whether the time per frame grows; 0
+            skips it.
+        announce: Called with a description of the next measurement.
+        open3d: Python interpreter with Open3D, for the comparison with its dense SLAM; None skips it.
+        recording: Recording of that comparison; None takes a static synthetic room.
 
     Raises:
         DudmapError: A measurement failed.
     """
     figures: list[Figure] = []
-    say("frames at 1, 2 and 0.5 cm voxels")
+    announce("frames at 1, 2 and 0.5 cm voxels")
     for voxel, median, p95 in ((0.01, 33.0, 50.0), (0.02, 20.0, None), (0.005, 70.0, None)):
-        row = _ask(_time_frames, (voxel, frames))
+        row = _measured(time_frames, (voxel, frames))
         name = f"frame, {100 * voxel:g} cm voxels"
         figures.append(Figure(f"{name}, median", "ms", median, row["median"]))
         if p95 is not None:
             figures.append(Figure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
             figures += _map_figures(row)
             figures.append(Figure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
-    say("one registration iteration on one thread")
+    announce("one registration iteration on one thread")
     with _environment(DUDMAP_THREADS="1"):
-        row = _ask(_time_iteration, 40)
+        row = _measured(time_iteration, 40)
     figures.append(Figure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
-    say("starting")
+    announce("starting")
     figures += _start_times()
     if long_frames:
-        say(f"{long_frames} frames through new space")
-        row = _ask(_time_walk, long_frames)
+        announce(f"{long_frames} frames through new space")
+        row = _measured(time_walk, long_frames)
         remark = f"{long_frames} frames, {row['first_ms']:.1f} to {row['last_ms']:.1f} ms"
         figures.append(Figure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
         remark = f"{row['stale']} chunks; all of the map takes {row['mesh_ms']:.0f} ms"
         figures.append(Figure("mesh again after one frame, end of the walk", "ms", None, row["again_ms"], remark))
     if open3d is not None:
-        say("Open3D's dense SLAM and ours in turn")
+        announce("Open3D's dense SLAM and ours in turn")
         figures += _open3d_figures(open3d, recording, frames)
     return figures
 
@@ -121,7 +109,7 @@ def markdown(figures: list[Figure]) -> str:
         [
             figure.what,
             "" if figure.target is None else f"<= {figure.target:.3g} {figure.unit}",
-            "nothing" if figure.measured is None else f"{figure.measured:.3g} {figure.unit}",
+            "none" if figure.measured is None else f"{figure.measured:.3g} {figure.unit}",
             "" if figure.target is None else "yes" if _reached(figure.measured, figure.target) else "NO",
             figure.remark,
         ]
@@ -134,7 +122,7 @@ def _reached(measured: float | None, target: float) -> bool:
     return measured is not None and measured <= target
 
 
-def _ask(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
+def _measured(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
     row = in_own_process(function, argument)
     if "error" in row:
         raise DudmapError(f"the speed could not be measured: {row['error']}")
@@ -143,7 +131,7 @@ def _ask(function: Callable[[Any], Row], argument: Any) -> Row:  # noqa: ANN401
 
 @contextmanager
 def _environment(**variables: str) -> Iterator[None]:
-    """Environment variables for the processes started within."""
+    """Set environment variables for the processes that are started in this context."""
     old = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:
@@ -153,114 +141,6 @@ def _environment(**variables: str) -> Iterator[None]:
             os.environ.pop(name)
             if value is not None:
                 os.environ[name] = value
-
-
-def _room(frames: int) -> "Sequence":
-    return Entry("room-person", parameters={"frames": frames, "start_dynamic": False}).open()
-
-
-def _processed(config: Config, sequence: "Sequence", frames: int) -> "Iterator[tuple[Slam, float]]":
-    """The system and the milliseconds of every frame of a recording, until it and the next one, which is made ready
-    meanwhile as in a run, are both done; rendering is not timed."""
-    from dudmap.slam import Slam
-
-    slam = Slam(sequence.camera, config)
-    with ThreadPoolExecutor(1) as reader:
-        prepared = slam.prepare(sequence[0])
-        for index in range(frames):
-            following = sequence[min(index + 1, frames - 1)]
-            start = time.perf_counter()
-            coming = reader.submit(slam.prepare, following)
-            slam.process(prepared)
-            prepared = coming.result()
-            yield slam, 1000 * (time.perf_counter() - start)
-
-
-def _time_frames(job: tuple[float, int]) -> Row:
-    """Frames, then mesh and view of the map they left; every time is the best of what a warm program gives."""
-    voxel, frames = job
-    slam, times, sequence = None, [], _room(frames + 1)
-    for slam, ms in _processed(Config().override([f"volume.voxel_size={voxel}"]), sequence, frames):  # noqa: B007
-        times.append(ms)
-    assert slam is not None
-    timed = np.array(times[WARM_UP:] or times)
-    row: Row = {"median": float(np.median(timed)), "p95": float(np.percentile(timed, 95))}
-    row["bytes_per_block"] = slam.volume.num_bytes / max(slam.volume.num_blocks, 1)
-    row["free_share"] = slam.volume.entry_bytes / (2 * 512 * 4)
-    pose, view = slam.trajectory.Ts_world_camera[-1], slam.camera.resized(320, 240)
-    seconds, mesh = _median_seconds(slam.volume.extract_mesh, 3)
-    row |= {"triangles": len(mesh.faces), "mesh_whole_s": seconds, "mesh_s": seconds * 1e6 / max(len(mesh.faces), 1)}
-    row["view_ms"] = 1000 * _median_seconds(lambda: slam.volume.raycast(pose, view), 10)[0]
-    return row | _time_again(slam, sequence[frames])
-
-
-def _time_again(slam: "Slam", frame: "Frame") -> Row:
-    """Extraction of what one more frame changed in the mesh, and how many chunks that are."""
-    from dudmap.mapping.incremental_mesh import IncrementalMesh
-
-    live = IncrementalMesh(slam.volume)
-    live.update()
-    slam.process(frame)
-    start = time.perf_counter()
-    stale = live.update()
-    return {"again_ms": 1000 * (time.perf_counter() - start), "stale": len(stale)}
-
-
-def _median_seconds(action: Callable[[], Any], times: int) -> tuple[float, Any]:
-    """Median duration after one call that warms up, and the last result."""
-    result, seconds = action(), []
-    for _ in range(times):
-        start = time.perf_counter()
-        result = action()
-        seconds.append(time.perf_counter() - start)
-    return statistics.median(seconds), result
-
-
-def _time_iteration(frames: int) -> Row:
-    """One linearisation of the level that is 320 pixels wide, against the map of a few frames."""
-    from dudmap.frames.observation import Level
-    from dudmap.frames.pyramid import halved
-
-    sequence = _room(frames)
-    slam = None
-    for slam, _ in _processed(Config(), sequence, frames):  # noqa: B007
-        pass
-    assert slam is not None
-    halvings = round(np.log2(slam.camera.width / 320))
-    depth, intensity = halved(slam.preprocess(sequence[frames - 1]), halvings)
-    level = Level(slam.camera.scaled(halvings), depth, intensity)
-    pose, weights = slam.trajectory.Ts_world_camera[-1], np.ones_like(depth)
-    slam.volume.look_at(pose)
-    seconds, _ = _median_seconds(lambda: slam.tracker.linearize(slam.volume, level, pose, weights), 100)
-    return {"iteration_ms": 1000 * seconds}
-
-
-def _time_walk(frames: int) -> Row:
-    """Median time of the first and the last tenth of a walk through space that is always new.
-
-    The machine's speed changes within minutes, so a second system walks the first tenth while the first one walks the
-    last, a few frames each in turn.
-    """
-    from dudmap.benchmark.passage import passage
-
-    sequence, slam = passage(frames + 1), None
-    start = min(60, frames // 4)
-    tenth = max((frames - start) // 10, 1)
-    old, new = _processed(Config(), sequence, frames), _processed(Config(), sequence, frames)
-    for _ in range(frames - tenth):
-        slam, _ = next(old)
-    for _ in range(start):
-        next(new)
-    first: list[float] = []
-    last: list[float] = []
-    while len(last) < tenth:
-        for walk, times in ((new, first), (old, last)):
-            times += [next(walk)[1] for _ in range(min(IN_TURN, tenth - len(times)))]
-    assert slam is not None
-    row: Row = {"first_ms": statistics.median(first), "last_ms": statistics.median(last)}
-    row["growth"] = row["last_ms"] / row["first_ms"]
-    row["mesh_ms"] = 1000 * _median_seconds(slam.volume.extract_mesh, 1)[0]
-    return row | _time_again(slam, sequence[frames])
 
 
 FIRST_POSE = """
@@ -277,33 +157,33 @@ def first(index, reading, result):
 
 run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False, observe=first)
 """
-"""The first pose that had to be computed is the second frame's: the first one's is the identity."""
+"""Program that ends at the first computed pose, that of the second frame; the first one is the identity."""
 
 
 def _start_times() -> list[Figure]:
-    """Time of import, help, and from the start of the program to the first computed pose."""
+    """Times of the import, of the help page, and from the start of the program to the first computed pose."""
     from dudmap.synthetic.folder import write_folder
 
     figures = [
-        Figure("import dudmap", "s", 0.15, _of_program(["-c", "import dudmap"]) - _of_program(["-c", ""])),
-        Figure("dudmap --help", "s", 0.4, _of_program(["-m", "dudmap", "--help"])),
+        Figure("import dudmap", "s", 0.15, program_seconds(["-c", "import dudmap"]) - program_seconds(["-c", ""])),
+        Figure("dudmap --help", "s", 0.4, program_seconds(["-m", "dudmap", "--help"])),
     ]
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         recording = Path(temporary) / "recording"
         write_folder(Entry("room-person", parameters={"frames": 3}).open(), recording, surface=False)  # type: ignore[arg-type]
         first_pose = ["-c", FIRST_POSE, str(recording)]
-        _of_program(first_pose, 1)
-        figures.append(Figure("to the first pose, kernels cached", "s", 1.5, _of_program(first_pose, 3)))
+        program_seconds(first_pose, 1)
+        figures.append(Figure("to the first pose, kernels cached", "s", 1.5, program_seconds(first_pose, 3)))
         with _environment(NUMBA_CACHE_DIR=str(Path(temporary) / "cache")):
-            figures.append(Figure("to the first pose, nothing cached", "s", 20.0, _of_program(first_pose, 1)))
+            figures.append(Figure("to the first pose, nothing cached", "s", 20.0, program_seconds(first_pose, 1)))
     return figures
 
 
-def _of_program(arguments: list[str], times: int = 5) -> float:
+def program_seconds(arguments: list[str], times: int = 5) -> float:
     """Median duration of a Python program, seconds.
 
     Raises:
-        DudmapError: It fails.
+        DudmapError: The program fails.
     """
     seconds = []
     for _ in range(times):

@@ -1,4 +1,4 @@
-"""Systems that a benchmark compares: configurations with a name."""
+"""Named configurations that the benchmarks compare."""
 
 from pathlib import Path
 
@@ -17,19 +17,19 @@ SYSTEMS: dict[str, tuple[str, ...]] = {
     "none": ("dynamics.method=none",),
     "em": ("dynamics.free_space=false", "dynamics.regions=false", "dynamics.start_seconds=0"),
 }
-"""What each differs in from the default configuration: the default itself, the default over the recording twice, the
-thesis' values, the threshold-and-flood rule of the thesis' ancestor with its threshold of 7 cm and the band of 10 cm
-that this needs, no dynamic handling at all, and EM on the residuals alone."""
+"""Differences from the default configuration: the default itself; the default with two passes; the values of the
+thesis; threshold and flood fill as in ReFusion, with its threshold of 7 cm and the truncation distance of 10 cm that it
+needs; no detection of dynamics; EM on the residuals alone."""
 
 PASSES = {"two-passes": 2}
-"""Systems that go over a recording more than once."""
+"""Systems that process a recording more than once, and how often."""
 
 
 def system(name: str) -> tuple[str, Config]:
-    """Name and configuration of a system: one of ``SYSTEMS``, or the path of a TOML file named by its stem.
+    """Name and configuration of a system: one of ``SYSTEMS``, or the path of a TOML file, whose stem is the name.
 
     Raises:
-        ConfigError: It is neither, or the file is not an acceptable configuration.
+        ConfigError: The name is neither, or the file is not a valid configuration.
     """
     if name in SYSTEMS:
         return name, Config().override(SYSTEMS[name])
@@ -39,7 +39,7 @@ def system(name: str) -> tuple[str, Config]:
 
 
 def systems(names: str) -> dict[str, Config]:
-    """Systems of a comma-separated list.
+    """Configurations by name, of a comma-separated list.
 
     Raises:
         ConfigError: The list is empty, a name is unknown, or two systems have the same name.

@@ -1,4 +1,4 @@
-"""One table in three forms: Markdown for people, CSV for spreadsheets, JSON for programs."""
+"""Tables of figures as Markdown, CSV and JSON."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ from dudmap.benchmark.measure import Row
 
 
 class Column(NamedTuple):
-    """How a figure is shown: heading with unit, factor from the stored unit, digits behind the point."""
+    """Format of one figure: heading with unit, factor from the stored unit, number of decimals."""
 
     key: str
     heading: str
@@ -35,7 +35,7 @@ COLUMNS = (
     Column("cpu_s", "CPU s", 1, 1),
     Column("peak_rss_mb", "peak MB"),
 )
-"""Every figure a suite can show; those that no row has are left out."""
+"""Columns of a suite; those without any value are omitted."""
 
 
 def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and words alike
@@ -46,7 +46,7 @@ def shown(value: Any, column: Column) -> str:  # noqa: ANN401 - figures and word
 
 
 def grid(header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -> str:
-    """A Markdown table; the first ``words`` columns are left-aligned."""
+    """Markdown table; the first ``words`` columns are left-aligned, the others right-aligned."""
     lines = ["| " + " | ".join(header) + " |"]
     lines.append("|" + "|".join("---" if number < words else "---:" for number in range(len(header))) + "|")
     lines += ["| " + " | ".join(row) + " |" for row in rows]
@@ -54,7 +54,7 @@ def grid(header: Sequence[str], rows: Iterable[Sequence[str]], words: int = 2) -
 
 
 def markdown(rows: Sequence[Row], columns: Sequence[Column] = COLUMNS) -> str:
-    """Rows as a Markdown table, and a line for each that failed."""
+    """Markdown table of the rows, followed by a list of the failed ones."""
     good = [row for row in rows if "error" not in row]
     used = [column for column in columns if any(row.get(column.key) is not None for row in good)]
     header = ["sequence", "system", *(column.heading for column in used)]

@@ -1,8 +1,8 @@
 """The command line: ``dudmap COMMAND``.
 
-Each command lives in ``dudmap.cli.<command>`` as a Typer application named ``app`` and is imported when it is called,
-so that ``dudmap --help`` stays instant. Every error of the user's ends here in one sentence and an exit code:
-1 for an error that dudmap names, 2 for wrong usage, 130 for ctrl-C.
+Each command is a Typer application named ``app`` in ``dudmap.cli.<command>``, which is imported when the command is
+called, so that ``dudmap --help`` is fast. Errors are printed as one sentence. Exit codes: 1 for an error, 2 for wrong
+usage, 130 for Ctrl-C.
 """
 
 from importlib import import_module
@@ -16,28 +16,28 @@ from dudmap.errors import DudmapError
 
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
-    "demo": "Make a short recording with a walking person and run on it.",
-    "synth": "Render a synthetic recording with exact truth.",
-    "evaluate": "Score a trajectory, mesh or masks against the truth.",
+    "demo": "Render a short recording with a walking person and run on it.",
+    "synth": "Render a synthetic recording with exact ground truth.",
+    "evaluate": "Score a trajectory, mesh or masks against the ground truth.",
     "benchmark": "Run a suite of recordings and print one table.",
-    "config": "Print all parameters with their meaning, as TOML.",
-    "warmup": "Compile all kernels now, so that the first run starts at once.",
+    "config": "Print all parameters with their meanings as TOML.",
+    "warmup": "Compile all kernels in advance.",
 }
 """Name and one-line help of every command, in the order of the help page."""
 
 
 class CommandGroup(TyperGroup):
-    """Imports a command's module when the command is called, and turns errors into one sentence."""
+    """Command group that imports a command when it is called, and prints errors as one sentence."""
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-        """Replace the called command's stand-in by the command itself."""
+        """Replace the placeholder of the called command by the command itself."""
         if args and args[0] in COMMANDS:
             module = import_module(f"dudmap.cli.{args[0]}")
             self.commands[args[0]] = typer.main.get_command(module.app)
         return super().resolve_command(ctx, args)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the command; report what the user can mend without a traceback."""
+        """Run the command; print errors without a traceback."""
         try:
             return super().invoke(ctx)
         except DudmapError as error:
@@ -51,7 +51,7 @@ class CommandGroup(TyperGroup):
 
 
 def fail(sentence: str, code: int = 1) -> None:
-    """Print one sentence to stderr and leave.
+    """Print one sentence to stderr and exit.
 
     Raises:
         typer.Exit: Always.
@@ -60,8 +60,8 @@ def fail(sentence: str, code: int = 1) -> None:
     raise typer.Exit(code)
 
 
-def _stand_in() -> None:
-    """Never called: the module of the command takes its place."""
+def _placeholder() -> None:
+    """Placeholder of a command in the help page; never called."""
 
 
 app = typer.Typer(
@@ -70,11 +70,10 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
-    help="Dense RGB-D SLAM for places where things move: an RGB-D recording with people in it goes in, "
-    "a trajectory and a clean mesh come out.",
+    help="Dense RGB-D SLAM in dynamic scenes: estimates the camera trajectory and a mesh of the static scene.",
 )
 for _name, _help in COMMANDS.items():
-    app.command(_name, help=_help)(_stand_in)
+    app.command(_name, help=_help)(_placeholder)
 
 
 def _print_version(wanted: bool) -> None:

@@ -10,7 +10,7 @@ from dudmap.benchmark.suites import SUITES
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="Run a suite of recordings and print one table; check against recorded figures; find the limit of dynamics.",
+    help="Run a suite of recordings, the accuracy gate, the limit of dynamics, or the speed measurement.",
 )
 
 SystemsOption = Annotated[
@@ -19,8 +19,10 @@ SystemsOption = Annotated[
         "--systems", help="Comma-separated: dudmap, thesis, threshold, none, em, or paths of .toml configurations."
     ),
 ]
-JobsOption = Annotated[int, typer.Option("--jobs", min=1, help="Runs at a time; times per frame mean most with 1.")]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Less of everything, to see that it works.")]
+JobsOption = Annotated[
+    int, typer.Option("--jobs", min=1, help="Number of runs at a time; times per frame are reliable with 1 only.")
+]
+QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
 
 
 def suite_command(
@@ -28,7 +30,7 @@ def suite_command(
     systems: SystemsOption = "dudmap",
     out: Annotated[Path | None, typer.Option("--out", help="Default: runs/benchmark/<suite>.")] = None,
     data: Annotated[
-        Path | None, typer.Option("--data", help="Folder that holds the recordings; nothing is downloaded.")
+        Path | None, typer.Option("--data", help="Folder of the recordings; nothing is downloaded.")
     ] = None,
     jobs: JobsOption = 1,
     quick: QuickOption = False,
@@ -37,7 +39,7 @@ def suite_command(
         typer.Option(
             "--score",
             metavar="NAME=FOLDER",
-            help="Score what another system computed: FOLDER/<sequence>/trajectory.txt and mesh.ply; may be repeated.",
+            help="Score results of another system, FOLDER/<sequence>/trajectory.txt and mesh.ply; repeatable.",
         ),
     ] = None,
 ) -> None:
@@ -50,7 +52,7 @@ def suite_command(
     wanted, others = find_systems(systems), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or Path("runs/benchmark") / name
-    typer.echo(run_suite(suite, wanted, others, out, workers=jobs, done=_say))
+    typer.echo(run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome))
     typer.echo(f"written to {out}")
 
 
@@ -58,24 +60,22 @@ for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
 
 
-def _say(row: dict[str, Any]) -> None:
+def _print_outcome(row: dict[str, Any]) -> None:
     outcome = row.get("error") or f"{row.get('tracked', row.get('frames'))} of {row.get('frames')} frames"
     typer.echo(f"{row['sequence']}, {row['system']}: {outcome}", err=True)
 
 
 @app.command()
 def gate(
-    figures: Annotated[
-        Path, typer.Option("--figures", help="The reviewed file of recorded figures and margins.")
-    ] = Path("tests/gate.toml"),
-    fixtures: Annotated[
-        Path, typer.Option("--fixtures", help="Folder that holds the real excerpt freiburg1_xyz.")
-    ] = Path("tests/fixtures"),
-    record: Annotated[
-        bool, typer.Option("--record", help="Rewrite the figures with what is measured now; margins stay.")
-    ] = False,
+    figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
+        "tests/gate.toml"
+    ),
+    fixtures: Annotated[Path, typer.Option("--fixtures", help="Folder with the real excerpt freiburg1_xyz.")] = Path(
+        "tests/fixtures"
+    ),
+    record: Annotated[bool, typer.Option("--record", help="Record the measured figures; margins are kept.")] = False,
     assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a parameter; may be repeated.")
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
 ) -> None:
     """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
@@ -100,33 +100,34 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option("--out", help="Folder for heat maps and figures.")] = Path(
+    out: Annotated[Path, typer.Option("--out", help="Output folder for heat maps and figures.")] = Path(
         "runs/benchmark/limits"
     ),
     jobs: JobsOption = 1,
     quick: QuickOption = False,
 ) -> None:
-    """Find how much may move, how fast and from when on, before tracking and mapping break down.
+    """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
-    Writes heat maps (PNG) of ATE, mask IoU, ghost area and the share of frames lost, and limits.md, .csv and .json.
-    What the same code has measured before into the same folder is not measured again: a run that was stopped goes on.
+    Writes heat maps (PNG) of ATE, mask IoU, ghost area and share of lost frames, and limits.md, .csv and .json.
+    Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
-    from dudmap.benchmark import limits as sweeping
+    from dudmap.benchmark.conditions import FRAMES
     from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
+    from dudmap.benchmark.limits import QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
     from dudmap.benchmark.systems import systems as find_systems
     from dudmap.benchmark.table import save
     from dudmap.pipeline.environment import machine, versions
 
     wanted = find_systems(systems)
-    sweeps = sweeping.QUICK_SWEEPS if quick else sweeping.SWEEPS
-    cells = sweeping.grid_cells(sweeps, sweeping.QUICK_FRAMES if quick else sweeping.FRAMES)
+    sweeps = QUICK_SWEEPS if quick else SWEEPS
+    cells = grid_cells(sweeps, QUICK_FRAMES if quick else FRAMES)
     with typer.progressbar(length=len({cell.condition for cell in cells}), label="conditions") as bar:
-        rows = sweeping.measure_cells(cells, wanted, out / "measured", jobs, bar.update)
+        rows = measure_cells(cells, wanted, out / "measured", jobs, bar.update)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
-    text = "Largest share of the image that may move, ATE RMSE at most 2 cm and no frame lost:\n"
+    text = "Largest dynamic share of the image with an ATE RMSE of at most 2 cm and no frame lost:\n"
     text += limits_table(rows, sweeps, list(wanted))
-    text += "\nATE RMSE in cm, and the share of frames lost; bold: the system copes:\n"
+    text += "\nATE RMSE in cm and share of lost frames; bold where the system copes:\n"
     text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     typer.echo(text)
@@ -135,39 +136,39 @@ def limits(
 
 @app.command()
 def speed(
-    out: Annotated[Path, typer.Option("--out", help="Folder for speed.md and speed.json.")] = Path(
+    out: Annotated[Path, typer.Option("--out", help="Output folder for speed.md and speed.json.")] = Path(
         "runs/benchmark/speed"
     ),
     long: Annotated[
-        bool, typer.Option("--long", help="Also walk through new space for 2000 frames: does the time grow?")
+        bool, typer.Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
     ] = False,
     open3d: Annotated[
         Path | None,
         typer.Option(
-            "--open3d", metavar="PYTHON", help="A Python that has open3d, to time its dense SLAM beside ours."
+            "--open3d", metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."
         ),
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Recording for that comparison; default: a synthetic room.")
+        Path | None, typer.Option("--recording", help="Recording of that comparison; default: a synthetic room.")
     ] = None,
     quick: QuickOption = False,
 ) -> None:
-    """Measure time and memory on this machine; leave it alone meanwhile."""
+    """Measure time and memory on this machine, which should be idle otherwise."""
     import json
 
-    from dudmap.benchmark import speed as timing
     from dudmap.benchmark.interleaved import find_open3d
+    from dudmap.benchmark.speed import markdown, speed_figures
     from dudmap.pipeline.environment import machine, versions
 
     frames, long_frames = (20, 60) if quick else (300, 2000)
-    figures = timing.speed_figures(
+    figures = speed_figures(
         frames,
         long_frames if long else 0,
         lambda what: typer.echo(f"measuring {what}", err=True),
         find_open3d(open3d),
         recording,
     )
-    text = timing.markdown(figures)
+    text = markdown(figures)
     out.mkdir(parents=True, exist_ok=True)
     (out / "speed.md").write_text(text, encoding="utf-8")
     content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}

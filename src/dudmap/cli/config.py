@@ -1,4 +1,4 @@
-"""``dudmap config``: all parameters with their meaning."""
+"""``dudmap config``: all parameters with their meanings."""
 
 import textwrap
 from typing import TYPE_CHECKING, Annotated
@@ -15,14 +15,14 @@ app = typer.Typer(add_completion=False)
 def config(
     preset: Annotated[str, typer.Option("--preset", help="default or thesis.")] = "default",
 ) -> None:
-    """Print all parameters with their meaning, as TOML that --config takes."""
+    """Print all parameters with their meanings as TOML, the format of --config."""
     from dudmap.config import Config
 
     typer.echo(commented(Config.from_tree({"preset": preset})), nl=False)
 
 
 def commented(config: "Config") -> str:
-    """TOML text of a configuration with each parameter's meaning above it."""
+    """TOML text of a configuration, with the meaning of each parameter as a comment."""
     parts = {"": type(config).model_fields}
     for name, field in type(config).model_fields.items():
         parts[name] = getattr(type(getattr(config, name)), "model_fields", {}) or {name: field}

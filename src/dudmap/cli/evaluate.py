@@ -1,4 +1,4 @@
-"""``dudmap evaluate``: score a trajectory, a mesh or dynamic masks against the truth."""
+"""``dudmap evaluate``: score a trajectory, a mesh or dynamic masks against the ground truth."""
 
 import json
 import math
@@ -32,7 +32,7 @@ app = typer.Typer(
     cls=EvaluateGroup,
     add_completion=False,
     no_args_is_help=True,
-    help="Score a trajectory, a mesh or dynamic masks against the truth.\n\n"
+    help="Score a trajectory, a mesh or dynamic masks against the ground truth.\n\n"
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 

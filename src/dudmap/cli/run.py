@@ -1,4 +1,4 @@
-"""``dudmap run``: a recording goes in, a run folder comes out."""
+"""``dudmap run``: process a recording into a run folder."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -15,11 +15,11 @@ app = typer.Typer(add_completion=False)
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Intrinsics: fx,fy,cx,cy[,w,h[,depth_scale]].", metavar="NUMBERS")
 ]
-ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file with parameters.")]
-PresetOption = Annotated[str | None, typer.Option("--preset", help="Values to start from: default or thesis.")]
+ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
+PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="One parameter, e.g. tracker.huber=0.02; may be repeated.", metavar="KEY=VALUE"),
+    typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
@@ -27,10 +27,8 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as o
 
 @app.command()
 def run(
-    sequence: Annotated[Path, typer.Argument(help="Folder of a recording in TUM layout (rgb.txt, depth.txt).")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="Run folder; default: runs/<name of the recording>.")
-    ] = None,
+    sequence: Annotated[Path, typer.Argument(help="Recording: folder in TUM layout (rgb.txt, depth.txt).")],
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
     preset: PresetOption = None,
@@ -38,23 +36,24 @@ def run(
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
     masks: Annotated[
-        Path | None, typer.Option("--masks", help="Folder of masks of what moves, <timestamp>.png with 255 = moves.")
+        Path | None,
+        typer.Option("--masks", help="Folder of external dynamic masks, <timestamp>.png with 255 = dynamic."),
     ] = None,
     live: Annotated[
         bool,
-        typer.Option("--live", help="Frames arrive at the sensor's rate; those there is no time for are dropped."),
+        typer.Option("--live", help="Replay in real time; frames are dropped where processing is too slow."),
     ] = False,
     passes: Annotated[
         int,
-        typer.Option("--passes", min=1, max=2, help="2: once more with what the whole recording tells; no ghosts."),
+        typer.Option("--passes", min=1, max=2, help="2: second pass with the map of the first; removes ghosts."),
     ] = 1,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Turn a recording into a trajectory and a clean mesh.
+    """Estimate the trajectory and a mesh of the static scene from a recording.
 
     Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
-    --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid thing that moved.
+    --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving object.
     """
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
@@ -70,17 +69,19 @@ def run(
 
 
 def read_config(file: Path | None, preset: str | None, assignments: list[str]) -> "Config":
-    """Parameters of a file or a preset, with single ones assigned."""
+    """Configuration of a file or a preset, with single parameters set."""
     from dudmap.config import Config
 
     if file is not None and preset is not None:
-        raise ConfigError(f"--config and --preset exclude each other; write preset = {preset!r} into {file} instead")
+        raise ConfigError(
+            f"--config and --preset are mutually exclusive; write preset = {preset!r} into {file} instead"
+        )
     config = Config.load(file) if file is not None else Config.from_tree({"preset": preset} if preset else {})
     return config.override(assignments)
 
 
 def free_folder(wanted: Path) -> Path:
-    """The folder itself if it is new or empty, else the first free one of ``<name>-2``, ``<name>-3``, ..."""
+    """The folder itself if it is new or empty, else the first of ``<name>-2``, ``<name>-3``, ... that is."""
     folder, number = wanted, 1
     while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         number += 1
@@ -89,7 +90,7 @@ def free_folder(wanted: Path) -> Path:
 
 
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
-    """Metrics on stdout: one JSON object, or a table, or nothing."""
+    """Print the metrics to stdout: as one JSON object, as a table, or not at all."""
     if as_json:
         import json
 

@@ -1,4 +1,4 @@
-"""``dudmap synth``: render a synthetic recording with exact truth."""
+"""``dudmap synth``: render a synthetic recording with exact ground truth."""
 
 import re
 from pathlib import Path
@@ -13,7 +13,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def synth(
-    out: Annotated[Path, typer.Argument(help="Folder to write, in TUM layout with the truth beside it.")],
+    out: Annotated[Path, typer.Argument(help="Output folder, in TUM layout with ground truth.")],
     scene: Annotated[
         str, typer.Option("--scene", help="room, corridor, desk, yard, textureless, plane or box.")
     ] = "room",
@@ -30,16 +30,18 @@ def synth(
         typer.Option(
             "--movers",
             help="person, people, wanderer, carried_box, removed_box, ball, balloon, creeper, stopping_cart, "
-            "starting_cart, door; several with commas or by repeating; none for a static world.",
+            "starting_cart, door; comma-separated or repeated; none for a static scene.",
         ),
     ] = None,
     speed: Annotated[float | None, typer.Option("--speed", help="Speed of the movers.", metavar="M_PER_S")] = None,
     coverage: Annotated[
         float | None,
-        typer.Option("--coverage", help="Share of the image hidden by a stream of people, 0 to 0.95.", metavar="SHARE"),
+        typer.Option(
+            "--coverage", help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE"
+        ),
     ] = None,
     start_dynamic: Annotated[
-        bool, typer.Option("--start-dynamic", help="Movers in view from the first frame.")
+        bool, typer.Option("--start-dynamic", help="Movers are in view from the first frame on.")
     ] = False,
     situation: Annotated[
         str | None,
@@ -51,18 +53,18 @@ def synth(
     frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 120,
     fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0,
     noise: Annotated[str, typer.Option("--noise", help="Sensor: kinect, realsense or none.")] = "kinect",
-    seed: Annotated[int, typer.Option("--seed", help="Chooses path, looks and noise.", min=0)] = 0,
+    seed: Annotated[int, typer.Option("--seed", help="Seed of path, appearance and noise.", min=0)] = 0,
     size: Annotated[str, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = "640x480",
     motion_blur: Annotated[
-        float, typer.Option("--motion-blur", help="Share of the frame interval with the shutter open.")
+        float, typer.Option("--motion-blur", help="Exposure time as a share of the frame interval.")
     ] = 0.0,
     exposure_change: Annotated[
-        float, typer.Option("--exposure-change", help="Relative amplitude of a slow change of brightness.")
+        float, typer.Option("--exposure-change", help="Relative amplitude of a slow oscillation of the exposure.")
     ] = 0.0,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
-    """Render a synthetic recording with exact truth.
+    """Render a synthetic recording with exact ground truth.
 
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
     surface_observed.ply and scene.json.

@@ -1,4 +1,4 @@
-"""``dudmap warmup``: compile every kernel and leave it in the cache."""
+"""``dudmap warmup``: compile all kernels into the cache."""
 
 import time
 from collections.abc import Callable
@@ -13,9 +13,9 @@ app = typer.Typer(add_completion=False)
 def warmup(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
 ) -> None:
-    """Compile all kernels now, so that the first run starts at once.
+    """Compile all kernels in advance.
 
-    Runs a tiny synthetic recording through every part of the system; what is compiled stays on disk.
+    Processes a small synthetic recording with every part of the system; the compiled kernels are cached on disk.
     """
     from rich.console import Console
 
@@ -30,7 +30,7 @@ def warmup(
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of every part that has kernels; a later one builds on what an earlier one left."""
+    """Name and action of every part with kernels, in the order in which they must run."""
     import tempfile
     from pathlib import Path
 

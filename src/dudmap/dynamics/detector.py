@@ -79,17 +79,17 @@ class _Comparison:
     @property
     def surface(self) -> NDArray[np.bool_]:
         """(h, w) bool, pixels near a surface of the map."""
-        return self.sample.place == SURFACE
+        return self.sample.occupancy == SURFACE
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """(h, w) bool, pixels in space the map knows to be free."""
-        return self.sample.place == FREE
+        return self.sample.occupancy == FREE
 
     @property
     def unknown(self) -> NDArray[np.bool_]:
         """(h, w) bool, pixels in space the map does not know."""
-        return self.sample.place == UNKNOWN
+        return self.sample.occupancy == UNKNOWN
 
 
 class DynamicDetector:

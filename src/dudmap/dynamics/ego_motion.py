@@ -13,7 +13,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ransac import NOISE_PX, reproject, rigid_motion
+from dudmap.dynamics.ransac import NOISE_PX, pixels_at_width, reproject, rigid_motion
 from dudmap.dynamics.segments import Segmentation
 from dudmap.frames.observation import Level
 from dudmap.frames.optical_flow import consistent_with_static, track_forward_backward
@@ -21,29 +21,20 @@ from dudmap.frames.pyramid import Pyramid, is_majority_dynamic
 from dudmap.geometry import se3
 
 MOVES_PX = 1.0
-"""Smallest reprojection error of a moving corner, pixels."""
+"""Smallest reprojection error of a moving corner, pixels of an image 320 wide: 3.5 sigma of a static corner."""
 MOVES_SIGMAS = 5.0
 """Smallest reprojection error of a moving corner, in standard deviations (per coordinate) of the static corners."""
 MOVES_SHARE = 0.08
 """Added to either limit: this share of the length of the corner's own flow (motion blur, rolling shutter)."""
-FAR_PX = 3.0
-"""Corners with a larger reprojection error are left out of that standard deviation, pixels."""
-RAYLEIGH = 1.1774
-"""Median length of a vector of two normally distributed coordinates of standard deviation 1: sqrt(2 ln 2)."""
 FEWEST = 15
-"""Fewest corners, and fewest static inliers, of a motion that is accepted."""
-LEAST_SHARE = 0.3
-"""Smallest share of the visible surface that must follow a motion that is accepted."""
-REACH = 0.1
-"""Largest distance of a corner that labels a pixel of its segment, as a share of the pixel's depth."""
+"""Fewest inliers of a motion that is accepted. A wrong motion gathers about one by chance: of 1000 corners with flow
+of up to 20 pixels the share (NOISE_PX / 20)^2."""
 NEIGHBOURS = 5
-"""Nearest corners that label a pixel of a segment whose corners disagree."""
+"""Nearest corners that vote on a pixel of a segment whose corners disagree."""
 FEWEST_MOVING = 3
-"""Fewest moving (static) corners of a moving (static) segment."""
+"""Fewest moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
 AGREED = 0.7
-"""Share of the corners of a segment that must move for it to move as a whole."""
-MOVED_WEIGHT = 0.1
-"""Weight of a corner on an object known to move, against 1 of any other."""
+"""Smallest share of moving corners of a segment that moves as a whole, and of the neighbours of a moving pixel."""
 SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
 """Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
 the map is young, images are kept at intervals of the shorter one."""
@@ -86,7 +77,7 @@ class DominantMotion:
 
     Attributes:
         T_after_before: (4, 4) motion of the static world from the first camera's frame to the second's.
-        share: Share of the visible surface, as sampled by the corners, that follows it.
+        share: Share of the surface not known to move, as sampled by the corners, that follows it.
         before, after: The corners in the first and in the second image; moving are those that do not follow it.
     """
 
@@ -245,43 +236,46 @@ def dominant_motion(
     may fill half of the image, but hardly ever half of the visible square metres. A corner is moving if its
     reprojection error e exceeds
 
-        max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < FAR_PX} / sqrt(2 ln 2)
+        max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
-    and the image does not match at its static position as well; it is dropped if it does.
+    with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
+    dropped if it does. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
+    sigma.)
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.
         segmentations: Segments of both, at the resolution of the labels.
-        moving: (h, w) bool at that resolution, pixels of the first image known to move; corners on them have little
-            weight in the estimate of the motion.
+        moving: (h, w) bool at that resolution, pixels of the first image known to move; corners on them are left out of
+            the estimate of the motion.
         T_expected: (4, 4) predicted motion: the search for the corners starts there, and it is the prior of the
             estimate. None: the identity.
 
     Returns:
-        None if too few corners are tracked, or too few of them follow one motion.
+        None if too few corners follow one motion.
     """
     fine, fine_after, first, second = before.fine, after.fine, before.grey, after.grey
     camera = fine.camera
     T_expected = np.eye(4) if T_expected is None else T_expected
     expected = reproject(T_expected, _points(fine, before.corners), camera)
     pixels, targets, difference = track_forward_backward(first, second, before.corners, expected)
-    if len(pixels) < FEWEST:
-        return None
     points = _points(fine, pixels)
-    static = np.ones(len(points), dtype=bool)
+    candidate = np.ones(len(points), dtype=bool)
     if moving is not None:
         columns, rows = _pixels_of_level(pixels, fine, before.labelled).T
-        static = ~moving[rows, columns]
-    weights = np.where(static, 1.0, MOVED_WEIGHT)
-    T, areas = rigid_motion(points, targets, weights, camera, T_expected), weights * points[:, 2] ** 2
+        candidate = ~moving[rows, columns]
+    if np.count_nonzero(candidate) < FEWEST:
+        return None
+    T = rigid_motion(points[candidate], targets[candidate], camera, T_expected)
     predicted = reproject(T, points, camera)
     error = np.linalg.norm(predicted - targets, axis=1)
-    inlier = error < NOISE_PX
-    share = float(areas[inlier].sum() / areas.sum())
-    if np.count_nonzero(static & inlier) < FEWEST or share < LEAST_SHARE:
+    threshold = pixels_at_width(NOISE_PX, camera)
+    inlier, areas = error < threshold, points[:, 2] ** 2
+    if np.count_nonzero(candidate & inlier) < FEWEST:
         return None
-    sigma = np.median(error[error < FAR_PX]) / RAYLEIGH
-    limit = np.maximum(MOVES_PX, MOVES_SIGMAS * sigma) + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
+    share = float(areas[candidate & inlier].sum() / areas[candidate].sum())
+    sigma = np.median(error[error < MOVES_SIGMAS * threshold]) / np.sqrt(2 * np.log(2))
+    least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
+    limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
     moves = error > limit
     kept = ~moves
     kept[moves] = ~consistent_with_static(
@@ -311,8 +305,8 @@ def dominant_motion(
 def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
     """Moving pixels (h, w) of an image: the labels of the corners carried over to the segments they lie in.
 
-    A segment moves as a whole if at least AGREED of its corners move. In a segment whose corners disagree, each pixel
-    takes the label of the majority of its nearest corners of the same segment, by distance in space.
+    A segment moves as a whole if at least AGREED of its corners move. Where its corners disagree, a pixel of it moves
+    if at least AGREED of the NEIGHBOURS nearest corners of the same segment do, by distance in space.
 
     Args:
         corners: The labelled corners.
@@ -326,7 +320,7 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     num_moving, num_all = corners.count_by_segment(moving), corners.count_by_segment()
     enough = num_moving >= FEWEST_MOVING
     whole = enough & (num_moving >= AGREED * num_all)
-    mixed = enough & ~whole & (num_moving >= 0.1 * num_all)
+    mixed = enough & ~whole
     whole[0] = mixed[0] = False
     out = whole[labels]
     if whole_only:
@@ -338,10 +332,8 @@ def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False)
     # the segment is a fourth coordinate, so that corners of other segments are far away
     known = np.column_stack([corners.points, 1e3 * corners.segment_of])
     queries = np.column_stack([level.camera.points(columns, rows, z), 1e3 * labels[rows, columns]])
-    distance, index = KDTree(known).query(queries, k=min(NEIGHBOURS, len(known)))
-    near = distance < REACH * z[:, None]
-    votes = np.append(np.where(moving, 1, -1), 0)[np.minimum(index, len(moving))]
-    out[rows, columns] = np.where(near, votes, 0).sum(axis=1) >= 2
+    _, nearest = KDTree(known).query(queries, k=NEIGHBOURS)  # a segment of 3 moving and other corners has 5 and more
+    out[rows, columns] = moving[nearest].mean(axis=1) >= AGREED
     return out
 
 

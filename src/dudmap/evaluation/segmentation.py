@@ -17,8 +17,8 @@ Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
 SCORED_COVERAGE = 0.05
-"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio is one of two
-small numbers and says little."""
+"""Share of the image above which a frame counts for the mean intersection over union. Below it the ratio of two
+small numbers is not significant."""
 
 
 class MaskPair(NamedTuple):

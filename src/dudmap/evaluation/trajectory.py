@@ -240,7 +240,7 @@ def trajectory_figures(
 
     ATE; ``drift_rmse_m`` and ``rotation_rmse_deg``, the root mean squares of distance and angle after aligning the
     first pose only, by which a fixed or merely rotating camera is judged; RPE per second and per metre. A relative
-    error is None where the recording is too short for it, and ``rpe_per_s_missing`` or ``rpe_per_m_missing`` says why.
+    error is None where the recording is too short for it; ``rpe_per_s_missing`` or ``rpe_per_m_missing`` is the reason.
 
     Args:
         estimate: Estimated poses, camera to world.

@@ -1,4 +1,4 @@
-"""One moment of an RGB-D recording."""
+"""A frame of an RGB-D camera."""
 
 from dataclasses import dataclass
 
@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """Depth and colour of one moment, both in the geometry of one camera.
+    """Depth and colour image of one instant, registered to one camera.
 
     Attributes:
         timestamp: Seconds, of the depth image.

@@ -6,27 +6,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.backend import Backend
 
 
 @dataclass(frozen=True, eq=False)
 class Observation:
-    """A frame made ready.
+    """A preprocessed frame.
 
     Attributes:
         timestamp: Seconds, of the depth image.
-        camera: Camera of all images here; without distortion.
+        camera: Camera of all images here; without lens distortion.
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
-        raw_depth: (H, W) float32, metres, limited and undistorted only, 0 = none.
         intensity: (H, W) float32, 0..1.
         rgb: (H, W, 3) uint8.
+        backend: Compute device of the preprocessor, which also makes the image pyramid.
     """
 
     timestamp: float
     camera: Camera
     depth: NDArray[np.float32]
-    raw_depth: NDArray[np.float32]
     intensity: NDArray[np.float32]
     rgb: NDArray[np.uint8]
+    backend: Backend = field(repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
 

@@ -7,16 +7,24 @@ from dudmap.frames.observation import Level
 
 CELLS = 40
 """Corners across the image: the strongest of each cell."""
-SIMILAR, SIMILAR_GREY = 1.5, 2.0
-"""A match is as good as another if its window's mean grey difference is below SIMILAR times the other's plus
-SIMILAR_GREY of 255 grey values."""
+SIMILAR = 1.5
+"""A match is as good as another if the mean grey difference of its windows is at most this multiple of the other's."""
 WINDOW = 11
-"""Edge of the window that a corner is matched by, pixels."""
+"""Edge of the window that a corner is matched by, pixels of an image 320 wide."""
+RETURN_PX = 0.5
+"""Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
+REFERENCE_WIDTH = 320
+"""Image width that these distances are given for; they grow in proportion to the width of an image."""
 
 
 def grey(level: Level) -> NDArray[np.uint8]:
     """Intensities (h, w) in grey values from 0 to 255."""
     return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
+
+
+def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
+    """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
+    return 2 * round((edge - 1) / 2 * width / reference_width) + 1
 
 
 def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
@@ -28,7 +36,7 @@ def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
     import cv2
 
     strength = cv2.cornerMinEigenVal(image, 5)
-    cell = max(6, image.shape[1] // CELLS)
+    cell = max(1, image.shape[1] // CELLS)
     height, width = image.shape[0] // cell, image.shape[1] // cell
     tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
     tiles = tiles.reshape(height * width, cell * cell)
@@ -36,7 +44,8 @@ def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
     rows = np.arange(height * width) // width * cell + strongest // cell
     columns = np.arange(height * width) % width * cell + strongest % cell
     z = level.depth[rows, columns]
-    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((WINDOW, WINDOW), np.uint8))
+    window = scaled_window(WINDOW, image.shape[1])
+    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((window, window), np.uint8))
     useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
     return np.stack([columns, rows], axis=1)[useful]
 
@@ -95,10 +104,13 @@ def track_forward_backward(
         These corners (m, 2) int, their positions (m, 2) in the second image, and the mean differences (m,) of the grey
         values of their windows.
     """
-    positions, found, difference = lucas_kanade(first, second, pixels, expected, WINDOW, 3)
-    back, found_back, _ = lucas_kanade(second, first, positions, pixels, WINDOW, 0)
+    width = first.shape[1]
+    window = scaled_window(WINDOW, width)
+    positions, found, difference = lucas_kanade(first, second, pixels, expected, window, 3)
+    back, found_back, _ = lucas_kanade(second, first, positions, pixels, window, 0)
     good = found & found_back
-    good[good] = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1) < 0.5
+    error = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1)
+    good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
     return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64)
 
 
@@ -123,7 +135,7 @@ def consistent_with_static(
         difference: (n,) mean differences of the grey values of the windows of the matches found elsewhere.
     """
     guess = expected.astype(np.float32)
-    positions, static, other = lucas_kanade(first, second, pixels, guess, WINDOW, 0)
+    positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)
     near = np.linalg.norm((positions - guess)[static], axis=1) < allowed[static]
-    static[static] = near & (other[static] < SIMILAR * difference[static] + SIMILAR_GREY)
+    static[static] = near & (other[static] <= SIMILAR * difference[static])
     return static

@@ -1,4 +1,4 @@
-"""An image in the sizes that the work on its frame asks for."""
+"""Image pyramid of an observation."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -10,7 +10,6 @@ from dudmap.config import Config
 from dudmap.frames.observation import Level, Observation
 from dudmap.frames.optical_flow import corners, grey
 from dudmap.geometry.camera import Camera
-from dudmap.kernels import filtering
 
 HALVING_BAND = 0.02
 """Readings this far (m, and share of the depth) behind the nearest of a 2x2 block belong to the same surface."""
@@ -18,11 +17,11 @@ HALVING_BAND = 0.02
 
 @dataclass(frozen=True, eq=False)
 class Pyramid:
-    """Levels of an image, each made by halvings of the camera's.
+    """Image pyramid of an observation; each level is the camera's image halved several times.
 
     Attributes:
-        tracked: Those that are registered, coarse to fine.
-        labelled: That at which is decided what moves.
+        tracked: Levels of the registration, coarse to fine.
+        labelled: Level of the dynamic labels.
     """
 
     tracked: list[Level]
@@ -39,17 +38,17 @@ class Pyramid:
 
     @property
     def coarse(self) -> Level:
-        """The first level that is registered."""
+        """Coarsest level of the registration."""
         return self.tracked[0]
 
     @property
     def fine(self) -> Level:
-        """The last level that is registered."""
+        """Finest level of the registration."""
         return self.tracked[-1]
 
     @cached_property
     def grey(self) -> NDArray[np.uint8]:
-        """Intensities (h, w) of the finest level, of 255."""
+        """Intensities (h, w) of the finest level, 0..255."""
         return grey(self.fine)
 
     @cached_property
@@ -59,7 +58,7 @@ class Pyramid:
 
 
 def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
-    """Mask (H, W) at the size of a level: pixels any part of which lies in it."""
+    """Mask (H, W) at the size of a level: a pixel is set if any part of it lies in the mask."""
     import cv2
 
     size = level.depth.shape[::-1]
@@ -67,7 +66,7 @@ def reduced(mask: NDArray[np.bool_], level: Level) -> NDArray[np.bool_]:
 
 
 def is_majority_dynamic(moving: NDArray[np.bool_], level: Level) -> bool:
-    """Whether more than half of the readings of an image move (h, w)."""
+    """Whether more than half of the readings of a level are marked as moving (h, w) bool."""
     return bool(2 * np.count_nonzero(moving) > np.count_nonzero(level.depth))
 
 
@@ -80,15 +79,5 @@ def halved(observation: Observation, level: int) -> tuple[NDArray[np.float32], N
     halvings = observation._halvings
     while len(halvings) < level:
         depth, intensity = halvings[-1] if halvings else (observation.depth, observation.intensity)
-        halvings.append(_halved(depth, intensity))
+        halvings.append(observation.backend.halve(depth, intensity, HALVING_BAND))
     return halvings[level - 1] if level else (observation.depth, observation.intensity)
-
-
-def _halved(
-    depth: NDArray[np.float32], intensity: NDArray[np.float32]
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    shape = (depth.shape[0] // 2, depth.shape[1] // 2)
-    small = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.float32)
-    filtering.halve_depth(0, shape[0], depth, np.float32(HALVING_BAND), small[0])
-    filtering.halve_intensity(0, shape[0], intensity, small[1])
-    return small

@@ -36,7 +36,7 @@ def motion_prior(distance):
 
 
 def msac_scores(
-    twists: NDArray[np.float64],
+    twists: NDArray[np.floating],
     jacobian: NDArray[np.float64],
     flow: NDArray[np.float64],
     expected_flow: NDArray[np.float64],
@@ -88,13 +88,12 @@ def _score_band(start, stop, twists, jacobian, flow, expected_flow, weights, par
 
 
 @kernel
-def normal_equations(points, targets, weights, T, intrinsics, inlier_px):
-    """Gauss-Newton normal equations of the weighted reprojection error of the inliers of a motion.
+def normal_equations(points, targets, T, intrinsics, inlier_px):
+    """Gauss-Newton normal equations of the reprojection error of the inliers of a motion.
 
     Args:
         points: (n, 3) float64, metres, first camera's frame.
         targets: (n, 2) float64, their pixels in the second image.
-        weights: (n,) float64.
         T: (4, 4) float64, the motion.
         intrinsics: (4,) fx, fy, cx, cy.
         inlier_px: Reprojection error from which on a point is left out, pixels.
@@ -118,7 +117,7 @@ def normal_equations(points, targets, weights, T, intrinsics, inlier_px):
         along_u = (fx / z, 0.0, -fx * x / z, -fx * x * y, fx * (1.0 + x * x), -fx * y)
         along_v = (0.0, fy / z, -fy * y / z, -fy * (1.0 + y * y), fy * x * y, fy * x)
         for i in range(6):
-            gradient[i] += weights[n] * (along_u[i] * du + along_v[i] * dv)
+            gradient[i] += along_u[i] * du + along_v[i] * dv
             for j in range(6):
-                H[i, j] += weights[n] * (along_u[i] * along_u[j] + along_v[i] * along_v[j])
+                H[i, j] += along_u[i] * along_u[j] + along_v[i] * along_v[j]
     return H, gradient, count

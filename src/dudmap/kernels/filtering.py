@@ -9,10 +9,10 @@ import numpy as np
 from dudmap.kernels.threads import kernel
 
 ABSENT = np.float32(-1e9)
-"""Depth of a pixel without a reading inside the filter: so far off that its range weight vanishes by itself."""
+"""Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
 LONGEST_RUN = 3
-"""A hole this many pixels long in its row or its column is small."""
-FEWEST = 8
+"""Longest run of missing pixels, in the row or the column, of a small hole."""
+MIN_NEIGHBOURS = 8
 """Readings that the 5x5 neighbourhood of a filled pixel must hold."""
 
 
@@ -27,7 +27,7 @@ def limit_depth(depth, low, high, out):
 
 @kernel
 def _distance(line, at, step):
-    """Pixels from ``at`` to the next reading along a line, at most LONGEST_RUN; 0 = none."""
+    """Pixels from ``at`` to the next reading along a line; 0 = none within LONGEST_RUN."""
     for k in range(1, LONGEST_RUN + 1):
         n = at + k * step
         if n < 0 or n >= line.size:
@@ -38,7 +38,7 @@ def _distance(line, at, step):
 
 
 @kernel
-def _is_small(line, at, slope, noise_floor):
+def _in_small_hole(line, at, slope, noise_floor):
     """Whether the run of missing pixels around ``at`` is short and its two ends lie on one surface."""
     before = _distance(line, at, -1)
     if before == 0:
@@ -56,9 +56,9 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
     """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
 
     A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
-    is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least FEWEST readings,
-    all within ``max(noise_floor, slope z^2)`` of each other. So no depth edge is bridged (its sides differ by more),
-    and a large hole keeps its border (its runs are longer in both directions).
+    is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least MIN_NEIGHBOURS
+    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus depth edges, whose sides
+    differ by more, are not bridged, and large holes, whose runs are longer in both directions, keep their border.
 
     Args:
         row_start, row_stop: Rows of the band.
@@ -73,7 +73,9 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
         for u in range(w):
             z = row[u]
             out[v, u] = z
-            if z > 0 or not (_is_small(row, u, slope, noise_floor) or _is_small(depth[:, u], v, slope, noise_floor)):
+            if z > 0 or not (
+                _in_small_hole(row, u, slope, noise_floor) or _in_small_hole(depth[:, u], v, slope, noise_floor)
+            ):
                 continue
             total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
             for y in range(max(v - 2, 0), min(v + 3, h)):
@@ -83,28 +85,36 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
                         total += q
                         low, high = min(low, q), max(high, q)
                         count += 1
-            if count >= FEWEST and high - low <= max(noise_floor, slope * low * low):
+            if count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low):
                 out[v, u] = total / np.float32(count)
 
 
 @kernel
+def range_weight(difference, inverse):
+    """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1; ``inverse`` = 1 / (16 sigma_c^2).
+
+    Approximates the Gaussian exp(-d^2 / (2 sigma_c^2)) by arithmetic that vectorises.
+    """
+    w = max(np.float32(1) - difference * difference * inverse, np.float32(0))
+    w = w * w
+    w = w * w
+    return w * w
+
+
+@kernel
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
-    """Add one tap on each side: weights (1 - d^2 inverse)^8, the range Gaussian as a polynomial."""
-    one, zero = np.float32(1), np.float32(0)
+    """Add one tap on each side of every pixel of a line to the sums of the filter."""
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]
         d, e = before[u] - z, after[u] - z
-        s = max(one - d * d * scale, zero)
-        t = max(one - e * e * scale, zero)
-        s, t = s * s, t * t
-        s, t = s * s, t * t
-        s, t = s * s * spatial, t * t * spatial
+        s, t = range_weight(d, scale) * spatial, range_weight(e, scale) * spatial
         numerator[u] += s * d + t * e
         denominator[u] += s + t
 
 
 @kernel
 def _start(middle, alpha, inverse, numerator, denominator):
+    """Sums of the filter with the centre tap alone, and 1 / (16 sigma_c^2) of each pixel."""
     for u in range(middle.size):
         z = middle[u]
         sigma = max(alpha * z * z, np.float32(1e-4))
@@ -116,8 +126,6 @@ def _start(middle, alpha, inverse, numerator, denominator):
 @kernel
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
-
-    The range weight exp(-t/2), t = (dz / sigma_c)^2, is taken as (1 - t/16)^8, 0 from t = 16 on.
 
     Args:
         row_start, row_stop: Rows of the band.

@@ -1,4 +1,4 @@
-"""Loads that NumPy has no word for."""
+"""Memory operations that NumPy does not have."""
 
 from llvmlite import ir
 from numba.core import types
@@ -7,7 +7,7 @@ from numba.extending import intrinsic
 
 @intrinsic
 def prefetch(typing_context, array, index):
-    """Begin to bring element ``index`` of a flat array into the cache; only a hint, which changes no result."""
+    """Prefetch element ``index`` of a flat array into the cache: a hint, which changes no result."""
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
@@ -26,7 +26,7 @@ def prefetch(typing_context, array, index):
 
 @intrinsic
 def pair(typing_context, array, index):
-    """Elements ``index`` and ``index + 1`` of a flat int32 array, as they lie in memory, in one int64."""
+    """Elements ``index`` and ``index + 1`` of a flat int32 array as one int64, in the order of memory."""
 
     def generate(context, builder, signature, arguments):
         data = context.make_array(signature.args[0])(context, builder, arguments[0]).data

@@ -1,26 +1,28 @@
 """Marching cubes over voxel blocks with shared vertices (Lorensen & Cline 1987; thesis section 4.5).
 
 A vertex belongs to the lattice edge it lies on and an edge to the voxel at its lower end, so that every vertex exists
-once, also where blocks meet. Four passes over the blocks: the case of each cell, the owned vertices of each voxel,
-then - once it is known where each block's share begins - vertices and triangles. The tables are arguments, not
-globals: a global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
+once, also where blocks meet. Four passes over the blocks: the case of each cell, the vertices that each voxel
+owns, and, once the offset of each block is known, vertices and triangles. The tables are arguments, not globals: a
+global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dudmap.kernels.parameters import MeshArrays, MeshParameters
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.kernels.threads import bands, kernel, run_bands
 
 BAND = 256
-"""Blocks of one piece of work."""
-CLOSEST = np.float32(1e-3)
-"""Vertices keep this distance from the voxels, as a share of the edge: where sdf is 0 at a voxel, the vertices of the
-edges around it stay apart, and no triangle loses its area."""
+"""Blocks of one band."""
+MIN_OFFSET = np.float32(1e-3)
+"""Smallest distance of a vertex from a voxel, as a share of the edge: where sdf is 0 at a voxel, the vertices of the
+edges around it stay distinct, and no triangle degenerates."""
 
 
 @kernel
 def _corner_words(geometry, near, row, words):
-    """Words (9, 9, 9) of a block's voxels and of those one step beyond its upper sides; 0 where no block is."""
+    """Words (9, 9, 9) of a block's voxels and of those one step beyond its upper sides; 0 where there is no block."""
     for m in range(8):
         dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
         slot = near[row, m]
@@ -40,7 +42,7 @@ def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count,
     """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or a trusted corner keep their 0.
 
     A cell across which the distance jumps by more than ``max_jump`` steps is an occlusion boundary, where the band
-    behind one thing meets the free space beside it, and holds no surface.
+    behind one object meets the free space beside it, and holds no surface.
 
     Returns:
         (stop - start,) int64 triangles per block.
@@ -153,8 +155,8 @@ def _step_block(near, behind, row_of, row, axis, sign):
 def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
     """Words (10, 10, 10) of a block's voxels and of those one step beyond all its sides; 0 where no block is reached.
 
-    A block across a corner with mixed signs is reached over a neighbour, either way round; a voxel missed there makes
-    one normal a little coarser.
+    A block across a corner with mixed signs is reached through a neighbour, in either order of the axes; a voxel
+    that is missed there makes one normal slightly less accurate.
     """
     for part in range(27):
         sx, sy, sz = part // 9 - 1, (part // 3) % 3 - 1, part % 3 - 1
@@ -194,7 +196,7 @@ def _write_vertices(
     start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, begin, voxel_size,
     first, vertices, vertex_colors, normals,
 ):  # fmt: skip
-    """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex, counted in its block."""
+    """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
     half = np.float32(0.5)
@@ -216,7 +218,7 @@ def _write_vertices(
                     continue
                 step = 100 if axis == 0 else (10 if axis == 1 else 1)
                 a, b = np.float32(flat[here] >> 16), np.float32(flat[here + step] >> 16)
-                t = min(max(a / (a - b), CLOSEST), np.float32(1) - CLOSEST)
+                t = min(max(a / (a - b), MIN_OFFSET), np.float32(1) - MIN_OFFSET)
                 ex, ey, ez = x + (axis == 0), y + (axis == 1), z + (axis == 2)
                 vertices[number, 0] = voxel_size * (8 * coords[slot, 0] + x + (t if axis == 0 else 0.0))
                 vertices[number, 1] = voxel_size * (8 * coords[slot, 1] + y + (t if axis == 1 else 0.0))
@@ -286,14 +288,14 @@ def _link(slots, near, row_of, behind):
 
 @kernel
 def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
-    """Give each chunk its own vertices: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
+    """Copy shared vertices for each chunk: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
 
     Args:
         begin: (chunks + 1,) int64.
-        num_vertices: Of all chunks together, each counted once.
+        num_vertices: Number of shared vertices.
         faces: (F, 3) int32.
         vertex_ids: (>= sum of the chunks' vertices,) int32 out: the shared vertex that each vertex is a copy of.
-        local_faces: (F, 3) int32 out, vertices counted within the chunk.
+        local_faces: (F, 3) int32 out, vertices numbered within the chunk.
         first_vertex: (chunks + 1,) int64 out, into ``vertex_ids``.
     """
     known_in = np.full(num_vertices, -1, np.int32)
@@ -313,58 +315,38 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
     first_vertex[len(begin) - 1] = total
 
 
-def extract(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump=np.inf):
-    """Triangles of the zero level of the given blocks; the vertex position does not depend on ``sdf_unit``.
-
-    Args:
-        geometry: (num_slots, 512) int32, packed voxels.
-        colors: (num_slots, 512) int32, packed colours.
-        slots: (n,) int32, blocks to mesh; each once.
-        coords: (num_slots, 3) int, block coordinates per slot.
-        neighbours: (n, 8) int32; column 4 dx + 2 dy + dz holds the slot of the block at +(dx, dy, dz), -1 = none.
-        voxel_size: Metres.
-        sdf_unit: Metres per step of the stored distance.
-        min_weight: Cells with a corner of less weight are left out (at least 1).
-        max_jump: Cells across which the distance changes by more than this hold no surface, metres.
-
-    Returns:
-        vertices (V, 3) float32 metres, faces (F, 3) int32 counter-clockwise seen from free space, colors (V, 3) uint8,
-        normals (V, 3) float32 unit length, pointing to free space. No vertex occurs twice or without a triangle.
-    """
-    return _surface(
-        geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump, len(slots)
-    )[:4]
+def extract(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.int16],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+) -> MeshArrays:
+    """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
+    vertices, faces, vertex_colors, normals, _ = _surface(
+        geometry, colors, slots, coords, neighbours, parameters, len(slots)
+    )
+    return MeshArrays(vertices, faces, vertex_colors, normals)
 
 
 def extract_chunks(
-    geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, chunks, max_jump=np.inf
-):
-    """Meshes of groups of blocks that share no vertices, so that each can be replaced when its blocks change.
-
-    Args:
-        geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight: As in ``extract``.
-        chunks: (n,) int chunk of each block, counted from 0; -1 for blocks that only lend their voxels. A mesh is
-            complete if the up to seven blocks at +(dx, dy, dz) from each of its blocks are among ``slots``.
-
-    Returns:
-        One tuple (vertices, faces, colors, normals) as of ``extract`` per chunk.
-    """
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.int16],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+    chunks: NDArray[np.int64],
+) -> list[MeshArrays]:
+    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
     vertices, faces, vertex_colors, normals, first_face = _surface(
-        geometry,
-        colors,
-        slots[order],
-        coords,
-        neighbours[order],
-        voxel_size,
-        sdf_unit,
-        min_weight,
-        max_jump,
-        int(per_chunk.sum()),
+        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
-    begin = first_face[_begins([per_chunk])]
+    begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
     first = np.empty(num_chunks + 1, dtype=np.int64)
     _split(begin, len(vertices), faces, ids, local_faces, first)
@@ -374,32 +356,41 @@ def extract_chunks(
     for chunk in range(num_chunks):  # copies: a view would keep the arrays of all chunks alive
         own, faces_of = slice(first[chunk], first[chunk + 1]), slice(begin[chunk], begin[chunk + 1])
         parts = vertices[own], local_faces[faces_of], vertex_colors[own], normals[own]
-        out.append(tuple(part.copy() for part in parts))
+        out.append(MeshArrays(*(part.copy() for part in parts)))
     return out
 
 
-def _surface(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, min_weight, max_jump, num_meshed):
-    """``extract`` for the cells of the first ``num_meshed`` blocks; and the first face (n + 1,) of each block."""
+def _surface(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.int16],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+    num_meshed: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
+    """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
+    face (n + 1,) of each block."""
     n = len(slots)
     slots = np.ascontiguousarray(slots, dtype=np.int32)
     row_of = np.empty(len(geometry), dtype=np.int32)
     behind = np.empty((n, 8), dtype=np.int32)
     near = np.ascontiguousarray(neighbours, dtype=np.int32)
     _link(slots, near, row_of, behind)
-    # a block that is not among the slots does not exist here
+    # blocks that are not among the slots count as absent
     near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.empty((n, 512), dtype=np.uint8)
-    least = max(int(min_weight), 1)
-    jump = int(min(max_jump / sdf_unit, 1 << 20))
+    least = max(int(parameters.min_weight), 1)
+    jump = int(min(parameters.max_jump / parameters.sdf_unit, 1 << 20))
     triangles = run_bands(
         lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
         bands(num_meshed, BAND),
     )
     owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
-    first_face = _begins([*triangles, np.zeros(n - num_meshed)])
-    first_vertex = _begins(owned)
+    first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
+    first_vertex = _offsets(owned)
     vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
     vertex_colors = np.empty((first_vertex[-1], 3), dtype=np.uint8)
     normals = np.empty((first_vertex[-1], 3), dtype=np.float32)
@@ -408,7 +399,7 @@ def _surface(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, 
     run_bands(
         lambda start, stop: _write_vertices(
             start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, first_vertex,
-            float(voxel_size), first, vertices, vertex_colors, normals,
+            float(parameters.voxel_size), first, vertices, vertex_colors, normals,
         ),
         ranges,
     )  # fmt: skip
@@ -421,6 +412,6 @@ def _surface(geometry, colors, slots, coords, neighbours, voxel_size, sdf_unit, 
     return vertices, faces, vertex_colors, normals, first_face
 
 
-def _begins(counts):
-    """Number of the first item of each block, and behind the last the number of all."""
+def _offsets(counts: list[NDArray]) -> NDArray[np.int64]:
+    """Offset of the first item of each block, and the number of all items at the end."""
     return np.concatenate([[0], *counts]).astype(np.int64).cumsum()

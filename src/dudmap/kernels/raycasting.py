@@ -1,21 +1,26 @@
 """The map seen from a pose: sphere tracing of the signed distance field (thesis eq. 4.12 and section 4.5).
 
 Blocks are first splatted into an image of tiles with the nearest and farthest depth at which a surface can lie
-(Prisacariu et al. 2017), so that a ray starts just before the first block it can meet and ends behind the last.
+(Prisacariu et al. 2017), so that a ray starts just before the first block it can meet and ends behind the last one.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.kernels.neighbors import load_corners
+from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
+from dudmap.kernels.pixel import project, ray
+from dudmap.kernels.residual import trilinear
 from dudmap.kernels.threads import bands, kernel, run_bands
+from dudmap.kernels.voxel import sdf_steps
 
 TILE = 8
 """Pixels along the edge of a tile."""
 BAND = 16
-"""Image rows of one piece of work."""
-NOWHERE = np.float32(1e9)
+"""Image rows of one band."""
+INFINITE = np.float32(1e9)
 FAR = np.float32(2)
-"""Distance from the surface, voxels, at which the nearest voxel's value is good enough."""
+"""Distance from the surface, voxels, beyond which the nearest voxel's value replaces the interpolated one."""
 
 
 @kernel
@@ -54,10 +59,11 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
                 if low > np.float32(0.02):
                     x = T[0, 0] * fi + T[0, 1] * fj + T[0, 2] * fk + T[0, 3]
                     y = T[1, 0] * fi + T[1, 1] * fj + T[1, 2] * fk + T[1, 3]
-                    # a point within the radius is seen at most this far from the centre
+                    # no point within the radius projects farther than this from the centre
                     du = fx * radius * np.sqrt(x * x + z * z) / (z * low) + np.float32(1)
                     dv = fy * radius * np.sqrt(y * y + z * z) / (z * low) + np.float32(1)
-                    u, v = fx * x / z + cx, fy * y / z + cy
+                    by_z = np.float32(1) / z
+                    u, v = project(x, by_z, fx, cx), project(y, by_z, fy, cy)
                     if u + du < 0 or v + dv < 0 or u - du > size[1] or v - dv > size[0]:
                         continue
                     first_column = np.int64(max(u - du, np.float32(0))) // TILE
@@ -71,14 +77,20 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
 
 
 @kernel
-def _blend(values, fx, fy, fz):
-    """Trilinear interpolation of eight corner values, corner 4 dx + 2 dy + dz."""
-    a = values[0] + (values[1] - values[0]) * fz
-    b = values[2] + (values[3] - values[2]) * fz
-    c = values[4] + (values[5] - values[4]) * fz
-    d = values[6] + (values[7] - values[6]) * fz
-    low, high = a + (b - a) * fy, c + (d - c) * fy
-    return low + (high - low) * fx
+def step_length(distance):
+    """Step along a ray, voxels, at a signed distance (voxels): a little less than the distance, since a projective
+    distance is an upper bound, but never so short that the tracing stalls."""
+    ahead, back = max(np.float32(0.8) * distance, np.float32(0.5)), max(np.float32(-0.8) * distance, np.float32(1))
+    return ahead if distance > np.float32(0) else back
+
+
+@kernel
+def _blend(values, ax, ay, az):
+    """Trilinear interpolation of eight corner values."""
+    value, _, _, _ = trilinear(
+        values[0], values[1], values[2], values[3], values[4], values[5], values[6], values[7], ax, ay, az
+    )
+    return value
 
 
 @kernel
@@ -90,24 +102,24 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
     for k in range(8):
         word = corners[k, 0]
         known &= ((word >> 8) & 0xFF) >= least
-        values[k] = np.float32(word >> 16)
+        values[k] = sdf_steps(word)
     if not known:
         return np.float32(np.nan)
     return _blend(values, x - lx, y - ly, z - lz)
 
 
 @kernel
-def _leave(p, d, inverse):
+def _to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
     return (block + np.float32(8) - p) * inverse if d > np.float32(0) else (block - p) * inverse
 
 
 @kernel
-def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
+def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, values):
     """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
 
-    Far from the surface one voxel tells how far to go; only within FAR of it the field is interpolated.
+    Far from the surface the nearest voxel gives the step; the field is interpolated only within FAR of it.
 
     Args:
         window: (Wx * Wy * Wz,) int32; negative entries are skipped as a whole.
@@ -131,9 +143,9 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
             t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
         elif o[axis] < zero or o[axis] >= last:
             return np.float32(-1)
-    rx = one / dx if dx != zero else NOWHERE
-    ry = one / dy if dy != zero else NOWHERE
-    rz = one / dz if dz != zero else NOWHERE
+    rx = one / dx if dx != zero else INFINITE
+    ry = one / dy if dy != zero else INFINITE
+    rz = one / dz if dz != zero else INFINITE
     size_y, size_z = shape[1], shape[2]
     t_before, before = -one, -one
     while t < end:
@@ -141,8 +153,8 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
         i, j, k = np.int64(x + half), np.int64(y + half), np.int64(z + half)
         slot = window[np.uintp(((i >> 3) * size_y + (j >> 3)) * size_z + (k >> 3))]
         if slot < 0:
-            steps = min(_leave(x + half, dx, rx), _leave(y + half, dy, ry))
-            t += min(steps, _leave(z + half, dz, rz)) + nudge
+            steps = min(_to_block_boundary(x + half, dx, rx), _to_block_boundary(y + half, dy, ry))
+            t += min(steps, _to_block_boundary(z + half, dz, rz)) + nudge
             before = -one
             continue
         word = geometry[np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
@@ -150,7 +162,7 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
             before = -one
             t += per_voxel
             continue
-        value = np.float32(word >> 16) * unit
+        value = sdf_steps(word) * unit
         if value > FAR:
             t_before, before = t, value
             t += (value - one) * per_voxel
@@ -158,11 +170,11 @@ def _find(window, shape, geometry, o, d, t, end, unit, least, corners, values):
         value = _sample(window, geometry, shape, x, y, z, least, corners, values) * unit
         if value > zero:
             t_before, before = t, value
-            t += max(np.float32(0.8) * value, half) * per_voxel
+            t += step_length(value) * per_voxel
         elif value <= zero:
             if before > zero:
                 return _refine(window, shape, geometry, o, d, t_before, before, t, value, unit, least, corners, values)
-            t += max(np.float32(-0.8) * value, one) * per_voxel
+            t += step_length(value) * per_voxel
         else:
             before = -one
             t += per_voxel
@@ -201,10 +213,10 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     fx, fy, fz = x - lx, y - ly, z - lz
     one = np.float32(1)
     load_corners(window, geometry, ix, iy, iz, corners, 0, shape[1], shape[2])
-    s0, s1 = np.float32(corners[0, 0] >> 16), np.float32(corners[1, 0] >> 16)
-    s2, s3 = np.float32(corners[2, 0] >> 16), np.float32(corners[3, 0] >> 16)
-    s4, s5 = np.float32(corners[4, 0] >> 16), np.float32(corners[5, 0] >> 16)
-    s6, s7 = np.float32(corners[6, 0] >> 16), np.float32(corners[7, 0] >> 16)
+    s0, s1 = sdf_steps(corners[0, 0]), sdf_steps(corners[1, 0])
+    s2, s3 = sdf_steps(corners[2, 0]), sdf_steps(corners[3, 0])
+    s4, s5 = sdf_steps(corners[4, 0]), sdf_steps(corners[5, 0])
+    s6, s7 = sdf_steps(corners[6, 0]), sdf_steps(corners[7, 0])
     wy, wz = one - fy, one - fz
     wx = one - fx
     gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
@@ -222,11 +234,11 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
 
 
 @kernel
-def _trace(
+def trace_rows(
     row_start, row_stop, window, shape, geometry, colors, intrinsics, T, near, far, depth_min, depth_max, unit, least,
     depth, color, normals,
 ):  # fmt: skip
-    """Fill pixel rows ``row_start`` to ``row_stop`` of a view; see ``raycast``.
+    """Fill pixel rows ``row_start`` to ``row_stop`` of a view of the map.
 
     ``T`` (3, 4) float32 maps metres in the camera frame to the lattice of the window.
     """
@@ -235,16 +247,16 @@ def _trace(
     o = T[:, 3].copy()
     d = np.empty(3, np.float32)
     for v in range(row_start, row_stop):
-        y = (np.float32(v) - intrinsics[3]) / intrinsics[1]
+        y = ray(v, intrinsics[3], intrinsics[1])
         for u in range(depth.shape[1]):
             start = max(near[v // TILE, u // TILE], depth_min)
             end = min(far[v // TILE, u // TILE], depth_max)
             t = np.float32(-1)
             if start < end:
-                x = (np.float32(u) - intrinsics[2]) / intrinsics[0]
+                x = ray(u, intrinsics[2], intrinsics[0])
                 for axis in range(3):
                     d[axis] = T[axis, 0] * x + T[axis, 1] * y + T[axis, 2]
-                t = _find(window, shape, geometry, o, d, start, end, unit, least, corners, values)
+                t = _trace_ray(window, shape, geometry, o, d, start, end, unit, least, corners, values)
             if t > np.float32(0) and t <= depth_max:
                 depth[v, u] = t
                 _shade(
@@ -258,43 +270,16 @@ def _trace(
 
 
 def raycast(
-    window,
-    window_origin,
-    geometry,
-    colors,
-    voxel_size,
-    sdf_unit,
-    T_world_camera,
-    camera,
-    depth_min,
-    depth_max,
-    min_weight,
-):
-    """Depth, colour and normals of the first surface that each pixel of a camera sees.
-
-    A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes from
-    unknown space straight to the inside, there is none.
-
-    Args:
-        window: (Wx, Wy, Wz) int32, slots of the blocks; negative = no voxels.
-        window_origin: (3,) int32, block coordinates of the window's first block.
-        geometry: (num_slots, 512) int32, packed voxels.
-        colors: (num_slots, 512) int32, packed colours.
-        voxel_size: Metres.
-        sdf_unit: Metres per step of the stored distance.
-        T_world_camera: (4, 4) float64.
-        camera: Camera of the view.
-        depth_min, depth_max: Limits of the depth, metres.
-        min_weight: Smallest weight of a trusted voxel (at least 1).
-
-    Returns:
-        depth (H, W) float32 metres, 0 = no surface; color (H, W, 3) uint8; normals (H, W, 3) float32, world frame,
-        unit length, 0 where there is no surface.
-    """
-    shape = np.array(window.shape, dtype=np.int64)
-    intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy], dtype=np.float32)
-    low, high = np.float32(depth_min), np.float32(depth_max)
-    corner = 8 * voxel_size * np.asarray(window_origin, dtype=np.float64)  # of the window, world frame
+    grid: VoxelGrid,
+    T_world_camera: NDArray[np.float64],
+    intrinsics: NDArray[np.float32],
+    size: tuple[int, int],
+    parameters: RaycastParameters,
+) -> RaycastResult:
+    """Depth, colour and normals of the first surface that each pixel of a camera sees; see ``Backend.raycast``."""
+    voxel_size, shape = grid.voxel_size, grid.shape
+    low, high = np.float32(parameters.depth_min), np.float32(parameters.depth_max)
+    corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
     rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
     to_camera = np.empty((3, 4), dtype=np.float32)
     to_camera[:, :3] = rotation.T * (8 * voxel_size)
@@ -303,15 +288,17 @@ def raycast(
     to_lattice[:, :3] = rotation / voxel_size
     to_lattice[:, 3] = (position - corner) / voxel_size
 
-    tiles = (-(-camera.height // TILE), -(-camera.width // TILE))
+    height, width = size
+    tiles = (-(-height // TILE), -(-width // TILE))
+    window = grid.window.reshape(tuple(shape))
     ranges = bands(len(window), -(-len(window) // 8))
-    nears = np.full((len(ranges), *tiles), NOWHERE, dtype=np.float32)
+    nears = np.full((len(ranges), *tiles), INFINITE, dtype=np.float32)
     fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
-    size = np.array(camera.shape, dtype=np.int64)
+    image_size = np.array(size, dtype=np.int64)
     radius = np.float32(4 * np.sqrt(3) * voxel_size)
     run_bands(
         lambda start, stop, near, far: _splat(
-            start, stop, window, to_camera, intrinsics, size, radius, low, high, near, far
+            start, stop, window, to_camera, intrinsics, image_size, radius, low, high, near, far
         ),
         ranges,
         nears,
@@ -319,15 +306,15 @@ def raycast(
     )
     near, far = nears.min(axis=0), fars.max(axis=0)
 
-    depth = np.empty(camera.shape, dtype=np.float32)
-    color = np.empty((*camera.shape, 3), dtype=np.uint8)
-    normals = np.empty((*camera.shape, 3), dtype=np.float32)
-    flat, unit, least = window.reshape(-1), np.float32(sdf_unit / voxel_size), max(int(min_weight), 1)
+    depth = np.empty(size, dtype=np.float32)
+    color = np.empty((*size, 3), dtype=np.uint8)
+    normals = np.empty((*size, 3), dtype=np.float32)
+    unit, least = np.float32(grid.sdf_unit / voxel_size), max(int(parameters.min_weight), 1)
     run_bands(
-        lambda start, stop: _trace(
-            start, stop, flat, shape, geometry.reshape(-1), colors.reshape(-1), intrinsics, to_lattice, near, far,
-            low, high, unit, least, depth, color, normals,
+        lambda start, stop: trace_rows(
+            start, stop, grid.window, shape, grid.geometry.reshape(-1), grid.colors.reshape(-1), intrinsics, to_lattice,
+            near, far, low, high, unit, least, depth, color, normals,
         ),
-        bands(camera.height, BAND),
+        bands(height, BAND),
     )  # fmt: skip
-    return depth, color, normals
+    return RaycastResult(depth, color, normals)

@@ -8,20 +8,25 @@ and the last on every CPU.
 import numpy as np
 
 from dudmap.kernels.neighbors import load_row
+from dudmap.kernels.pixel import band_front, elements, rotate, sigma
+from dudmap.kernels.residual import huber_cost, huber_weight, trilinear, tukey_cost, tukey_inlier
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.voxel import intensity_of, sdf_steps
 
 NUM_SUMS = 32
-"""21 of H, 6 of b, cost, pixels on the map, weight of all readings, weight of those on the map, weighted squares."""
+"""Sums of one linearisation: 21 of H, 6 of b, cost, readings on the map, weight of all readings, weight of those on
+the map, weighted squared distances."""
 
 SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
-"""Where the sums hold each element of H, its upper triangle row by row."""
+"""Index of each element of H among the sums, which hold its upper triangle row by row."""
 SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 
 
 @kernel
-def linearize(
-    row_start, row_stop, depth, intensity, weights, intrinsics, T, window, shape, geometry, parameters, residuals, sums
-):
+def linearize_rows(
+    row_start, row_stop, depth, intensity, weights, intrinsics, T, window, shape, geometry, voxel_size, sdf_unit,
+    parameters, residuals, sums,
+):  # fmt: skip
     """Add the normal equations of pixel rows ``row_start`` to ``row_stop`` to ``sums`` and write their residuals.
 
     Args:
@@ -30,21 +35,21 @@ def linearize(
         intensity: (h, w) float32 in [0, 1].
         weights: (h, w) float32 static weights in [0, 1].
         intrinsics: (4,) float32 fx, fy, cx, cy of this level.
-        T: (3, 4) float32, camera to window lattice: voxel units, origin at the window's first voxel.
+        T: (3, 4) float32, camera to the window's lattice: voxels, origin at the window's first voxel.
         window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
         shape: (3,) int64 blocks of the window.
         geometry: (slots * 512,) int32 packed voxels.
-        parameters: (12,) float32: voxel_size, sdf_unit, huber, tukey (0 = Huber), color weight, color Huber,
-            sigma_base, sigma_scale, sigma at one metre, noise weighting (0 or 1), truncation, truncation_noise.
+        voxel_size, sdf_unit: Metres, and metres per step of the stored distance.
+        parameters: RegistrationParameters.
         residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
-        sums: (NUM_SUMS,) float64, see there. Twist (v, omega) about the camera's centre, world axes.
+        sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
     w = depth.shape[1]
     cells = np.empty(w, np.int32)
     voxels = np.empty(w, np.int32)
     crossing = np.empty(w, np.int32)
     lists = np.empty((2, w + 1), np.int32)
-    places = np.empty(w, np.int64)
+    positions = np.empty(w, np.int64)
     corners = np.empty((w, 8), np.int64)
     pairs = np.empty((4, w), np.int64)
     words = pairs.view(np.int32)
@@ -57,25 +62,22 @@ def linearize(
     pz = np.empty(w, np.float32)
     inside = np.empty(w, np.float32)
 
-    zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
-    voxel_size, unit, huber, tukey = parameters[0], parameters[1], parameters[2], parameters[3]
-    color_weight, color_huber = parameters[4], parameters[5]
-    sigma_base, sigma_scale, sigma_one, noisy = parameters[6], parameters[7], parameters[8], parameters[9]
-    truncation, truncation_noise = parameters[10], parameters[11]
-    by_unit = unit / voxel_size
+    zero, one = np.float32(0), np.float32(1)
+    band, huber, tukey = parameters.band, parameters.huber, parameters.tukey
+    color_weight, color_huber = parameters.color_weight, parameters.color_huber
+    sigma_one, noisy = parameters.sigma_at_one_metre, parameters.noise_weighting
+    by_unit = sdf_unit / voxel_size
     by_voxel = one / voxel_size
     by_255 = np.float32(1 / 255)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
     cx, cy = intrinsics[2], intrinsics[3]
     use_tukey = tukey > zero
     by_tukey = one / tukey if use_tukey else one
-    tukey_cost = tukey * tukey / np.float32(6)
-    worst_color = min(np.float32(0.3), color_huber) * (np.float32(0.3) - half * min(np.float32(0.3), color_huber))
+    tukey_limit = tukey * tukey / np.float32(6)
+    worst_color = huber_cost(np.float32(0.3), color_huber)
     last_x, last_y, last_z = np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
     size_y, size_z = shape[1], shape[2]
-    t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
-    t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
-    t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    t = elements(T)
 
     for v in range(row_start, row_stop):
         row_y = (np.float32(v) - cy) * by_fy
@@ -83,10 +85,8 @@ def linearize(
             z = depth[v, u]
             x = (np.float32(u) - cx) * by_fx * z
             y = row_y * z
-            rx = t00 * x + t01 * y + t02 * z
-            ry = t10 * x + t11 * y + t12 * z
-            rz = t20 * x + t21 * y + t22 * z
-            gx, gy, gz = rx + t03, ry + t13, rz + t23
+            rx, ry, rz = rotate(t, x, y, z)
+            gx, gy, gz = rx + t[3], ry + t[7], rz + t[11]
             lx, ly, lz = np.floor(gx), np.floor(gy), np.floor(gz)
             jx, jy, jz = np.int32(lx), np.int32(ly), np.int32(lz)
             kx = min(max(jx, np.int32(0)), last_x)
@@ -100,7 +100,7 @@ def linearize(
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
             inside[u] = one if ok else zero
 
-        load_row(window, shape, geometry, cells, voxels, crossing, lists, places, corners, pairs)
+        load_row(window, shape, geometry, cells, voxels, crossing, lists, positions, corners, pairs)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
@@ -116,39 +116,23 @@ def linearize(
                 min(min(c0 & 0xFF00, c1 & 0xFF00), min(c2 & 0xFF00, c3 & 0xFF00)),
                 min(min(c4 & 0xFF00, c5 & 0xFF00), min(c6 & 0xFF00, c7 & 0xFF00)),
             )
-            # signed distance, voxel units: value and gradient of the trilinear interpolation
-            s0, s1 = np.float32(c0 >> 16), np.float32(c1 >> 16)
-            s2, s3 = np.float32(c2 >> 16), np.float32(c3 >> 16)
-            s4, s5 = np.float32(c4 >> 16), np.float32(c5 >> 16)
-            s6, s7 = np.float32(c6 >> 16), np.float32(c7 >> 16)
-            s01, s23 = s0 + (s1 - s0) * az, s2 + (s3 - s2) * az
-            s45, s67 = s4 + (s5 - s4) * az, s6 + (s7 - s6) * az
-            sl, sh = s01 + (s23 - s01) * ay, s45 + (s67 - s45) * ay
-            r = (sl + (sh - sl) * ax) * unit
-            gx = (sh - sl) * by_unit
-            gy = ((s23 - s01) + ((s67 - s45) - (s23 - s01)) * ax) * by_unit
-            d01, d23, d45, d67 = s1 - s0, s3 - s2, s5 - s4, s7 - s6
-            dl, dh = d01 + (d23 - d01) * ay, d45 + (d67 - d45) * ay
-            gz = (dl + (dh - dl) * ax) * by_unit
-            # intensity 0..1, gradient per metre
-            i0, i1 = np.float32(c0 & 0xFF), np.float32(c1 & 0xFF)
-            i2, i3 = np.float32(c2 & 0xFF), np.float32(c3 & 0xFF)
-            i4, i5 = np.float32(c4 & 0xFF), np.float32(c5 & 0xFF)
-            i6, i7 = np.float32(c6 & 0xFF), np.float32(c7 & 0xFF)
-            i01, i23 = i0 + (i1 - i0) * az, i2 + (i3 - i2) * az
-            i45, i67 = i4 + (i5 - i4) * az, i6 + (i7 - i6) * az
-            il, ih = i01 + (i23 - i01) * ay, i45 + (i67 - i45) * ay
-            rc = (il + (ih - il) * ax) * by_255 - intensity[v, u]
+            distance, gx, gy, gz = trilinear(
+                sdf_steps(c0), sdf_steps(c1), sdf_steps(c2), sdf_steps(c3),
+                sdf_steps(c4), sdf_steps(c5), sdf_steps(c6), sdf_steps(c7), ax, ay, az,
+            )  # fmt: skip
+            r = distance * sdf_unit
+            gx, gy, gz = gx * by_unit, gy * by_unit, gz * by_unit
+            # intensity in 0..1 and its gradient per metre
+            shade, kx_, ky_, kz_ = trilinear(
+                intensity_of(c0), intensity_of(c1), intensity_of(c2), intensity_of(c3),
+                intensity_of(c4), intensity_of(c5), intensity_of(c6), intensity_of(c7), ax, ay, az,
+            )  # fmt: skip
+            rc = shade * by_255 - intensity[v, u]
             scale_c = by_255 * by_voxel
-            kx_ = (ih - il) * scale_c
-            ky_ = ((i23 - i01) + ((i67 - i45) - (i23 - i01)) * ax) * scale_c
-            e01, e23, e45, e67 = i1 - i0, i3 - i2, i5 - i4, i7 - i6
-            el, eh = e01 + (e23 - e01) * ay, e45 + (e67 - e45) * ay
-            kz_ = (el + (eh - el) * ax) * scale_c
+            kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
 
-            sigma = sigma_base + sigma_scale * z * z
-            gate = max(truncation, truncation_noise * sigma) * np.float32(0.95)
-            scaled = min(sigma_one / max(sigma, np.float32(1e-6)), one)
+            gate = band_front(z, band) * np.float32(0.95)
+            scaled = min(sigma_one / max(sigma(z, band.noise), np.float32(1e-6)), one)
             scale = noisy * scaled + (one - noisy)
             static = weights[v, u]
             known = (low > 0) & (inside[u] > zero)
@@ -158,17 +142,12 @@ def linearize(
 
             rn = r * scale
             a = abs(rn)
-            capped = min(a * by_tukey, one)
-            inlier = one - capped * capped
-            huber_weight = huber / max(a, huber)
-            huber_cost = min(a, huber) * (a - half * min(a, huber))
-            robust = inlier * inlier if use_tukey else huber_weight
-            geometric_cost = tukey_cost * (one - inlier * inlier * inlier) if use_tukey else huber_cost
-            gate_n = gate * scale
-            worst = tukey_cost if use_tukey else min(gate_n, huber) * (gate_n - half * min(gate_n, huber))
+            inlier = tukey_inlier(a, by_tukey)
+            robust = inlier * inlier if use_tukey else huber_weight(a, huber)
+            geometric_cost = tukey_cost(inlier, tukey_limit) if use_tukey else huber_cost(a, huber)
+            worst = tukey_limit if use_tukey else huber_cost(gate * scale, huber)
             ac = abs(rc)
-            color_robust = color_huber / max(ac, color_huber)
-            color_cost = min(ac, color_huber) * (ac - half * min(ac, color_huber))
+            color_robust, color_cost = huber_weight(ac, color_huber), huber_cost(ac, color_huber)
 
             used = static if valid else zero
             missing = static - used if z > zero else zero

@@ -1,65 +1,61 @@
-"""What the map says at the points of a depth image."""
+"""Loop over the points of a depth image: signed distance, intensity difference and occupancy of the map there."""
 
 import numpy as np
 
+from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN
+from dudmap.kernels.pixel import elements, ray, transform
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.voxel import intensity_of, sdf_steps
 
 
 @kernel
-def sample_map(
-    row_start,
-    row_stop,
-    depth,
-    intensity,
-    intrinsics,
-    T,
-    window,
-    shape,
-    geometry,
-    unit,
-    free_count,
-    free_after,
-    distance,
-    difference,
-    place,
-):
-    """What the map says at the points of a depth image.
+def _corner_weight(k, ax, ay, az):
+    """Trilinear weight of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
+    return (ax if k >> 2 else 1 - ax) * (ay if (k >> 1) & 1 else 1 - ay) * (az if k & 1 else 1 - az)
+
+
+@kernel
+def sample_rows(
+    row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
+    distance, difference, occupancy,
+):  # fmt: skip
+    """Sample the map at the points of pixel rows ``row_start`` to ``row_stop``.
+
+    Corners without an observation are left out of the interpolation; a point needs half of the weight.
 
     Args:
         row_start, row_stop: Rows of the band.
-        depth: (h, w) float32.
+        depth: (h, w) float32, metres, 0 = none.
         intensity: (h, w) float32 in [0, 1].
         intrinsics: (4,) float32.
-        T: (3, 4) float32, camera to window lattice, voxel units.
+        T: (3, 4) float32, camera to the window's lattice, voxels.
         window: (cells,) int32.
-        shape: (3,) int64.
+        shape: (3,) int64 blocks of the window.
         geometry: (slots * 512,) int32.
-        unit: sdf_unit, metres.
+        sdf_unit: Metres per step of the stored distance.
         free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
         free_after: Observations that make free space.
         distance: (h, w) float32 out, metres, NaN where the map has no distance.
         difference: (h, w) float32 out, map minus image intensity, NaN likewise.
-        place: (h, w) uint8 out: 0 no reading or unknown space, 1 on the map, 2 in confirmed free space.
+        occupancy: (h, w) uint8 out: UNKNOWN (also without a reading), SURFACE or FREE.
     """
     nan = np.float32(np.nan)
+    t = elements(T)
     for v in range(row_start, row_stop):
         for u in range(depth.shape[1]):
             z = depth[v, u]
-            distance[v, u], difference[v, u], place[v, u] = nan, nan, 0
+            distance[v, u], difference[v, u], occupancy[v, u] = nan, nan, UNKNOWN
             if z <= 0:
                 continue
-            x = (np.float32(u) - intrinsics[2]) / intrinsics[0] * z
-            y = (np.float32(v) - intrinsics[3]) / intrinsics[1] * z
-            gx = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]
-            gy = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]
-            gz = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
+            x, y = ray(u, intrinsics[2], intrinsics[0]) * z, ray(v, intrinsics[3], intrinsics[1]) * z
+            gx, gy, gz = transform(t, x, y, z)
             ix, iy, iz = np.int64(np.floor(gx)), np.int64(np.floor(gy)), np.int64(np.floor(gz))
             if ix < 0 or iy < 0 or iz < 0 or ix >= shape[0] * 8 - 1 or iy >= shape[1] * 8 - 1 or iz >= shape[2] * 8 - 1:
                 continue
             slot = window[((ix >> 3) * shape[1] + (iy >> 3)) * shape[2] + (iz >> 3)]
             if slot < 0:
                 if slot <= -2 and free_count[-2 - slot] >= free_after:
-                    place[v, u] = 2
+                    occupancy[v, u] = FREE
                 continue
             sdf, shade, total = np.float32(0), np.float32(0), np.float32(0)
             ax, ay, az = gx - np.float32(ix), gy - np.float32(iy), gz - np.float32(iz)
@@ -71,12 +67,12 @@ def sample_map(
                 word = geometry[np.int64(other) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (m & 7))]
                 if (word & 0xFF00) == 0:
                     continue
-                part = (ax if k >> 2 else 1 - ax) * (ay if (k >> 1) & 1 else 1 - ay) * (az if k & 1 else 1 - az)
-                sdf += part * np.float32(word >> 16)
-                shade += part * np.float32(word & 0xFF)
+                part = _corner_weight(k, ax, ay, az)
+                sdf += part * sdf_steps(word)
+                shade += part * intensity_of(word)
                 total += part
             if total < np.float32(0.5):
                 continue
-            distance[v, u] = sdf / total * unit
+            distance[v, u] = sdf / total * sdf_unit
             difference[v, u] = shade / total / np.float32(255) - intensity[v, u]
-            place[v, u] = 1
+            occupancy[v, u] = SURFACE

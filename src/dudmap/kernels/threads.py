@@ -1,4 +1,4 @@
-"""Row bands in a thread pool, and the one way kernels are compiled.
+"""Bands of rows in a thread pool, and the decorator that compiles all kernels.
 
 Kernels are serial and release the GIL; a call is cut into bands that do not depend on the number of threads, and
 sums are added in band order, so that the result is the same, bit for bit, on one core and on sixteen.
@@ -34,7 +34,7 @@ def _pool() -> ThreadPoolExecutor:
 
 
 def submit(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Begin ``function`` beside the caller, where there is a core for it; what is returned waits for its result."""
+    """Start ``function`` in the thread pool if there is a core for it; the returned function waits for its result."""
     if num_threads() > 1:
         return _pool().submit(function).result
     result = function()
@@ -53,19 +53,19 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
     if threads <= 1:
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)
-    order = iter(range(len(calls)))  # taken from by all threads: one Python call each, so none is given out twice
+    order = iter(range(len(calls)))  # shared by all threads; next() is atomic, so no band runs twice
 
     def work() -> None:
         for n in order:
             range_, *items = calls[n]
             results[n] = function(*range_, *items)
 
-    # the calling thread works too: the pool is woken once per thread, not once per band
+    # the calling thread works too, and each worker is woken once, not once per band
     others = [_pool().submit(work) for _ in range(threads - 1)]
     try:
         work()
     finally:
         for other in others:
-            if not other.cancel():  # a worker that is still busy elsewhere is not waited for: all is done
+            if not other.cancel():  # do not wait for a worker that never started
                 other.result()
     return results

@@ -1,4 +1,4 @@
-"""The blocks around the view as a dense array, so that the inner loops find a voxel with one load."""
+"""The blocks around the view as a dense array, in which inner loops find a voxel with one load."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,11 +8,11 @@ from dudmap.kernels import hashing
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
 MARGIN = 3
-"""Blocks that the view may move before the window follows it; its edge has room for them."""
+"""Blocks that the view may move before the window follows; the window is larger by as many on each side."""
 
 
 class BlockWindow:
-    """What the hash table of the blocks, which stays the authoritative index, holds around the view.
+    """Dense copy of the hash table, which stays the authoritative index, around the view.
 
     Args:
         block_size: Edge of a block, metres.
@@ -20,10 +20,10 @@ class BlockWindow:
 
     Attributes:
         shape: (3,) int64, blocks along each axis.
-        cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 where nothing is known; -2 - entry where there are none.
-        stamps: Like ``cells``, number of the frame that asked for a block last.
+        cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
+        stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
         near: (n,) int32, the slots inside.
-        origin: (3,) int64 coordinates of the first block; None until something has been looked at.
+        origin: (3,) int64 coordinates of the first block; None before the first ``look_at``.
     """
 
     def __init__(self, block_size: float, cells: int) -> None:
@@ -36,7 +36,7 @@ class BlockWindow:
         self.origin: NDArray[np.int64] | None = None
 
     def look_at(self, middle: NDArray[np.float64], blocks: VoxelBlocks) -> None:
-        """Move to a point (3,) in metres, if the middle has moved too far away from it."""
+        """Centre the window on a point (3,), metres, if its centre is more than ``MARGIN`` blocks away."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
         if self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN:
             return
@@ -48,30 +48,30 @@ class BlockWindow:
         self.near = np.sort(self.cells[self.cells >= 0])
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
-        """Camera to lattice (3, 4): in voxels, from the first voxel of the window on."""
+        """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
         assert self.origin is not None
         T = T_world_camera[:3] / (self.block_size / BLOCK)
         T[:, 3] -= self.origin * BLOCK
         return T.astype(np.float32)
 
-    def give_voxels(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
-        """Give voxels to cells (n,) that have none."""
-        slots = blocks.give_voxels(self.entries_of(cells, blocks), frame_number)
+    def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
+        """Allocate voxels for cells (n,) that have none."""
+        slots = blocks.allocate(self.entries_of(cells, blocks), frame_number)
         self.cells[cells] = slots
         self.near = np.concatenate([self.near, slots])
 
-    def take_voxels(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
-        """Take the voxels of these slots (n,); their blocks have been seen empty so many times."""
+    def release(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
+        """Release slots (n,); their blocks get so many observations of emptiness."""
         if len(slots) == 0:
             return
         assert self.origin is not None
-        entries = blocks.take_voxels(slots, free_count)
+        entries = blocks.release(slots, free_count)
         cells = np.ravel_multi_index(tuple((blocks.coords[entries] - self.origin).T), tuple(self.shape))
         self.cells[cells] = -2 - entries
         self.near = self.near[blocks.entry_of[self.near] >= 0]
 
     def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
-        """Take note of cells (n,), of which nothing was known, that were seen empty so many times."""
+        """Make entries for unknown cells (n,) with so many observations of emptiness."""
         if len(cells) == 0:
             return
         entries = self.entries_of(cells, blocks)
@@ -79,7 +79,7 @@ class BlockWindow:
         blocks.free_count[entries] = min(free_count, 255)
 
     def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
-        """Entries of cells (n,), made where there is none yet.
+        """Entries (n,) of cells (n,); new ones where there is none.
 
         Raises:
             MapError: A cell lies too far from where the map began.

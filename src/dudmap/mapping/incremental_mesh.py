@@ -1,14 +1,10 @@
-"""The mesh of a map that grows: only what changed is extracted again."""
-
-from typing import TYPE_CHECKING
+"""Mesh of a growing map, of which only the changed parts are extracted again."""
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.geometry.mesh import Mesh
-
-if TYPE_CHECKING:
-    from dudmap.mapping.volume import TsdfVolume
+from dudmap.mapping.volume import TsdfVolume
 
 EDGE = 4
 """Blocks along the edge of a chunk."""
@@ -16,11 +12,11 @@ Chunk = tuple[int, int, int]
 
 
 class IncrementalMesh:
-    """Keeps the mesh of a volume up to date, for a view of the map while it is made.
+    """Mesh of a volume that is kept up to date while the map grows, for a live view.
 
-    The map is cut into chunks of 4x4x4 blocks. An update extracts those chunks again that a frame wrote to since the
-    last one, or that touch a block which was written; its time goes with what the camera sees, not with the map. All
-    chunks together are the surface that ``TsdfVolume.extract_mesh`` gives, with vertices doubled where chunks meet.
+    The map is cut into chunks of 4x4x4 blocks. An update extracts the chunks that hold or touch a block written since
+    the last update; its time is proportional to the view, not to the map. All chunks together are the surface of
+    ``TsdfVolume.extract_mesh``, with duplicate vertices where chunks meet.
     Updates and ``integrate`` must not run at the same time.
 
     Args:
@@ -31,7 +27,7 @@ class IncrementalMesh:
             ``4 k`` blocks.
     """
 
-    def __init__(self, volume: "TsdfVolume") -> None:
+    def __init__(self, volume: TsdfVolume) -> None:
         self.chunks: dict[Chunk, Mesh] = {}
         self._volume = volume
         self._map_id = volume.map_id
@@ -39,19 +35,19 @@ class IncrementalMesh:
         self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
 
     def update(self) -> list[Chunk]:
-        """Extract again what changed since the last update, and return which chunks may have changed.
+        """Extract what changed since the last update, and return the chunks that may have changed.
 
-        A chunk that is returned and is not in ``chunks`` has no surface any more.
+        A returned chunk that is not in ``chunks`` has no surface any more.
         """
-        forgotten: list[Chunk] = []
+        removed: list[Chunk] = []
         if self._volume.map_id != self._map_id:  # the map was cleared: its frames count from zero again
-            forgotten = list(self.chunks)
+            removed = list(self.chunks)
             self.chunks.clear()
             self._map_id, self._seen, self._coords_of = self._volume.map_id, -1, self._coords_of[:0]
         slots, coords = self._volume.written_since(self._seen)
         self._seen = self._volume.num_integrated
         known = slots[slots < len(self._coords_of)]
-        changed = np.concatenate([coords, self._coords_of[known]])  # a slot may have changed hands
+        changed = np.concatenate([coords, self._coords_of[known]])  # a slot may belong to another block now
         if len(slots) and slots[-1] >= len(self._coords_of):
             more = np.zeros((2 * (int(slots[-1]) + 1), 3), dtype=np.int32)
             more[: len(self._coords_of)] = self._coords_of
@@ -59,7 +55,7 @@ class IncrementalMesh:
         self._coords_of[slots] = coords
         stale = _touched(changed)
         if len(stale) == 0:
-            return forgotten
+            return removed
         meshes = self._extract(stale)
         keys: list[Chunk] = [(int(i), int(j), int(k)) for i, j, k in stale]
         for key, mesh in zip(keys, meshes, strict=True):
@@ -67,13 +63,13 @@ class IncrementalMesh:
                 self.chunks[key] = mesh
             else:
                 self.chunks.pop(key, None)
-        return keys + [key for key in forgotten if key not in self.chunks]
+        return keys + [key for key in removed if key not in self.chunks]
 
     def mesh(self) -> Mesh:
         """All chunks as one mesh."""
         parts = list(self.chunks.values())
         if not parts:
-            return _nothing()
+            return _empty_mesh()
         counts = np.array([len(part.vertices) for part in parts])
         first = (np.cumsum(counts) - counts).astype(np.int32)
         return Mesh(
@@ -92,13 +88,13 @@ class IncrementalMesh:
         chunk_of = np.where(inner, np.arange(len(stale))[:, None], -1)
         exists = slots >= 0
         chosen, groups = slots[exists], chunk_of[exists]
-        # a block beside two chunks is named by both, and by its own: once is enough, and its own chunk wins
+        # a block beside two chunks is listed for both and for its own chunk: keep one of them, its own chunk first
         order = np.lexsort((-groups, chosen))
         chosen, groups = chosen[order], groups[order]
         once = np.ones(len(chosen), dtype=bool)
         once[1:] = chosen[1:] != chosen[:-1]
         meshes = self._volume.extract_chunks(chosen[once], groups[once])
-        return meshes + [_nothing()] * (len(stale) - len(meshes))
+        return meshes + [_empty_mesh()] * (len(stale) - len(meshes))
 
 
 def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -111,6 +107,6 @@ def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
     return (np.stack(axes, axis=1) - (1 << 20)).astype(np.int32)
 
 
-def _nothing() -> Mesh:
+def _empty_mesh() -> Mesh:
     empty = np.zeros((0, 3), dtype=np.float32)
     return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)

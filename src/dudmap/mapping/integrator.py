@@ -1,6 +1,6 @@
-"""A depth image on its way into the voxels: allocate, average (eq. 4.18-4.23), carve, remember free space."""
+"""Fusion of a depth image into the map: allocate, average (eq. 4.18-4.23), carve, remember free space."""
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,174 +8,161 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
-from dudmap.kernels import integration, visibility
-from dudmap.kernels.threads import bands, run_bands
-from dudmap.mapping.voxel_blocks import BLOCK
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.parameters import DepthView, FusionParameters, SensorNoise, TruncationBand, VoxelGrid
+from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.voxel_blocks import VoxelBlocks
 
-if TYPE_CHECKING:
-    from dudmap.mapping.volume import TsdfVolume
+DEPTH_MIN = 0.05
+"""Blocks nearer to the camera than this are not updated, metres."""
+MIN_LIMIT = 0.3
+"""Smallest limit of the distances that voxels can store, metres."""
+FRONTAL_WEIGHT = 4.0
+"""Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
 
-NEAREST = 0.05
-"""Blocks nearer to the camera than this are not seen, metres."""
+
+@dataclass(frozen=True)
+class StorageScale:
+    """Discretisation of the map.
+
+    Attributes:
+        voxel_size: Edge of a voxel, metres.
+        band: Truncation band around a reading.
+        sdf_unit: Metres per step of a stored distance.
+        depth_unit: Metres per step of a reading on its way into the voxels.
+    """
+
+    voxel_size: float
+    band: TruncationBand
+    sdf_unit: float
+    depth_unit: float
+
+    @classmethod
+    def of(cls, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> "StorageScale":
+        """Scale of a map whose readings end at ``depth_max`` metres."""
+        front = config.truncation_voxels * config.voxel_size
+        behind = config.truncation_behind_voxels * config.voxel_size
+        limit = max(MIN_LIMIT, front, behind)
+        noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
+        band = TruncationBand(front, behind, config.truncation_noise, limit, noise)
+        return cls(config.voxel_size, band, limit / 32767, depth_max / 65534)
 
 
 class Integrator:
-    """One frame that is fused into a map.
+    """Fuses depth images into the blocks of a map.
 
     Args:
-        volume: The map, whose window has been moved to the view.
-        depth: (H, W) float32, metres, 0 where nothing is to be fused.
-        T_world_camera: (4, 4).
-        number: Number of the frame among those of the map.
+        config: Weights and carving.
+        scale: Discretisation of the map.
+        depth_max: Farthest reading, metres.
+        backend: Compute device.
     """
 
-    def __init__(
-        self, volume: "TsdfVolume", depth: NDArray[np.float32], T_world_camera: NDArray[np.float64], number: int
-    ) -> None:
-        self.volume = volume
-        self.depth = depth
-        self.number = number
-        self.T_lattice_camera = volume.window.T_grid_camera(T_world_camera)
-        self.T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
-        self.size = np.array(depth.shape, dtype=np.int64)
-        tiles = -(-depth.shape[0] // visibility.TILE), -(-depth.shape[1] // visibility.TILE)
-        self.tiles = tuple(np.empty(tiles, dtype=np.float32) for _ in range(3))  # nearest, farthest, share of readings
-        run_bands(
-            lambda start, stop: visibility.tile_ranges(start, stop, depth, *self.tiles),
-            bands(tiles[0], 15),
+    def __init__(self, config: VolumeConfig, scale: StorageScale, depth_max: float, backend: Backend) -> None:
+        self.config = config
+        self.scale = scale
+        self.backend = backend
+        self.parameters = FusionParameters(
+            band=scale.band,
+            voxel_size=scale.voxel_size,
+            sdf_unit=scale.sdf_unit,
+            depth_unit=scale.depth_unit,
+            max_weight=config.max_weight,
+            max_readings=config.max_readings,
+            carve_rate=config.carve_rate if config.carving else 1,
+            depth_min=DEPTH_MIN,
+            depth_max=depth_max,
         )
-        sensor, config = volume.sensor, volume.config
-        self.band = np.array(
-            [
-                volume.truncation, volume.truncation_behind, config.truncation_noise, sensor.sigma_base,
-                sensor.sigma_scale, volume.block_size,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
 
-    def allocate(self) -> None:
-        """Give voxels to the blocks that the truncation band of the image touches."""
-        volume, depth, window, blocks = self.volume, self.depth, self.volume.window, self.volume.blocks
-        T = self.T_lattice_camera / np.float32(BLOCK)
-        farthest = max(float(depth.max()), 0.05)
-        stride = int(np.clip(0.5 * volume.block_size * volume.camera.fx / farthest, 1, 8))  # half a block, or less
-        ranges = bands(-(-depth.shape[0] // stride), 15)
-        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
-        counts = run_bands(
-            lambda start, stop, out: visibility.mark_blocks(
-                stride * start, min(stride * stop, depth.shape[0]), stride, depth, volume.camera.intrinsics, T,
-                window.shape, window.cells, blocks.free_count, volume.config.free_after, self.number, window.stamps,
-                self.band, out,
-            ),
-            ranges, found,
-        )  # fmt: skip
-        cells = np.unique(np.concatenate([out[:count] for out, count in zip(found, counts, strict=True)]))
-        if len(cells):
-            window.give_voxels(cells, blocks, self.number)
+    def integrate(
+        self,
+        blocks: VoxelBlocks,
+        window: BlockWindow,
+        camera: Camera,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
+        frame_number: int,
+        count: int,
+    ) -> None:
+        """Fuse an image.
 
-    def average(self, color: NDArray[np.uint8], weights: NDArray[np.uint8], count: int) -> None:
-        """Average distances and colours (H, W, 3) into the voxels in view; free what is empty.
-
-        Each reading counts by its weight (H, W), as though ``count`` frames had shown it.
+        Args:
+            blocks: Blocks of the map; changed here.
+            window: The blocks around the view, to which it has been moved; changed here.
+            camera: Camera of the image.
+            depth: (H, W) float32, metres, 0 where nothing is to be fused.
+            color: (H, W, 3) uint8.
+            weights: (H, W) uint8 weight of each reading; None = by the configuration.
+            T_world_camera: (4, 4).
+            frame_number: Number of the frame among those of the map, from 1.
+            count: Number of equal frames that it stands for.
         """
-        volume, window, blocks, config = self.volume, self.volume.window, self.volume.blocks, self.volume.config
+        T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
+        view = self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_world)
+        self._allocate(blocks, window, view, frame_number)
+        weights = self._reading_weights(depth, camera) if weights is None else weights
+        self._average(blocks, window, view, color, weights, frame_number, count)
+        if self.config.carving:
+            self._observe_free(blocks, window, view, frame_number, count)
+
+    def grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
+        """The blocks around the view as a back end takes them; valid until blocks are added."""
+        assert window.origin is not None
+        return VoxelGrid(
+            window.cells, window.shape, window.origin, blocks.geometry, blocks.colors, blocks.slot_coords,
+            blocks.free_count, self.scale.voxel_size, self.scale.sdf_unit,
+        )  # fmt: skip
+
+    def _allocate(self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int) -> None:
+        """Allocate voxels for the blocks that the truncation band of the image touches."""
+        farthest = max(float(view.depth.max()), 0.05)
+        half_block = 0.5 * window.block_size * float(view.intrinsics[0]) / farthest  # pixels, at the farthest reading
+        stride = int(np.clip(half_block, 1, 8))
+        cells = self.backend.touched_cells(
+            self.grid(blocks, window), view, window.stamps, stride, self.config.free_after, frame_number,
+            self.parameters,
+        )  # fmt: skip
+        if len(cells):
+            window.allocate(cells, blocks, frame_number)
+
+    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
+        """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
+        if self.config.weighting == "constant":
+            return np.ones(depth.shape, dtype=np.uint8)
+        return self.backend.reading_weights(depth, camera.intrinsics, self.scale.band.noise, FRONTAL_WEIGHT)
+
+    def _average(
+        self,
+        blocks: VoxelBlocks,
+        window: BlockWindow,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        frame_number: int,
+        count: int,
+    ) -> None:
+        """Average distances and colours into the voxels in view; release the blocks that are seen to be empty."""
         if len(window.near) == 0:
             return
-        visible, repeats = self._visible()
-        repeats *= count
-        blocks.written[visible] = self.number
-        blocks.fused[visible] = np.minimum(blocks.fused[visible], 254) + 1
-        voxel = np.array(
-            [
-                volume.voxel_size, volume.sdf_unit, volume.truncation, volume.truncation_behind,
-                config.truncation_noise, volume.sensor.sigma_base, volume.sensor.sigma_scale, config.max_weight,
-                config.carve_rate if config.carving else 1, volume.largest, volume.depth_unit,
-                config.max_readings,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
-        pixels = self._pixels(color, weights)
-        occupied = np.empty(len(visible), dtype=np.int32)
-        run_bands(
-            lambda start, stop: integration.integrate(
-                start, stop, visible, repeats, blocks.slot_coords, self.T_camera_world, volume.camera.intrinsics,
-                self.size, pixels, blocks.geometry.reshape(-1), blocks.colors.reshape(-1), voxel, occupied,
-            ),
-            bands(len(visible), 256),
-        )  # fmt: skip
-        if config.carving:
-            window.take_voxels(visible[occupied == 0], blocks, config.free_after)
+        turn = frame_number if self.config.take_turns else -1
+        slots, occupied = self.backend.fuse(
+            self.grid(blocks, window), view, color, weights, window.near, blocks.fused, turn, count, self.parameters
+        )
+        blocks.written[slots] = frame_number
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
+        if self.config.carving:
+            window.release(slots[occupied == 0], blocks, self.config.free_after)
 
-    def observe_free(self, count: int) -> None:
+    def _observe_free(
+        self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int, count: int
+    ) -> None:
         """Count ``count`` more observations of emptiness for blocks without voxels in front of the image.
 
         Each call visits every second plane of the window, so that the cost is spread over two frames.
         """
-        volume, window, blocks = self.volume, self.volume.window, self.volume.blocks
-        assert window.origin is not None
-        nearest, _, valid = self.tiles
-        parity = self.number % 2
-        ranges = bands(int(window.shape[0]) // 2, 8)
-        found = [np.empty(1 << 16, dtype=np.int32) for _ in ranges]
-        numbers = run_bands(
-            lambda start, stop, out: visibility.observe_free(
-                2 * start + parity, 2 * stop + parity, 2, window.cells, window.shape, window.origin,
-                self.T_camera_world, volume.camera.intrinsics, self.size, np.float32(volume.block_size), nearest,
-                valid, self.band, np.float32(volume.depth_max), blocks.free_count, count, volume.config.free_after,
-                out,
-            ),
-            ranges, found,
-        )  # fmt: skip
-        cells = np.concatenate([out[:number] for out, number in zip(found, numbers, strict=True)])
-        window.set_free(cells, blocks, count)
-
-    def _visible(self) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
-        """Slots (n,) that the image may change in this frame, and for how many frames each of them counts."""
-        volume, near, blocks = self.volume, self.volume.window.near, self.volume.blocks
-        nearest, farthest, _ = self.tiles
-        slots, repeats = np.empty(len(near), dtype=np.int32), np.empty(len(near), dtype=np.float32)
-        turn = self.number if volume.config.take_turns else -1
-        ranges = bands(len(near), 2048)
-        counts = run_bands(
-            lambda start, stop: visibility.visible_slots(
-                start, stop, near, blocks.slot_coords, blocks.fused, turn, self.T_camera_world,
-                volume.camera.intrinsics, self.size, np.float32(volume.block_size), nearest, farthest, self.band,
-                np.float32(NEAREST), np.float32(volume.depth_max), slots, repeats,
-            ),
-            ranges,
-        )  # fmt: skip
-        taken = [np.s_[start : start + n] for (start, _), n in zip(ranges, counts, strict=True)]
-        return np.concatenate([slots[part] for part in taken]), np.concatenate([repeats[part] for part in taken])
-
-    def _pixels(self, color: NDArray[np.uint8], weights: NDArray[np.uint8]) -> NDArray[np.int64]:
-        """Readings and colours (H * W + 1,) as the kernel takes them; the last pixel has no reading."""
-        volume, depth = self.volume, self.depth
-        pixels, rgb = volume.pixel_buffer(depth.size + 1), np.ascontiguousarray(color)
-        limits = np.array(
-            [
-                volume.truncation, volume.config.truncation_noise, volume.sensor.sigma_base,
-                volume.sensor.sigma_scale, volume.largest, volume.depth_unit,
-            ],
-            dtype=np.float32,
-        )  # fmt: skip
-        run_bands(
-            lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, limits, pixels),
-            bands(depth.shape[0], 60),
+        cells = self.backend.observe_free(
+            self.grid(blocks, window), view, frame_number % 2, count, self.config.free_after, self.parameters
         )
-        return pixels.view(np.int64).reshape(-1)
-
-
-def reading_weights(
-    depth: NDArray[np.float32], camera: Camera, config: VolumeConfig, sensor: SensorConfig
-) -> NDArray[np.uint8]:
-    """Weights (H, W) of the readings: all alike, or by the angle of sight and the sensor's noise (eq. 4.20)."""
-    weights = np.ones(depth.shape, dtype=np.uint8)
-    if config.weighting == "angle":
-        run_bands(
-            lambda start, stop: integration.observation_weights(
-                start, stop, depth, camera.intrinsics, np.float32(sensor.sigma_base), np.float32(sensor.sigma_scale),
-                np.float32(4), weights,
-            ),
-            bands(depth.shape[0], 60),
-        )  # fmt: skip
-    return weights
+        window.set_free(cells, blocks, count)

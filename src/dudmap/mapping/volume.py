@@ -1,7 +1,6 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -12,49 +11,31 @@ from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
-from dudmap.kernels import meshing, raycasting, sampling
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.parameters import (
+    FREE,
+    SURFACE,
+    UNKNOWN,
+    MapSample,
+    MeshParameters,
+    RaycastParameters,
+    RaycastResult,
+    VoxelGrid,
+)
 from dudmap.mapping.block_window import BlockWindow
-from dudmap.mapping.integrator import Integrator, reading_weights
+from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+
+__all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
 _MAP_IDS = itertools.count()
 FORMAT = "dudmap map 1"
-STEEPEST = 5.0
+MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
-one over the cosine of the angle of sight; what is steeper is the edge between a band and the free space beside it."""
-UNKNOWN, SURFACE, FREE = 0, 1, 2
-"""What the map says of a point: unknown, near a surface, in confirmed free space."""
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """The map seen from a pose: the thesis' artificial camera view.
-
-    Attributes:
-        depth: (H, W) float32, metres, 0 where no surface is hit.
-        color: (H, W, 3) uint8.
-        normals: (H, W, 3) float32, world frame, 0 where no surface is hit.
-    """
-
-    depth: NDArray[np.float32]
-    color: NDArray[np.uint8]
-    normals: NDArray[np.float32]
-
-
-@dataclass(frozen=True, eq=False)
-class MapSample:
-    """What the map says at the points of a depth image.
-
-    Attributes:
-        distance: (h, w) float32 signed distance in metres, NaN where the map has none.
-        difference: (h, w) float32 map minus image intensity (0..1), NaN likewise.
-        place: (h, w) uint8: UNKNOWN, SURFACE or FREE.
-    """
-
-    distance: NDArray[np.float32]
-    difference: NDArray[np.float32]
-    place: NDArray[np.uint8]
+one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
+MAX_WINDOW = 288
+"""Largest number of blocks along the edge of the window; its cells then take 96 MB."""
 
 
 class TsdfVolume:
@@ -66,13 +47,15 @@ class TsdfVolume:
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
         extent: Depth that the window covers, metres; None covers ``depth_max``.
+        backend: Compute device, of this map alone; None takes the CPU.
 
     Attributes:
-        blocks: What is known of space.
-        window: The part of it around the view.
-        sdf_unit, largest: What a voxel's distance is stored in, and the largest it holds, metres.
-        depth_unit: What a reading is held in on its way into the voxels, metres.
-        born: Number of this map among all of the program; another one after the map was made anew.
+        blocks: The blocks of the map.
+        window: Those around the view.
+        voxel_size, block_size: Edge of a voxel and of a block, metres.
+        band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
+        sdf_unit: Metres per step of a stored distance.
+        map_id: Number of the map in this process; ``clear`` gives a new one.
 
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
@@ -85,35 +68,37 @@ class TsdfVolume:
         sensor: SensorConfig | None = None,
         depth_max: float = 6.0,
         extent: float | None = None,
+        backend: Backend | None = None,
     ) -> None:
         self.camera = camera
         self.config = config or VolumeConfig()
         self.sensor = sensor or SensorConfig()
         self.depth_max = depth_max
-        self.voxel_size = self.config.voxel_size
+        self.backend: Backend = backend or CpuBackend()
+        scale = StorageScale.of(self.config, self.sensor, depth_max)
+        self._integrator = Integrator(self.config, scale, depth_max, self.backend)
+        self.voxel_size, self.sdf_unit, self.band = scale.voxel_size, scale.sdf_unit, scale.band
         self.block_size = BLOCK * self.voxel_size
-        self.truncation = self.config.truncation_voxels * self.voxel_size
-        self.truncation_behind = self.config.truncation_behind_voxels * self.voxel_size
-        self.largest = max(0.3, self.truncation, self.truncation_behind)
-        self.sdf_unit = self.largest / 32767
-        self.depth_unit = depth_max / 65534
+        self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
                          max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
         extent = depth_max if extent is None else extent
-        self._extent = extent
         self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
-        cells = int(np.ceil(2 * (self._reach + self.largest) / self.block_size)) + 8
-        if cells > 288:
-            longest = extent * 280 / cells
+        self._window_cells = int(np.ceil(2 * (self._reach + self.band.limit) / self.block_size)) + 8
+        if self._window_cells > MAX_WINDOW:
+            longest = extent * (MAX_WINDOW - 8) / self._window_cells
             raise MapError(
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
-        self.window = BlockWindow(self.block_size, cells)
+        self._reset()
+
+    def _reset(self) -> None:
+        """Become an empty map."""
+        self.window = BlockWindow(self.block_size, self._window_cells)
         self.blocks = VoxelBlocks()
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
-        self._pixels: NDArray[np.int32] | None = None
 
     @property
     def is_empty(self) -> bool:
@@ -132,16 +117,17 @@ class TsdfVolume:
 
     @property
     def num_bytes(self) -> int:
-        """Memory of the map: voxels, also those given back and not taken again yet, the index of all entries, the hash.
+        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
+        hash table.
 
-        Arrays grow ahead of what they hold; that spare room is address space the system has not backed with memory, and
-        is left out. So is the window, whose size depends on the view and the voxels, not on the map.
+        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
+        is the window, whose size depends on the view and the voxels, not on the map.
         """
         return self.blocks.num_bytes
 
     @property
     def entry_bytes(self) -> float:
-        """Memory that knowing a block costs without voxels, such as free space: its entry and its share of the hash."""
+        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
         return self.blocks.entry_bytes
 
     @property
@@ -165,8 +151,8 @@ class TsdfVolume:
             frame: Depth (m) and colour of the volume's camera.
             T_world_camera: (4, 4).
             static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
-            weights: (H, W) uint8 weight of each reading; None takes what the configuration says.
-            count: Number of like frames that it stands for: their weights and observations of emptiness add up.
+            weights: (H, W) uint8 weight of each reading; None = by the configuration.
+            count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
 
         Raises:
             MapError: The images do not have the camera's size.
@@ -183,32 +169,31 @@ class TsdfVolume:
             depth[~static_mask] = 0
         self._frame_number += 1
         self.look_at(T_world_camera)
-        fusion = Integrator(self, depth, T_world_camera, self._frame_number)
-        fusion.allocate()
-        weights = reading_weights(depth, self.camera, self.config, self.sensor) if weights is None else weights
-        fusion.average(frame.color, weights, count)
-        if self.config.carving:
-            fusion.observe_free(count)
-
-    def pixel_buffer(self, size: int) -> NDArray[np.int32]:
-        """Array (size, 2) for readings on their way into the voxels, the same for every frame; its last row is 0."""
-        if self._pixels is None or len(self._pixels) != size:
-            self._pixels = np.zeros((size, 2), dtype=np.int32)
-        return self._pixels
+        self._integrator.integrate(
+            self.blocks, self.window, self.camera, depth, frame.color, weights, T_world_camera, self._frame_number,
+            count,
+        )  # fmt: skip
 
     def clear(self) -> None:
-        """Forget everything."""
-        self.__init__(self.camera, self.config, self.sensor, self.depth_max, self._extent)
+        """Remove everything that was integrated."""
+        self._reset()
 
     def take_over(self, other: "TsdfVolume") -> None:
-        """Become the map that ``other`` is; ``other`` must not be used afterwards."""
-        self.__dict__.update(other.__dict__)
+        """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
+        assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
+        self.blocks, self.window = other.blocks, other.window
+        self._frame_number, self.map_id = other._frame_number, other.map_id
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         self.window.look_at(T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach, self.blocks)
 
     # -- reading -----------------------------------------------------------------------------------------------------
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
+        return self._integrator.grid(self.blocks, self.window)
 
     def sample(
         self,
@@ -217,32 +202,17 @@ class TsdfVolume:
         camera: Camera,
         T_world_camera: NDArray[np.float64],
     ) -> MapSample:
-        """What the map says at the points of a depth image (h, w) of ``camera`` at a pose inside the window."""
-        shape = depth.shape
-        out = (np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
-        window, T = self.window, self.window.T_grid_camera(T_world_camera)
-        run_bands(
-            lambda start, stop: sampling.sample_map(
-                start, stop, depth, intensity, camera.intrinsics, T, window.cells, window.shape,
-                self.blocks.geometry.reshape(-1), np.float32(self.sdf_unit), self.blocks.free_count,
-                self.config.free_after, *out,
-            ),
-            bands(shape[0], max(8, -(-shape[0] // 8))),
-        )  # fmt: skip
-        return MapSample(*out)
+        """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
+        at a pose inside the window."""
+        T = self.window.T_grid_camera(T_world_camera)
+        return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
 
-    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> View:
+    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
         """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera
         self.look_at(T_world_camera)
-        window = self.window
-        assert window.origin is not None
-        depth, color, normals = raycasting.raycast(
-            window.cells.reshape(tuple(window.shape)), window.origin.astype(np.int32), self.blocks.geometry,
-            self.blocks.colors, self.voxel_size, self.sdf_unit, T_world_camera, camera, 0.05, self.depth_max,
-            self.config.min_weight,
-        )  # fmt: skip
-        return View(depth, color, normals)
+        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        return self.backend.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
@@ -252,13 +222,16 @@ class TsdfVolume:
         """
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
-        slots = self.active_slots
-        vertices, faces, colors, normals = meshing.extract(
-            self.blocks.geometry, self.blocks.colors, slots, self.blocks.slot_coords, self.blocks.neighbours(slots),
-            self.voxel_size, self.sdf_unit, self.config.min_weight if min_weight is None else min_weight,
-            STEEPEST * self.voxel_size,
+        slots, blocks = self.active_slots, self.blocks
+        return Mesh(
+            *self.backend.extract_mesh(
+                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+                self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
+            )
         )  # fmt: skip
-        return Mesh(vertices, faces, colors, normals)
+
+    def _mesh_parameters(self, min_weight: int) -> MeshParameters:
+        return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
 
     def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
@@ -267,11 +240,12 @@ class TsdfVolume:
             slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
         """
-        parts = meshing.extract_chunks(
-            self.blocks.geometry, self.blocks.colors, slots, self.blocks.slot_coords, self.blocks.neighbours(slots),
-            self.voxel_size, self.sdf_unit, self.config.min_weight, chunks, STEEPEST * self.voxel_size,
+        blocks = self.blocks
+        meshes = self.backend.extract_chunks(
+            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+            self._mesh_parameters(self.config.min_weight), chunks,
         )  # fmt: skip
-        return [Mesh(*part) for part in parts]
+        return [Mesh(*mesh) for mesh in meshes]
 
     @property
     def num_integrated(self) -> int:
@@ -281,7 +255,7 @@ class TsdfVolume:
     def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
 
-        A slot whose block gave its voxels back is among them, with the coordinates of that block or of the next one.
+        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
         """
         slots = np.flatnonzero(self.blocks.written[: self.blocks.num_slots] > num_integrated).astype(np.int32)
         return slots, self.blocks.slot_coords[slots].astype(np.int32)

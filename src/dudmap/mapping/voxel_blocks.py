@@ -1,35 +1,35 @@
-"""Blocks of 8x8x8 voxels: the hash that finds them, the memory that holds them."""
+"""Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels import hashing, integration
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.kernels import hashing
+from dudmap.kernels.parameters import BLOCK
 
-BLOCK = 8
-"""Voxels along the edge of a block."""
-FULLEST = 0.8
-"""Largest share of the hash table that may be taken: 16 ns per insertion then, 9 ns after it has grown."""
+__all__ = ["BLOCK", "VoxelBlocks"]
+
+MAX_LOAD = 0.8
+"""Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
 
 class VoxelBlocks:
-    """Everything that is known of space, block by block.
+    """The map's content, block by block.
 
-    An entry is a block that something is known of; an entry near a surface owns a slot of 512 voxels. Arrays grow ahead
-    of what they hold.
+    An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
+    than their content and grow by factors.
 
     Attributes:
         table: Hash table of entry numbers (``kernels/hashing.py``).
         coords: (entries, 3) int16 block coordinates.
         slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
         free_count: (entries,) uint8 observations of emptiness.
-        num_entries: Entries that are in use.
+        num_entries: Number of entries.
         geometry, colors: (slots, 512) int32 packed voxels.
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
         slot_coords: (slots, 3) int16 block coordinates by slot.
-        written: (slots,) int32 number of the frame that last wrote a slot.
+        written: (slots,) int32 number of the frame that last wrote to a slot.
         fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
-        num_slots: Slots that are or were in use.
+        num_slots: Number of slots in use or released.
     """
 
     def __init__(self) -> None:
@@ -45,23 +45,23 @@ class VoxelBlocks:
         self.written = np.zeros(1 << 10, dtype=np.int32)
         self.fused = np.zeros(1 << 10, dtype=np.uint8)
         self.num_slots = 0
-        self._unused = np.empty(0, dtype=np.int32)
+        self._released = np.empty(0, dtype=np.int32)
 
     @property
     def num_voxel_blocks(self) -> int:
         """Blocks that own voxels."""
-        return self.num_slots - len(self._unused)
+        return self.num_slots - len(self._released)
 
     def num_free(self, observations: int) -> int:
-        """Blocks without voxels that were seen empty at least so often."""
+        """Blocks without voxels that have at least so many observations of emptiness."""
         n = self.num_entries
         return int(np.count_nonzero((self.free_count[:n] >= observations) & (self.slot_of[:n] < 0)))
 
     @property
     def num_bytes(self) -> int:
-        """Memory of all slots, also those given back and not taken again yet, of all entries, and of the hash.
+        """Memory of all slots, also the released ones, of all entries and of the hash table.
 
-        What arrays hold ahead is address space that the system has not backed with memory, and is left out.
+        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
         """
         slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
         return (
@@ -72,7 +72,7 @@ class VoxelBlocks:
 
     @property
     def entry_bytes(self) -> float:
-        """Memory that knowing a block costs without voxels, such as free space: its entry and its share of the hash."""
+        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
         return self._index_bytes + self.table.nbytes / max(self.num_entries, 1)
 
     @property
@@ -85,24 +85,24 @@ class VoxelBlocks:
         return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
 
     def entries_at(self, coords: NDArray[np.int16], unknown: int) -> NDArray[np.int32]:
-        """Entries (n,) int32 of blocks at coordinates (n, 3), made for those, ``unknown`` at most, that have none."""
+        """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
         needed = self.num_entries + unknown
         if needed > len(self.coords):
             capacity = max(needed, 2 * len(self.coords))
             self.coords = _grown(self.coords, capacity, 0)
             self.slot_of = _grown(self.slot_of, capacity, -1)
             self.free_count = _grown(self.free_count, capacity, 0)
-        if needed > FULLEST * len(self.table):
-            size = max(int(needed / FULLEST), len(self.table)) * 3 // 2  # a full table would be searched for ever
+        if needed > MAX_LOAD * len(self.table):
+            size = max(int(needed / MAX_LOAD), len(self.table)) * 3 // 2  # a search in a full table would not end
             self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
             hashing.rebuild(self.table, self.coords, self.num_entries)
         entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
         return entries
 
-    def give_voxels(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
+    def allocate(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
         """New slots (n,) int32 for entries that have none."""
-        kept = max(len(self._unused) - len(entries), 0)
-        reused, self._unused = self._unused[kept:][::-1], self._unused[:kept]
+        kept = max(len(self._released) - len(entries), 0)
+        reused, self._released = self._released[kept:][::-1], self._released[:kept]
         needed = self.num_slots + len(entries) - len(reused)
         if needed > len(self.geometry):
             capacity = max(needed, len(self.geometry) * 3 // 2)
@@ -121,17 +121,14 @@ class VoxelBlocks:
         self.slot_of[entries] = slots
         return slots
 
-    def take_voxels(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
-        """Take slots back; their entries (n,) int32 count as seen empty at least so often."""
+    def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
+        """Release and empty slots; their entries (n,) int32 get at least so many observations of emptiness."""
         entries = self.entry_of[slots]
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
         self.entry_of[slots] = -1
-        run_bands(
-            lambda start, stop: integration.clear(start, stop, slots, self.geometry, self.colors),
-            bands(len(slots), 512),
-        )
-        self._unused = np.concatenate([self._unused, slots[::-1]])
+        self.geometry[slots] = self.colors[slots] = 0
+        self._released = np.concatenate([self._released, slots[::-1]])
         return entries
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -156,7 +153,7 @@ class VoxelBlocks:
         geometry: NDArray[np.int32],
         colors: NDArray[np.int32],
     ) -> "VoxelBlocks":
-        """Blocks from what a file holds: all entries, and entry and voxels of each slot."""
+        """Blocks of a map file: all entries, and entry and voxels of each slot."""
         blocks, n, m = cls(), len(coords), len(entries)
         blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
         blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n

@@ -39,4 +39,4 @@ class MovingObjects:
 
     def rigid_objects(self, Ts_world_camera: Mapping[float, NDArray[np.float64]]) -> list[RigidObject]:
         """Shape and trajectory of the objects so far, given the camera poses (4, 4) by time; empty without fusion."""
-        return [] if self.fusion is None else self.fusion.bodies(dict(Ts_world_camera))
+        return [] if self.fusion is None else self.fusion.objects(dict(Ts_world_camera))

@@ -16,7 +16,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.median import median
 from dudmap.objects.regions import (
-    MIN_PIXELS,
+    MIN_SHARE,
     MovingPixels,
     Region,
     boxes_overlap,
@@ -214,7 +214,7 @@ class ObjectTracker:
             track.id
             for track in self._tracks
             if track.id < len(counts)
-            and counts[track.id] >= MIN_PIXELS
+            and counts[track.id] >= MIN_SHARE * pixels.shape[0] * pixels.shape[1]
             and self._is_established(track, float(pixels.area[indices[predicted == track.id]].sum()))
         ]
         return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)

@@ -13,8 +13,8 @@ SAMPLES = 60
 """Points per region that the gap to another region is measured with."""
 MAX_REGIONS = 24
 """Regions of a frame that are considered, the largest first."""
-MIN_PIXELS = 12
-"""Regions of fewer pixels are noise."""
+MIN_SHARE = 12 / (160 * 120)
+"""Regions of a smaller share of the image are noise: 12 pixels of a label image of the default size."""
 OCCLUSION_GAP = 0.1
 """A surface nearer than an object's border by more than this occludes a part of the object, metres."""
 
@@ -94,7 +94,7 @@ def connected_regions(
     sizes[0] = 0
     area = np.square(level.depth.reshape(-1)) / np.float32(level.camera.fx * level.camera.fy)
     areas = np.bincount(number, area, minlength=count + 1)
-    areas[sizes < MIN_PIXELS] = 0
+    areas[sizes < MIN_SHARE * moving.size] = 0
     kept = np.argsort(-areas, kind="stable")[:MAX_REGIONS]
     kept = kept[areas[kept] > 0]
     if len(kept) == 0:

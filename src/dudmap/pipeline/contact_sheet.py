@@ -13,7 +13,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.image import AxesImage
 
-    from dudmap.mapping.volume import View
+    from dudmap.mapping.volume import RaycastResult
 
 RESIDUAL_RANGE = 0.05
 """Residual at the end of the colour scale, metres."""
@@ -26,7 +26,7 @@ def save_sheet(
     frame: Frame,
     dynamic_mask: NDArray[np.bool_],
     residuals: NDArray[np.floating],
-    view: "View",
+    view: "RaycastResult",
     T_world_camera: NDArray[np.float64],
     true_mask: NDArray[np.bool_] | None = None,
 ) -> None:
@@ -70,7 +70,7 @@ def save_sheet(
         raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
 
 
-def shaded(view: "View", T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+def shaded(view: "RaycastResult", T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Grey image (H, W, 3) of the surface of a view, lit from beside the camera; white where there is no surface."""
     light = T_world_camera[:3, :3] @ LIGHT
     brightness = 0.25 + 0.7 * np.clip(view.normals @ light, 0, 1)

@@ -159,7 +159,7 @@ def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, 
     """Write mesh and trajectory of every rigid object; returns the entries of all objects in metrics.json."""
     out = []
     for body in objects:
-        row = {"id": body.id, "rigid": body.rigid, "why_not": body.why or None, "frames": body.frames}
+        row = {"id": body.id, "rigid": body.rigid, "why_not": body.reason or None, "frames": body.frames}
         if body.mesh is not None and body.trajectory is not None:
             folder.mkdir(exist_ok=True)
             body.mesh.save(folder / f"{body.id}.ply")

@@ -1,6 +1,6 @@
-"""All that is known of the world: submaps, each in its own world frame, with their keyframes, frames and poses.
+"""Atlas: submaps, each with a world frame of its own, their keyframes, stored frames and trajectories.
 
-Several maps that are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
+Submaps are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from dudmap.places.place_recognition import KeyframeDatabase
 
 @dataclass(eq=False)
 class TimedPose:
-    """Pose of a tracked frame in the world of a submap."""
+    """Pose (4, 4) of a tracked frame in the world of a submap; timestamp in seconds."""
 
     timestamp: float
     T_world_camera: NDArray[np.float64]
@@ -27,18 +27,18 @@ class TimedPose:
 
 
 class Atlas:
-    """The submaps, and everything that moves along when one is corrected or joined with another.
+    """The submaps and everything whose pose changes when a submap is corrected or joined with another.
 
     Args:
-        make_volume: Makes an empty map.
-        keyframes: Places that can be recognised.
-        history: The fused frames, to build maps again; None where neither loops nor submaps are wanted.
-        number: Of the first submap.
+        make_volume: Creates an empty map.
+        keyframes: Keyframes of all submaps.
+        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
+        number: Number of the first submap.
 
     Attributes:
-        volumes: Map by number of the submap.
+        volumes: Maps by the numbers of their submaps.
         current: Number of the submap that is tracked.
-        poses: Of all tracked frames, in time.
+        poses: Poses of all tracked frames, in order of time.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class Atlas:
 
     @property
     def volume(self) -> TsdfVolume:
-        """The map that is tracked."""
+        """The map of the current submap."""
         return self.volumes[self.current]
 
     def integrate(self, frame: Frame, static_mask: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> None:
@@ -73,38 +73,42 @@ class Atlas:
             self.history.drop_last()
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Take over the pose of a tracked frame."""
+        """Append the pose (4, 4) of a frame tracked in the current submap."""
         self.poses.append(TimedPose(timestamp, T_world_camera, self.current))
 
     def start_submap(self) -> None:
-        """Go on in a new, empty map."""
+        """Make a new, empty submap the current one."""
         self.current = max(self.volumes) + 1
         self.volumes[self.current] = self.make_volume()
 
     def by_size(self) -> list[int]:
-        """Numbers of the submaps, that with the most frames first."""
+        """Numbers of the submaps, those with more tracked frames first."""
         return sorted(self.volumes, key=lambda number: -sum(pose.submap == number for pose in self.poses))
 
     def trajectory(self, submap: int) -> Trajectory:
-        """Poses of the frames that were tracked in a submap."""
+        """Trajectory of the frames tracked in a submap."""
         return Trajectory.from_poses(
             (pose.timestamp, pose.T_world_camera) for pose in self.poses if pose.submap == submap
         )
 
     def nodes(self, submap: int) -> list[int]:
-        """Numbers of the kept frames of a submap, in time."""
-        return [] if self.history is None else [n for n, of in enumerate(self.history.submaps) if of == submap]
+        """Numbers of the stored frames of a submap, in order of time."""
+        if self.history is None:
+            return []
+        return [n for n, number in enumerate(self.history.submaps) if number == submap]
 
     def correct(self, nodes: list[int], Ts_new: NDArray[np.float64], volume: TsdfVolume) -> NDArray[np.float64]:
-        """Move the kept frames of the current submap; everything else moves along, by time between them.
+        """Set new poses of the stored frames of the current submap, and replace its map.
+
+        Trajectory and keyframes receive the correction interpolated in time between the stored frames.
 
         Args:
-            nodes: Numbers of all its kept frames, in time.
+            nodes: Numbers of all stored frames of the submap, in order of time.
             Ts_new: (n, 4, 4) their new poses.
-            volume: The map built from these.
+            volume: The map built from them.
 
         Returns:
-            (4, 4) motion of what is newest.
+            (4, 4) motion of the newest stored frame.
         """
         assert self.history is not None
         stamps = np.array([self.history.timestamps[n] for n in nodes])
@@ -122,13 +126,13 @@ class Atlas:
         return corrections[-1]
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
-        """Fuse a submap into another, whose world ``T_target_source`` maps into, and go on there."""
+        """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
         nodes = self.nodes(source)
-        for place in (*self.poses, *self.keyframes.keyframes):
-            if place.submap == source:
-                place.T_world_camera = T_target_source @ place.T_world_camera
-                place.submap = target
+        for moved in (*self.poses, *self.keyframes.keyframes):
+            if moved.submap == source:
+                moved.T_world_camera = T_target_source @ moved.T_world_camera
+                moved.submap = target
         for n in nodes:
             self.history.Ts_world_camera[n] = T_target_source @ self.history.Ts_world_camera[n]
             self.history.submaps[n] = target

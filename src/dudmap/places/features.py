@@ -1,4 +1,4 @@
-"""SIFT features of a frame (Lowe 2004), found in a reduced grey image."""
+"""SIFT features of a reduced grey image and their matching by Lowe's ratio test (Lowe 2004)."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -64,3 +64,29 @@ class SiftExtractor:
             descriptors,
             (grey.shape[0], grey.shape[1]),
         )
+
+
+def match_descriptors(
+    a: NDArray[np.float32], b: NDArray[np.float32], ratio: float, *, mutual: bool
+) -> NDArray[np.int64]:
+    """Pairs (m, 2) of rows: each row of ``a`` with its nearest neighbour in ``b``, if it passes the ratio test.
+
+    The distances of all pairs are computed: with some hundred features this is faster than building a search tree,
+    and exact.
+
+    Args:
+        a: (n, d) descriptors.
+        b: (k, d) descriptors; with k < 2 the ratio test cannot be made and nothing matches.
+        ratio: Largest quotient of the nearest and the second nearest distance.
+        mutual: Keep only pairs that are also the nearest neighbours from ``b`` to ``a``.
+    """
+    if len(a) == 0 or len(b) < 2:
+        return np.empty((0, 2), dtype=np.int64)
+    squared = (a * a).sum(axis=1)[:, None] + (b * b).sum(axis=1) - 2 * (a @ b.T)
+    nearest = np.argmin(squared, axis=1)
+    rows = np.arange(len(a))
+    first = squared[rows, nearest]
+    passed = np.argmin(squared, axis=0)[nearest] == rows if mutual else np.ones(len(a), dtype=bool)
+    squared[rows, nearest] = np.inf
+    passed &= first < ratio**2 * squared.min(axis=1)
+    return np.stack([rows[passed], nearest[passed]], axis=1)

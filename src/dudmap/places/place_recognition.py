@@ -14,16 +14,19 @@ from dudmap.config import RelocalizationConfig, SensorConfig
 from dudmap.frames.observation import Observation
 from dudmap.geometry.alignment import agree, rigid_ransac
 from dudmap.geometry.camera import Camera
-from dudmap.places.features import SiftExtractor, reduced_grey
+from dudmap.places.features import SiftExtractor, match_descriptors, reduced_grey
 
-COMPARED = 64
-"""Strongest features of each keyframe that choose the keyframes worth a closer look."""
-LOOKED_AT = 5
-"""KeyframeDatabase per lost frame that get that closer look."""
-SLACK = 0.01
-"""Two places of one feature differ by this beyond the sensor's noise, metres per metre of depth (half a pixel)."""
-SAME_PLACE = 0.1, 5.0
-"""Candidates nearer to each other than this (m, deg) are one."""
+COARSE_FEATURES = 64
+"""Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
+MAX_MATCHED = 5
+"""Keyframes per frame whose features are all matched; it bounds the time of a query."""
+POSITION_ERROR = 0.01
+"""Largest error of a feature's position beyond the sensor's noise, metres per metre of depth.
+
+That are 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
+"""
+DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
+"""Matches in one submap with poses nearer to each other than this (m, deg) are duplicates."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,11 +174,15 @@ class KeyframeDatabase:
             return []
         found: list[PlaceMatch] = []
         for keyframe in _most_similar(features, among):
-            pairs = matches(features.descriptors, keyframe.features.descriptors, self.config.ratio)
+            pairs = match_descriptors(
+                features.descriptors, keyframe.features.descriptors, self.config.ratio, mutual=True
+            )
             if len(pairs) < self.config.min_inliers:
                 continue
             a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
-            T_keyframe_camera, inliers = rigid_ransac(a, b, self._tolerance(a) + self._tolerance(b))
+            T_keyframe_camera, inliers = rigid_ransac(
+                a, b, self._tolerance(a) + self._tolerance(b), self.config.min_share
+            )
             num_inliers = int(np.count_nonzero(inliers))
             if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
                 found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
@@ -184,7 +191,7 @@ class KeyframeDatabase:
         for match in found:
             if not any(
                 match.keyframe.submap == other.keyframe.submap
-                and agree(match.T_world_camera, other.T_world_camera, *SAME_PLACE)
+                and agree(match.T_world_camera, other.T_world_camera, DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG)
                 for other in distinct
             ):
                 distinct.append(match)
@@ -217,7 +224,7 @@ class KeyframeDatabase:
     def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
         """Largest believable error (n,) of the position of a feature, metres."""
         z = points[:, 2]
-        return SLACK * z + 2 * self.sensor.sigma(z)
+        return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
@@ -226,36 +233,14 @@ def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterab
     The score of a keyframe sums, over the frame's features, how far its best cosine similarity exceeds the median of
     all keyframes: features that many places share do not count.
     """
-    if len(among) <= LOOKED_AT:
+    if len(among) <= MAX_MATCHED:
         return among
-    parts = [keyframe.features.descriptors[:COMPARED] for keyframe in among]
+    parts = [keyframe.features.descriptors[:COARSE_FEATURES] for keyframe in among]
     starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
     similarity = np.concatenate(parts) @ features.descriptors.T
     best = np.maximum.reduceat(similarity, starts, axis=0)  # per keyframe and feature of the frame
     distinctive = np.clip(best - np.median(best, axis=0), 0, None)
-    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:LOOKED_AT]]
-
-
-def matches(a: NDArray[np.float32], b: NDArray[np.float32], ratio: float) -> NDArray[np.int64]:
-    """Pairs (m, 2) of rows of ``a`` and ``b`` that are each other's nearest, clearly nearer than the second in ``b``.
-
-    Args:
-        a: (n, d) unit vectors.
-        b: (k, d) unit vectors.
-        ratio: Largest quotient of the nearest and the second nearest distance (Lowe 2004).
-    """
-    if len(a) == 0 or len(b) < 2:
-        return np.empty((0, 2), dtype=np.int64)
-    cosine = a @ b.T
-    nearest = np.argmax(cosine, axis=1)
-    rows = np.arange(len(a))
-    first = cosine[rows, nearest]
-    mutual = np.argmax(cosine, axis=0)[nearest] == rows
-    cosine[rows, nearest] = -1
-    second = cosine.max(axis=1)
-    distinct = 2 - 2 * first < ratio**2 * (2 - 2 * second)
-    chosen = np.flatnonzero(mutual & distinct)
-    return np.stack([chosen, nearest[chosen]], axis=1)
+    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:MAX_MATCHED]]
 
 
 def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:

@@ -1,4 +1,4 @@
-"""Pose graph: poses that agree best with measured motions between them (Lu and Milios 1997; Grisetti et al. 2010)."""
+"""Pose graph optimization (Lu and Milios 1997; Grisetti et al. 2010)."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -8,18 +8,18 @@ from numpy.typing import NDArray
 
 from dudmap.geometry import se3
 
-ITERATIONS = 20
-STOP = 1e-9
-"""The optimisation ends when no pose moves by more than this, metres and radians."""
+MAX_ITERATIONS = 20
+MAX_STEP = 1e-9
+"""The optimization has converged when no pose moves by more than this, metres and radians."""
 
 
 @dataclass(frozen=True, eq=False)
 class Edge:
-    """A measured motion between two poses.
+    """Measured motion between two poses.
 
     Attributes:
-        a, b: Numbers of the poses.
-        T_a_b: (4, 4).
+        a, b: Indices of the poses.
+        T_a_b: (4, 4) measured motion.
         sigma_distance: Standard deviation of its translation, metres, per axis.
         sigma_angle: Standard deviation of its rotation, radians, per axis.
     """
@@ -32,18 +32,18 @@ class Edge:
 
 
 def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np.float64]:
-    """Poses with the least sum of ``|log(T_a_b^-1 T_a^-1 T_b)|^2``, weighted by the variances; the first stays.
+    """Minimize the sum over all edges of ``|e|^2`` with ``e = log(T_a_b^-1 T_a^-1 T_b)``, weighted by the variances.
 
-    Gauss-Newton on SE(3) with updates ``T exp(xi)``; the normal equations are sparse and solved by SciPy (SuperLU).
-    The residual's derivative by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the series of the inverse right
-    Jacobian, and by ``xi_a`` that times ``-Ad(T_b^-1 T_a)``.
+    Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. The sparse normal equations
+    are solved by SciPy (SuperLU). The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
+    series of the inverse right Jacobian; the derivative by ``xi_a`` is that times ``-Ad(T_b^-1 T_a)``.
 
     Args:
-        Ts_world: (N, 4, 4) first guess.
-        edges: Must connect all poses.
+        Ts_world: (N, 4, 4) initial poses.
+        edges: Measured motions; they must connect all poses.
 
     Returns:
-        (N, 4, 4).
+        (N, 4, 4) optimized poses; not finite if the normal equations are singular.
     """
     from scipy.sparse import coo_matrix
     from scipy.sparse.linalg import spsolve
@@ -53,7 +53,7 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
     if n < 2 or not edges:
         return Ts
     blocks = np.arange(6)
-    for _ in range(ITERATIONS):
+    for _ in range(MAX_ITERATIONS):
         rows, columns, values = [], [], []
         b = np.zeros(6 * n)
         for edge in edges:
@@ -74,6 +74,6 @@ def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np
         for i in range(1, n):
             Ts[i] = Ts[i] @ se3.exp(steps[i])
             Ts[i, :3, :3] = se3.nearest_rotation(Ts[i, :3, :3])
-        if np.abs(steps).max() < STOP:
+        if np.abs(steps).max() < MAX_STEP:
             break
     return Ts

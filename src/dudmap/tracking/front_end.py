@@ -135,7 +135,7 @@ class FrontEnd:
         """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not
         be registered again."""
         changed = labels.dynamic if self.last_dynamic is None else labels.dynamic != self.last_dynamic
-        on_map = labels.sample.place == SURFACE
+        on_map = labels.sample.occupancy == SURFACE
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
 
     def _label(

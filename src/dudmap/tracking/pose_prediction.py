@@ -144,4 +144,4 @@ class PosePredictor:
 def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
     """Occupancy (h, w) that the map gives the points of an image: UNKNOWN, SURFACE or FREE."""
     volume.look_at(T_world_camera)
-    return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).place
+    return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).occupancy

@@ -9,13 +9,10 @@ from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels import registration
 from dudmap.kernels.median import median
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 
-PIXELS_PER_BAND = 4800
-"""What a thread is woken for; the coarsest level is one band."""
 SHORT = 4
 """Only steps shorter than this many times that end a level by how little they gain."""
 EXPOSURE_NOISE = 0.01
@@ -174,35 +171,22 @@ class Tracker:
     ) -> LinearSystem:
         """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose; the colour's weight from the
         configuration, unless another is given."""
-        camera, config, sensor = level.camera, self.config, self.sensor
+        config, sensor = self.config, self.sensor
         color_weight = config.color_weight if color_weight is None else color_weight
-        parameters = np.array(
-            [
-                volume.voxel_size, volume.sdf_unit, config.huber, config.tukey if config.robust == "tukey" else 0,
-                color_weight, config.color_huber, sensor.sigma_base, sensor.sigma_scale,
-                sensor.sigma_base + sensor.sigma_scale, config.noise_weighting, volume.truncation,
-                volume.config.truncation_noise,
-            ],
-            dtype=np.float32,
+        parameters = RegistrationParameters(
+            band=volume.band,
+            huber=config.huber,
+            tukey=config.tukey if config.robust == "tukey" else 0.0,
+            color_weight=color_weight,
+            color_huber=config.color_huber,
+            sigma_at_one_metre=sensor.sigma(1.0),
+            noise_weighting=float(config.noise_weighting),
+        )
+        equations = volume.backend.linearize(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
+            volume.window.T_grid_camera(T_world_camera), parameters,
         )  # fmt: skip
-        window, geometry = volume.window, volume.blocks.geometry.reshape(-1)
-        height, width = level.depth.shape
-        ranges = bands(height, -(-PIXELS_PER_BAND // width))
-        sums = np.zeros((len(ranges), registration.NUM_SUMS))
-        residuals = np.empty((2, *level.depth.shape), dtype=np.float32)
-        T = window.T_grid_camera(T_world_camera)
-        run_bands(
-            lambda start, stop, out: registration.linearize(
-                start, stop, level.depth, level.intensity, weights, camera.intrinsics, T, window.cells, window.shape,
-                geometry, parameters, residuals, out,
-            ),
-            ranges, list(sums),
-        )  # fmt: skip
-        total = sums.sum(axis=0)
-        return LinearSystem(
-            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
-            float(total[30]), float(total[31]), residuals,
-        )  # fmt: skip
+        return LinearSystem(*equations)
 
     def _judge(
         self,

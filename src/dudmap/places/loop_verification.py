@@ -1,0 +1,106 @@
+"""Geometric verification of recognised places: plausible drift, and registration against the map of that time."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.frames.observation import Level, Observation
+from dudmap.geometry import se3
+from dudmap.geometry.alignment import agree
+from dudmap.places.atlas import Atlas
+from dudmap.places.loop_correction import path_length
+from dudmap.places.place_recognition import PlaceMatch
+from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.tracker import Tracker, TrackingResult
+
+LOCAL_FRAMES = 8
+"""Stored frames, those nearest to the recognised pose, of which the local map of a place is built."""
+LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
+"""Largest distance (m) and angle (deg) of these frames from the recognised pose."""
+DRIFT_ALLOWANCE = 0.05
+"""Drift that is believed after any path, metres and radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopQuery:
+    """A tracked frame that may show a known place.
+
+    Attributes:
+        observation: The frame.
+        levels: Its image pyramid, coarse to fine.
+        static_weights: Per level (h, w), weights of the pixels in a registration; None = 1.
+        static_mask: (H, W) bool.
+        tracking: Its registration against the current map.
+    """
+
+    observation: Observation
+    levels: list[Level]
+    static_weights: list[NDArray[np.float32]] | None
+    static_mask: NDArray[np.bool_]
+    tracking: TrackingResult
+
+
+class LoopVerifier:
+    """Decides whether a frame shows a recognised place.
+
+    Args:
+        config: All parameters; used are ``loops`` and ``relocalization``.
+        atlas: Submaps, poses and stored frames; read only.
+        tracker: Registers frames.
+    """
+
+    def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
+        self.config = config
+        self.atlas = atlas
+        self.tracker = tracker
+
+    def is_plausible(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> bool:
+        """Whether the path since a place was last seen is long enough for the drift that the match implies.
+
+        Args:
+            place: Match in the current submap.
+            T_world_camera: (4, 4) tracked pose of the frame.
+        """
+        since = [
+            pose.T_world_camera
+            for pose in self.atlas.poses
+            if pose.submap == self.atlas.current and pose.timestamp >= place.keyframe.last_seen
+        ]
+        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path_length(since[::3])  # every third: less jitter
+        drift = se3.inverse(place.T_world_camera) @ T_world_camera
+        return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
+
+    def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
+        """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place.
+
+        Returns:
+            None unless features, distances and intensities agree.
+        """
+        history = self.atlas.history
+        assert history is not None
+        keyframe, limits = place.keyframe, self.config.relocalization
+        nodes = [
+            n
+            for n in self.atlas.nodes(keyframe.submap)
+            if history.timestamps[n] <= keyframe.last_seen
+            and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+        ]
+        T_camera_world = se3.inverse(place.T_world_camera)
+        distances = [np.linalg.norm((T_camera_world @ history.Ts_world_camera[n])[:3, 3]) for n in nodes]
+        nearest = sorted(nodes[i] for i in np.argsort(distances, kind="stable")[:LOCAL_FRAMES])
+        if not nearest:
+            return None
+        local = self.atlas.make_volume()
+        history.reintegrate(local, nearest)
+        exposure = query.tracking.exposure
+        found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
+        if (
+            found.converged
+            and not monitor.deviation(found, recognized=True)
+            and found.inlier_share >= limits.min_on_map
+            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
+        ):
+            return found.T_world_camera
+        return None
