@@ -6,7 +6,7 @@ wrap-around test, and with it the vectorisation (measured: a factor 4).
 
 import numpy as np
 
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import kernel, scalar
 
 ABSENT = np.float32(-1e9)
 """Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
@@ -57,8 +57,8 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
 
     A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
     is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least MIN_NEIGHBOURS
-    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus no depth edge is bridged (its sides differ by
-    more), and a large hole keeps its border (its runs are longer in both directions).
+    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus no depth edge is bridged (its sides differ
+    by more), and a large hole keeps its border (its runs are longer in both directions).
 
     Args:
         row_start, row_stop: Rows of the band.
@@ -89,7 +89,7 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
                 out[v, u] = total / np.float32(count)
 
 
-@kernel
+@scalar
 def range_weight(difference, inverse):
     """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1; ``inverse`` = 1 / (16 sigma_c^2).
 
