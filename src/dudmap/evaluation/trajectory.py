@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.geometry import se3
+from dudmap.geometry.alignment import umeyama
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.trajectory import Trajectory
 
@@ -219,24 +220,9 @@ def rpe(
     return RpeResult(*_statistics(errors), *_statistics(angles), len(i), delta, unit, stamps[i], errors, angles)
 
 
-def umeyama(points: Numbers, targets: Numbers) -> tuple[Numbers, Numbers]:
-    """Rigid motion (4, 4) that brings points (N, 3) closest to targets (N, 3), least squares (Umeyama 1991, eq. 34-42).
-
-    Also returns (3,) how far the two spread together along the principal directions, metres: the square roots of the
-    singular values of their cross-covariance. The rotation is determined only if the second is not zero.
-    """
-    center, target_center = points.mean(axis=0), targets.mean(axis=0)
-    covariance = (targets - target_center).T @ (points - center) / len(points)
-    U, singular, V_t = np.linalg.svd(covariance)
-    T = np.eye(4)
-    T[:3, :3] = U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
-    T[:3, 3] = target_center - T[:3, :3] @ center
-    return T, np.sqrt(singular)
-
-
 def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
-    T, spread = umeyama(positions, targets)
+    T, _, spread = umeyama(targets, positions)
     if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
         return T, "se3"
     rotations = Ts_reference[:, :3, :3] @ np.swapaxes(Ts_estimate[:, :3, :3], 1, 2)

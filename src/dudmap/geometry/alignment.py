@@ -1,66 +1,95 @@
 """Rigid alignment of point sets and comparison of poses."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.geometry import se3
 
-TRIPLES = 3000
-"""Triples of matches that are drawn; those whose sides have the same lengths in both frames become hypotheses."""
-HYPOTHESES = 400
-SHORTEST_SIDE = 0.1
-"""Triples with a shorter side than this define no pose, metres."""
+NUM_TRIPLES = 3000
+"""Random triples of matches; those with sides of equal lengths in both frames become hypotheses."""
+MAX_HYPOTHESES = 400
+"""Most hypotheses that are tested."""
+MIN_SIDE = 0.1
+"""Shortest side of a triple that determines a pose, metres."""
 
 
 def rigid_ransac(
     a: NDArray[np.float64], b: NDArray[np.float64], tolerance: NDArray[np.float64], seed: int = 1
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Rigid motion T_a_b that most pairs of points agree with, and which do; the same input gives the same answer.
+    """Rigid motion T_a_b with the most inliers among pairs of points (RANSAC); deterministic.
 
     Args:
-        a, b: (m, 3) the same points in two frames, metres.
-        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of a pair that agrees.
-        seed: Of the draws.
+        a, b: (m, 3) matched points in two frames, metres.
+        tolerance: (m,) largest distance between ``a`` and ``T_a_b b`` of an inlier, metres.
+        seed: Of the random triples.
 
     Returns:
-        T_a_b (4, 4) refined on all pairs that agree, and those pairs (m,) bool; none where nothing was found.
+        T_a_b (4, 4) refined on all inliers, and the inliers (m,) bool; none if no motion was found.
     """
-    nothing = np.eye(4), np.zeros(len(a), dtype=bool)
+    no_motion = np.eye(4), np.zeros(len(a), dtype=bool)
     if len(a) < 3:
-        return nothing
-    triples = np.random.default_rng(seed).integers(0, len(a), (TRIPLES, 3))
+        return no_motion
+    triples = np.random.default_rng(seed).integers(0, len(a), (NUM_TRIPLES, 3))
     sides = [(0, 1), (1, 2), (2, 0)]
     lengths = np.array(
         [[np.linalg.norm(p[triples[:, i]] - p[triples[:, j]], axis=1) for i, j in sides] for p in (a, b)]
     )
     slack = np.array([tolerance[triples[:, i]] + tolerance[triples[:, j]] for i, j in sides])
-    alike = np.all(np.abs(lengths[0] - lengths[1]) < slack, axis=0) & (lengths.min(axis=(0, 1)) > SHORTEST_SIDE)
-    triples = triples[alike][:HYPOTHESES]
+    congruent = np.all(np.abs(lengths[0] - lengths[1]) < slack, axis=0) & (lengths.min(axis=(0, 1)) > MIN_SIDE)
+    triples = triples[congruent][:MAX_HYPOTHESES]
     if len(triples) == 0:
-        return nothing
+        return no_motion
     Ts = kabsch(a[triples], b[triples])
     moved = np.einsum("hij,mj->hmi", Ts[:, :3, :3], b) + Ts[:, None, :3, 3]
-    agreeing = np.linalg.norm(moved - a, axis=-1) < tolerance
-    inliers = agreeing[int(np.argmax(agreeing.sum(axis=1)))]
+    consistent = np.linalg.norm(moved - a, axis=-1) < tolerance
+    inliers = consistent[int(np.argmax(consistent.sum(axis=1)))]
     T = np.eye(4)
     for _ in range(3):
         if np.count_nonzero(inliers) < 3:
-            return nothing
+            return no_motion
         T = kabsch(a[inliers], b[inliers])
         inliers = np.linalg.norm(b @ T[:3, :3].T + T[:3, 3] - a, axis=1) < tolerance
     return T, inliers
 
 
-def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
+class Alignment(NamedTuple):
+    """Similarity transform that aligns two point sets: ``a = scale R b + t``.
+
+    Attributes:
+        T_a_b: (..., 4, 4) rotation R and translation t, metres.
+        scale: (...,) 1 unless it was estimated.
+        spread: (..., 3) extent of the two sets together along the principal directions, metres: the square roots of the
+            singular values of their cross-covariance. The rotation is determined only if the second is not zero.
+    """
+
+    T_a_b: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+
+def umeyama(a: NDArray[np.float64], b: NDArray[np.float64], with_scale: bool = False) -> Alignment:
+    """Least-squares alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42)."""
     a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
-    U, _, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
-    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # no mirror images
+    U, singular, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
+    sign = np.linalg.det(U @ V_t)[..., None]  # -1 where the best orthogonal matrix is a reflection
+    U[..., :, 2] *= sign
+    scale = np.ones(a.shape[:-2])
+    if with_scale:
+        trace = singular[..., 0] + singular[..., 1] + sign[..., 0] * singular[..., 2]
+        scale = trace / ((b - b_mean) ** 2).sum(axis=(-2, -1))
     T = np.zeros((*a.shape[:-2], 4, 4))
     T[..., :3, :3] = U @ V_t
-    T[..., :3, 3] = (a_mean - b_mean @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
+    rotated = b_mean @ np.swapaxes(T[..., :3, :3], -1, -2)
+    T[..., :3, 3] = (a_mean - scale[..., None, None] * rotated)[..., 0, :]
     T[..., 3, 3] = 1
-    return T
+    return Alignment(T, scale, np.sqrt(singular / a.shape[-2]))
+
+
+def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
+    return umeyama(a, b).T_a_b
 
 
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:

@@ -8,6 +8,8 @@ from dudmap.errors import DatasetError
 from dudmap.geometry.camera import Camera
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+TUM_DEPTH_SCALE = 5000.0
+"""Units of the TUM RGB-D benchmark's depth images per metre: the default of a recording in its format."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
 
 
@@ -43,7 +45,7 @@ class Intrinsics:
             cy=self.values["cy"],
             width=width,
             height=height,
-            depth_scale=self.values.get("depth_scale", 5000.0),
+            depth_scale=self.values.get("depth_scale", TUM_DEPTH_SCALE),
             distortion=distortion if any(distortion) else (),
         )
 

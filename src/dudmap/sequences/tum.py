@@ -138,7 +138,7 @@ class TumSequence:
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
-                frame = self._read(int(index), known.values.get("depth_scale", 5000.0))
+                frame = self._read(int(index), known.values.get("depth_scale", intrinsics.TUM_DEPTH_SCALE))
             except FrameError as error:
                 problem = problem or str(error)
                 continue

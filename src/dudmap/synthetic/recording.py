@@ -26,7 +26,7 @@ from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, fin
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 
 NEAREST, FARTHEST = 0.3, 6.0  # metres; what counts as seen by an ideal sensor
-DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480)
+DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, height=480, depth_scale=5000)
 
 
 class MoverState(NamedTuple):
