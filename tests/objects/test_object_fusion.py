@@ -157,7 +157,7 @@ def test_off_by_default_and_without_influence():
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)
         np.testing.assert_array_equal(a.dynamic_mask, b.dynamic_mask)
         assert "bodies" not in a.timings
-    assert off.fusion is None
+    assert off.objects.fusion is None
     assert off.bodies == []
     assert len(on.bodies) > 0
     assert off.volume.num_blocks == on.volume.num_blocks
