@@ -1,4 +1,4 @@
-"""What one frame gave, and how long each stage took."""
+"""Result of processing one frame."""
 
 from dataclasses import dataclass, field
 from typing import Literal
@@ -13,26 +13,27 @@ from dudmap.tracking.tracker import TrackingResult
 
 @dataclass(frozen=True, eq=False)
 class FrameResult:
-    """What one frame gave.
+    """Result of processing one frame.
 
     Attributes:
-        timestamp: Seconds, of the depth image.
+        timestamp: Time of the depth image, seconds.
         state: "tracked" or "lost".
-        lost_reason: The check that failed, empty for a tracked frame.
-        T_world_camera: (4, 4), None if lost.
+        lost_reason: Sentence on the check that failed; empty for a tracked frame.
+        T_world_camera: Camera pose (4, 4); None if lost.
         fused: Whether the frame changed the map.
-        skipped_similar: Whether it was left out of the fusion as a redundant view.
-        blind: Whether its image showed nothing (black, say) and the distances alone gave the pose; it is not fused.
-        relocalized: Whether tracking was lost and the pose comes from a place that was recognised.
-        dynamic_mask: (H, W) bool, in the image as it was recorded.
-        dynamic_share: Share of the readings that lie in the mask.
-        residuals: (h, w) float32 signed distance to the map in metres at the label resolution, NaN off the map.
-        labels: The label step's full outcome, None where it did not run.
-        tracking: The registration's full outcome, None for the first frame.
+        skipped_similar: Whether the frame was not fused because it is a redundant view.
+        dynamic_mask: (H, W) bool, dynamic pixels in the image as it was recorded.
+        dynamic_share: Share of the depth readings that lie in the mask.
+        residuals: (h, w) float32 signed distances of the readings to the map, metres, at the resolution of the labels;
+            NaN off the map.
+        labels: Full result of the labelling; None where it did not run.
+        tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
-        movers: The moving bodies, by number; none in a lost frame.
-        submap: Number of the map that the pose belongs to, 0 the first.
-        corrected: Whether a known place was seen again here and all poses so far have moved.
+        relocalized: Whether the pose comes from a recognised place after tracking was lost.
+        movers: Moving objects, by id; none in a lost frame.
+        submap: Number of the submap that the pose belongs to, 0 the first.
+        corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
+        blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
     """
 
     timestamp: float

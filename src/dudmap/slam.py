@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dudmap.bootstrap import Bootstrap
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
-from dudmap.dynamics.masks import Labels, full_mask, grown_mask
+from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
@@ -36,7 +36,7 @@ from dudmap.tracking.front_end import FrontEnd
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import Tracker, TrackingResult
+from dudmap.tracking.tracker import Tracker
 
 
 class Slam:
@@ -201,25 +201,16 @@ class Slam:
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
         self.monitor.lose()
-        static_mask = None if view.known_dynamic is None else ~view.known_dynamic
-
-        def register(volume: TsdfVolume, T_init: NDArray[np.float64]) -> tuple[TrackingResult, Labels | None]:
-            estimate = self.front_end.register_from(volume, view, prediction, T_init)
-            return estimate.tracking, estimate.labels
-
         found = self.relocalizer.recover(
-            view.observation,
-            view.labelled,
-            register,
+            view,
+            lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
             lambda tracking: not self.monitor.deviation(tracking, recognized=True),
-            view.timer,
-            static_mask,
         )
         if found is None:
             return None
         self.atlas.current = found.submap
-        self.motion.restart(view.timestamp, found.tracking.T_world_camera)
-        return PoseEstimate(found.tracking, found.labels, prediction.unverified_mask)
+        self.motion.restart(view.timestamp, found.estimate.T_world_camera)
+        return found.estimate
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""

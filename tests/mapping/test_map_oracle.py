@@ -9,10 +9,12 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import hashing
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.parameters import SensorNoise
 from dudmap.kernels.visibility import SETTLED
-from dudmap.mapping.integrator import reading_weights
+from dudmap.mapping.integrator import FRONTAL_WEIGHT
 from dudmap.mapping.volume import FREE, TsdfVolume
-from dudmap.mapping.voxel_blocks import FULLEST
+from dudmap.mapping.voxel_blocks import MAX_LOAD
 from oracle import fuse, trilinear
 from wavy_wall import CAMERA, CONSTANT, wall
 
@@ -35,6 +37,11 @@ def voxels_of(volume: TsdfVolume) -> tuple[np.ndarray, np.ndarray, np.ndarray, n
 def intensity(volume: TsdfVolume) -> np.ndarray:
     """Intensities (n,) 0..255 of all voxels."""
     return volume.blocks.geometry[volume.active_slots].reshape(-1) & 255
+
+
+def reading_weights(depth, camera, sensor):
+    noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
+    return CpuBackend().reading_weights(depth, camera.intrinsics, noise, FRONTAL_WEIGHT)
 
 
 def allowed(volume: TsdfVolume) -> float:
@@ -69,7 +76,7 @@ def test_integrate_with_angle_weights_and_a_band_that_grows_with_the_noise():
     frames, Ts = [wall(distance, seed, bump=0.08) for seed, distance in enumerate((0.8, 0.85, 0.8))], poses(3)
     for frame, T in zip(frames, Ts, strict=True):
         volume.integrate(frame, T)
-    gains = [reading_weights(frame.depth, volume.camera, volume.config, volume.sensor) for frame in frames]
+    gains = [reading_weights(frame.depth, volume.camera, volume.sensor) for frame in frames]
     assert len(np.unique(gains)) >= 3
     sigma = lambda z: 3.0 * (0.001 + 0.06 * z**2)  # noqa: E731
     assert sigma(0.8) > 1.1 * volume.truncation
@@ -99,11 +106,11 @@ def test_weights_are_the_cosine_over_the_error(tilt_deg):
         depth = distance * np.cos(tilt) / (rays @ normal)
         cosine = (rays @ normal) / np.linalg.norm(rays, axis=-1)
         exact = np.clip(4 * cosine * 0.003 / (0.001 + 0.002 * depth**2), 1, 16)
-        found = reading_weights(depth.astype(np.float32), camera, VolumeConfig(), sensor)
+        found = reading_weights(depth.astype(np.float32), camera, sensor)
         assert np.abs(found - exact)[1:-1, 1:-1].max() <= 0.52  # rounded to whole numbers
     jump = np.where(u < 32, 0.5, 1.5).astype(np.float32)
     jump[10, 10] = 0
-    found = reading_weights(jump, camera, VolumeConfig(), sensor)
+    found = reading_weights(jump, camera, sensor)
     assert found[24, 31] == round(4 * 0.3 * 0.003 / 0.0015)  # at a depth edge the angle is not known: taken as slanted
     assert found[10, 10] == 0
 
@@ -399,7 +406,7 @@ def test_an_occupied_block_costs_little_more_than_its_voxels():
         known = 3 * blocks
         assert volume.num_blocks == blocks
         assert volume.blocks.num_entries == known
-        assert volume.blocks.num_entries <= FULLEST * len(volume.blocks.table)
+        assert volume.blocks.num_entries <= MAX_LOAD * len(volume.blocks.table)
         assert volume.num_bytes <= 4.2 * 1024 * blocks
 
 

@@ -12,6 +12,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.tracker import TrackingResult
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)
@@ -69,12 +70,16 @@ class Registration:
 
     def __call__(self, volume, T_init):
         self.calls.append((volume, T_init[0, 3]))
-        return replace(self.tracking, T_world_camera=shifted(self.moved) @ T_init), self.labels
+        return PoseEstimate(replace(self.tracking, T_world_camera=shifted(self.moved) @ T_init), self.labels)
 
 
 def recover(subject, register, accept=lambda tracking: True, static_mask=None):
     level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
-    return subject.recover(frame(5.0), level, register, accept, StageTimer(), static_mask)
+    known_dynamic = None if static_mask is None else ~static_mask
+    view = SimpleNamespace(
+        observation=frame(5.0), labelled=level, timer=StageTimer(), known_dynamic=known_dynamic
+    )  # what of a FrameView is used
+    return subject.recover(view, register, accept)
 
 
 def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
@@ -87,7 +92,7 @@ def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
 def test_the_first_verified_candidate_is_returned_with_its_submap():
     subject, register = relocalizer([match(1, 0.2), match(0, 0.1), match(0, 0.3)]), Registration(labels=None)
     result = recover(subject, register, accept=lambda tracking: tracking.T_world_camera[0, 3] < 0.15)
-    assert (result.submap, result.tracking.T_world_camera[0, 3], result.labels) == (0, 0.1, None)
+    assert (result.submap, result.estimate.T_world_camera[0, 3], result.estimate.labels) == (0, 0.1, None)
     assert len(register.calls) == 2
     assert subject.atlas.current == 1
 
@@ -110,9 +115,10 @@ def test_registration_must_confirm_the_features(register, passes):
 
 
 def test_the_static_mask_reaches_the_features():
-    subject, mask = relocalizer(), np.ones(CAMERA.shape, dtype=bool)
+    subject, mask = relocalizer(), np.arange(CAMERA.width) < np.full((CAMERA.height, 1), 20)
     assert recover(subject, Registration(), static_mask=mask) is None
-    assert subject.atlas.keyframes.masks == [mask]
+    assert len(subject.atlas.keyframes.masks) == 1
+    assert np.array_equal(subject.atlas.keyframes.masks[0], mask)
 
 
 def test_switched_off():

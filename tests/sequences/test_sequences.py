@@ -73,7 +73,7 @@ def test_depth_scale_and_size_of_the_file_are_used(tmp_path):
 )
 def test_other_forms_of_intrinsics(tmp_path, text):
     sequence = open_sequence(write_recording(tmp_path / "a", 1, intrinsics=text))
-    assert sequence.camera == Camera(60, 61, 31.5, 23.5, WIDTH, HEIGHT)
+    assert sequence.camera == Camera(60, 61, 31.5, 23.5, WIDTH, HEIGHT, 5000.0)
 
 
 def test_known_cameras_by_folder_name(tmp_path):
@@ -91,7 +91,7 @@ def test_a_known_camera_does_not_fit_images_of_another_size(tmp_path):
 
 
 def test_camera_argument_wins(recording):
-    assert open_sequence(recording, "70,71,30,20").camera == Camera(70, 71, 30, 20, WIDTH, HEIGHT)
+    assert open_sequence(recording, "70,71,30,20").camera == Camera(70, 71, 30, 20, WIDTH, HEIGHT, 5000.0)
     assert open_sequence(recording, "70,71,30,20,64,48,1000").camera.depth_scale == 1000
     camera = Camera(70, 71, 30, 20, WIDTH, HEIGHT, 2000.0, (0.1, 0.2, 0.0, 0.0, 0.3))
     assert open_sequence(recording, camera).camera == camera

@@ -326,7 +326,7 @@ def test_folder_opens_again_as_the_same_recording(tmp_path):
         a, b = recording[k], opened[k]
         assert a.timestamp == b.timestamp
         assert np.array_equal(a.color, b.color)
-        assert np.abs(a.depth - b.depth).max() < 0.5 / 5000 + 1e-6
+        assert np.abs(a.depth - b.depth).max() < 0.5 / SMALL.depth_scale + 1e-6
         assert np.array_equal(recording.mask(k), opened.mask(k))
     assert np.allclose(opened.ground_truth.Ts_world_camera, recording.ground_truth.Ts_world_camera, atol=1e-8)
     lines = [json.loads(line) for line in (tmp_path / "made" / "movers.jsonl").read_text().splitlines()]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.geometry import se3
-from dudmap.geometry.alignment import kabsch
+from dudmap.geometry.alignment import umeyama
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.trajectory import Trajectory
 
@@ -299,9 +299,7 @@ def _align(Ts_estimate: Numbers, Ts_reference: Numbers) -> tuple[Numbers, str]:
     their common principal directions, metres. The rotation is determined only if the second one is not zero.
     """
     positions, targets = Ts_estimate[:, :3, 3], Ts_reference[:, :3, 3]
-    T = kabsch(targets, positions)
-    covariance = (targets - targets.mean(axis=0)).T @ (positions - positions.mean(axis=0)) / len(positions)
-    spread = np.sqrt(np.linalg.svd(covariance, compute_uv=False))
+    T, _, spread = umeyama(targets, positions)
     if spread[1] > SMALLEST_SPREAD * max(1.0, spread[0]):
         return T, "se3"
     rotations = Ts_reference[:, :3, :3] @ np.swapaxes(Ts_estimate[:, :3, :3], 1, 2)

@@ -8,7 +8,7 @@ from dudmap.kernels.median import median
 
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
-    """Colours (H, W, 3) with the gain and offset that make them those of the map."""
+    """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
     import cv2
 
     gain, offset = exposure
@@ -28,16 +28,16 @@ def exposed(level: Level, exposure: tuple[float, float]) -> Level:
 
 
 def chained(first: tuple[float, float], then: tuple[float, float]) -> tuple[float, float]:
-    """Gain and offset of one exposure after another."""
+    """Gain and offset of two exposures applied one after the other."""
     return then[0] * first[0], then[0] * first[1] + then[1]
 
 
 def fit_exposure(
     intensity: NDArray[np.float32], difference: NDArray[np.float32], weights: NDArray[np.float32]
 ) -> tuple[float, float]:
-    """Gain and offset with ``gain * intensity + offset`` nearest to the map's intensities, robustly.
+    """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
 
-    Auto-exposure changes all intensities at once; unexplained, such a change looks like motion.
+    Auto-exposure changes all intensities at once; without this model such a change would look like motion.
 
     Args:
         intensity: (h, w) float32 of the image.
@@ -47,7 +47,7 @@ def fit_exposure(
     used = np.flatnonzero(np.isfinite(difference) & (weights > 0.5))
     if len(used) < 100:
         return 1.0, 0.0
-    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels tell two numbers
+    used = used[:: max(1, len(used) // 1000)]  # a thousand pixels determine two numbers well
     x = intensity.reshape(-1)[used].astype(np.float64)
     y = x + difference.reshape(-1)[used]
     gain, offset = 1.0, float(median(y - x))
@@ -56,7 +56,7 @@ def fit_exposure(
         scale = max(1.5 * float(median(np.abs(error))), 0.01)
         w = 1 / (1 + (error / scale) ** 2)
         total = w.sum()
-        # the gain is tied to 1 as if a tenth of the pixels had seen it with a contrast of 0.2
+        # prior of the gain at 1: worth a tenth of the pixels at a contrast of 0.2
         prior = 0.1 * total * 0.04
         x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
         variance = (w * (x - x_mean) ** 2).sum() + prior

@@ -1,6 +1,7 @@
 """Rigid alignment of point sets (Kabsch 1976, Umeyama 1991; RANSAC: Fischler and Bolles 1981), comparison of poses."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -62,16 +63,42 @@ def rigid_ransac(
     return T, inliers
 
 
-def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
+class Alignment(NamedTuple):
+    """Similarity transform that aligns two point sets: ``a = scale R b + t``.
+
+    Attributes:
+        T_a_b: (..., 4, 4) rotation R and translation t, metres.
+        scale: (...,) 1 unless it was estimated.
+        spread: (..., 3) extent of the two sets together along the principal directions, metres: the square roots of the
+            singular values of their cross-covariance. The rotation is determined only if the second is not zero.
+    """
+
+    T_a_b: NDArray[np.float64]
+    scale: NDArray[np.float64]
+    spread: NDArray[np.float64]
+
+
+def umeyama(a: NDArray[np.float64], b: NDArray[np.float64], with_scale: bool = False) -> Alignment:
+    """Least-squares alignment of points ``b`` to ``a``, both (..., n, 3) (Umeyama 1991, eq. 34-42)."""
     a_mean, b_mean = a.mean(axis=-2, keepdims=True), b.mean(axis=-2, keepdims=True)
-    U, _, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
-    U[..., :, 2] *= np.linalg.det(U @ V_t)[..., None]  # a rotation, not a reflection
+    U, singular, V_t = np.linalg.svd(np.swapaxes(a - a_mean, -1, -2) @ (b - b_mean))
+    sign = np.linalg.det(U @ V_t)[..., None]  # -1 where the best orthogonal matrix is a reflection
+    U[..., :, 2] *= sign
+    scale = np.ones(a.shape[:-2])
+    if with_scale:
+        trace = singular[..., 0] + singular[..., 1] + sign[..., 0] * singular[..., 2]
+        scale = trace / ((b - b_mean) ** 2).sum(axis=(-2, -1))
     T = np.zeros((*a.shape[:-2], 4, 4))
     T[..., :3, :3] = U @ V_t
-    T[..., :3, 3] = (a_mean - b_mean @ np.swapaxes(T[..., :3, :3], -1, -2))[..., 0, :]
+    rotated = b_mean @ np.swapaxes(T[..., :3, :3], -1, -2)
+    T[..., :3, 3] = (a_mean - scale[..., None, None] * rotated)[..., 0, :]
     T[..., 3, 3] = 1
-    return T
+    return Alignment(T, scale, np.sqrt(singular / a.shape[-2]))
+
+
+def kabsch(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rigid motions (..., 4, 4) with the least squared distance between ``a`` and ``T b``, both (..., n, 3)."""
+    return umeyama(a, b).T_a_b
 
 
 def agree(T_a: NDArray[np.float64], T_b: NDArray[np.float64], distance: float, angle_deg: float) -> bool:

@@ -1,4 +1,4 @@
-"""Lists of timed files, and which of them belong together."""
+"""Lists of timed files and their association by time."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 
 LARGEST_GAP = 0.02
-"""Colour and depth further apart than this do not belong together, seconds (as in the TUM benchmark's script)."""
+"""Largest time difference of an associated pair, seconds (that of the TUM benchmark's script)."""
 
 
 class TimedFile(NamedTuple):
@@ -61,7 +61,7 @@ def read_list(path: Path) -> list[TimedFile]:
 def read_pairs(path: Path) -> list[tuple[TimedFile, TimedFile]]:
     """(colour, depth) files of an associations list ``t_rgb rgb_file t_depth depth_file``.
 
-    Some tools write depth first; the order is taken from the folder names.
+    Some tools write depth first; the folder names decide.
 
     Raises:
         DatasetError: The list is unreadable, or its depth times are not finite and strictly increasing.
@@ -81,7 +81,7 @@ def parse_stamp(path: Path, number: int, text: str) -> float:
     """A finite time in seconds.
 
     Raises:
-        DatasetError: It is no number, NaN or infinite.
+        DatasetError: The text is no number, NaN or infinite.
     """
     try:
         stamp = float(text)
@@ -93,10 +93,10 @@ def parse_stamp(path: Path, number: int, text: str) -> float:
 
 
 def check_increasing(path: Path, numbers: list[int], stamps: list[float]) -> None:
-    """Times must increase from line to line.
+    """Check that times increase from line to line.
 
     Raises:
-        DatasetError: They do not; the first offending line is named.
+        DatasetError: They do not; the message names the first offending line.
     """
     wrong = np.flatnonzero(np.diff(stamps) <= 0)
     if len(wrong):
@@ -110,12 +110,12 @@ def check_increasing(path: Path, numbers: list[int], stamps: list[float]) -> Non
 def associate(
     first: NDArray[np.float64], second: NDArray[np.float64], largest_gap: float = LARGEST_GAP
 ) -> list[tuple[int, int]]:
-    """One-to-one pairs of nearest times: the closest pair first, then the closest of what is left, and so on.
+    """One-to-one pairs of nearest times, chosen greedily by increasing time difference.
 
     Args:
         first: (N,) increasing times, seconds.
         second: (M,) increasing times, seconds.
-        largest_gap: Pairs further apart than this are none, seconds.
+        largest_gap: Largest time difference of a pair, seconds.
 
     Returns:
         Index pairs (into first, into second), in the order of ``second``.

@@ -19,7 +19,7 @@ class Camera:
         fx, fy: Focal lengths in pixels.
         cx, cy: Principal point in pixels.
         width, height: Image size in pixels.
-        depth_scale: Units of the depth image per metre (5000 for TUM files, 1000 for millimetres).
+        depth_scale: Units of 16-bit depth images per metre; 1000 = millimetres, the unit of most sensors.
         distortion: Coefficients k1, k2, p1, p2[, k3] of the Brown-Conrady model (thesis eq. 3.88), empty for none.
     """
 
@@ -29,7 +29,7 @@ class Camera:
     cy: float
     width: int
     height: int
-    depth_scale: float = 5000.0
+    depth_scale: float = 1000.0
     distortion: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
@@ -53,16 +53,16 @@ class Camera:
 
     @property
     def intrinsics(self) -> NDArray[np.float32]:
-        """(fx, fy, cx, cy) in pixels, as kernels take them."""
+        """(4,) float32 fx, fy, cx, cy in pixels, the form that kernels use."""
         return np.array([self.fx, self.fy, self.cx, self.cy], dtype=np.float32)
 
     @property
     def shape(self) -> tuple[int, int]:
-        """Image shape (height, width) as NumPy has it."""
+        """Shape (height, width) of an image array."""
         return self.height, self.width
 
     def scaled(self, level: int) -> "Camera":
-        """Camera of the image after ``level`` halvings by 2x2 blocks (a pixel's centre is its blocks' centre)."""
+        """Camera of the image after ``level`` halvings by 2x2 blocks; a pixel lies at the centre of its block."""
         factor = 1.0 / (1 << level)
         return replace(
             self,
@@ -88,7 +88,7 @@ class Camera:
         )
 
     def backproject(self, depth: NDArray[np.floating]) -> NDArray[np.float32]:
-        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); no reading gives the origin."""
+        """Points (H, W, 3) in metres, camera frame, of a depth image (H, W); the origin where there is no reading."""
         u = (np.arange(depth.shape[1], dtype=np.float32) - np.float32(self.cx)) / np.float32(self.fx)
         v = (np.arange(depth.shape[0], dtype=np.float32) - np.float32(self.cy)) / np.float32(self.fy)
         z = depth.astype(np.float32)

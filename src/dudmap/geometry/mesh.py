@@ -49,7 +49,7 @@ class Mesh:
         except OSError as error:
             raise MapError(f"cannot write the mesh to {path}: {error}") from error
 
-    def _as_trimesh(self):  # noqa: ANN202 - trimesh is imported late: it costs 0.6 s
+    def _as_trimesh(self):  # noqa: ANN202 - trimesh is imported here: the import takes 0.6 s
         import trimesh
 
         return trimesh.Trimesh(

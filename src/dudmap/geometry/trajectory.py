@@ -1,4 +1,4 @@
-"""Timed camera poses and their text form."""
+"""Timed camera poses and their text format."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -13,7 +13,7 @@ from dudmap.geometry import se3
 
 @dataclass(frozen=True, eq=False)
 class Trajectory:
-    """Camera poses in time.
+    """Camera poses over time.
 
     Attributes:
         timestamps: (N,) float64, seconds, strictly increasing.

@@ -193,7 +193,7 @@ class Backend(Protocol):
         geometry: NDArray[np.int32],
         colors: NDArray[np.int32],
         slots: NDArray[np.int32],
-        coords: NDArray[np.int16],
+        coords: NDArray[np.integer],
         neighbours: NDArray[np.int32],
         parameters: MeshParameters,
     ) -> MeshArrays:
@@ -216,10 +216,10 @@ class Backend(Protocol):
         geometry: NDArray[np.int32],
         colors: NDArray[np.int32],
         slots: NDArray[np.int32],
-        coords: NDArray[np.int16],
+        coords: NDArray[np.integer],
         neighbours: NDArray[np.int32],
         parameters: MeshParameters,
-        chunks: NDArray[np.int64],
+        chunks: NDArray[np.integer],
     ) -> list[MeshArrays]:
         """Meshes of groups of blocks that share no vertices, so that each can be replaced when its blocks change.
 

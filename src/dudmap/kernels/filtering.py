@@ -6,7 +6,7 @@ wrap-around test, and with it the vectorisation (measured: a factor 4).
 
 import numpy as np
 
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import kernel, scalar
 
 ABSENT = np.float32(-1e9)
 """Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
@@ -89,7 +89,7 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
                 out[v, u] = total / np.float32(count)
 
 
-@kernel
+@scalar
 def range_weight(difference, inverse):
     """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1; ``inverse`` = 1 / (16 sigma_c^2).
 

@@ -1,7 +1,7 @@
 """Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
 
 Open addressing with linear probing over a table of any size; a cell holds an entry's number or -1. Entries are
-never removed: a block that becomes free space keeps its entry and gives back its voxels.
+never removed: a block that becomes free space keeps its entry and releases its voxels.
 """
 
 import numpy as np
@@ -9,6 +9,7 @@ import numpy as np
 from dudmap.kernels.threads import kernel
 
 EMPTY = -1
+"""Content of a free cell of the table."""
 
 
 @kernel

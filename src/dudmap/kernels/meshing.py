@@ -319,7 +319,7 @@ def extract(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
-    coords: NDArray[np.int16],
+    coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
 ) -> MeshArrays:
@@ -334,10 +334,10 @@ def extract_chunks(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
-    coords: NDArray[np.int16],
+    coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
-    chunks: NDArray[np.int64],
+    chunks: NDArray[np.integer],
 ) -> list[MeshArrays]:
     """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
     num_chunks = int(chunks.max(initial=-1)) + 1
@@ -364,7 +364,7 @@ def _surface(
     geometry: NDArray[np.int32],
     colors: NDArray[np.int32],
     slots: NDArray[np.int32],
-    coords: NDArray[np.int16],
+    coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     num_meshed: int,

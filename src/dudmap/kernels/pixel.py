@@ -6,12 +6,12 @@ A rigid motion (3, 4) is passed as its twelve elements, row by row (``elements``
 
 import numpy as np
 
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import scalar
 
 f32 = np.float32
 
 
-@kernel
+@scalar
 def elements(T):
     """Elements of a motion (3, 4), row by row, as a tuple: held in registers, they need no loads in inner loops."""
     return (
@@ -21,13 +21,13 @@ def elements(T):
     )  # fmt: skip
 
 
-@kernel
+@scalar
 def rotate(t, x, y, z):
     """Linear part of a motion, applied to a vector."""
     return t[0] * x + t[1] * y + t[2] * z, t[4] * x + t[5] * y + t[6] * z, t[8] * x + t[9] * y + t[10] * z
 
 
-@kernel
+@scalar
 def transform(t, x, y, z):
     """Motion, applied to a point."""
     return (
@@ -37,31 +37,31 @@ def transform(t, x, y, z):
     )
 
 
-@kernel
+@scalar
 def ray(u, c, f):
     """Coordinate, at depth 1, of the ray through pixel coordinate ``u``; principal point ``c``, focal length ``f``."""
     return (f32(u) - c) / f
 
 
-@kernel
+@scalar
 def project(x, by_z, f, c):
     """Pixel coordinate of a point with coordinate ``x`` and reciprocal depth ``by_z`` (thesis eq. 4.4)."""
     return x * by_z * f + c
 
 
-@kernel
+@scalar
 def sigma(z, noise):
     """Standard deviation of a reading at depth ``z``, metres (thesis eq. 3.91)."""
     return noise.base + noise.scale * z * z
 
 
-@kernel
+@scalar
 def band_front(z, band):
     """Width of the truncation band in front of a reading at depth ``z``, metres: at least ``band.sigmas`` sigma(z)."""
     return max(band.front, band.sigmas * sigma(z, band.noise))
 
 
-@kernel
+@scalar
 def band_behind(z, band):
     """Width of the truncation band behind a reading at depth ``z``, metres."""
     return max(band.behind, band.sigmas * sigma(z, band.noise))

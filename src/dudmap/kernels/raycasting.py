@@ -11,7 +11,7 @@ from dudmap.kernels.neighbors import load_corners
 from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.kernels.pixel import project, ray
 from dudmap.kernels.residual import trilinear
-from dudmap.kernels.threads import bands, kernel, run_bands
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar
 from dudmap.kernels.voxel import sdf_steps
 
 TILE = 8
@@ -76,7 +76,7 @@ def _splat(start, stop, window, T, intrinsics, size, radius, depth_min, depth_ma
                         far[row, column] = max(far[row, column], z + radius)
 
 
-@kernel
+@scalar
 def step_length(distance):
     """Step along a ray, voxels, at a signed distance (voxels): a little less than the distance, since a projective
     distance is an upper bound, but never so short that the tracing stalls."""

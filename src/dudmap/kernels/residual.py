@@ -2,12 +2,12 @@
 
 import numpy as np
 
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import scalar
 
 f32 = np.float32
 
 
-@kernel
+@scalar
 def trilinear(v0, v1, v2, v3, v4, v5, v6, v7, ax, ay, az):
     """Trilinear interpolation of eight corner values, corner 4 dx + 2 dy + dz, at (ax, ay, az) in [0, 1]^3.
 
@@ -23,26 +23,26 @@ def trilinear(v0, v1, v2, v3, v4, v5, v6, v7, ax, ay, az):
     return low + (high - low) * ax, high - low, along_y, d_low + (d_high - d_low) * ax
 
 
-@kernel
+@scalar
 def huber_weight(a, k):
     """Huber weight of an absolute residual (thesis eq. 4.44)."""
     return k / max(a, k)
 
 
-@kernel
+@scalar
 def huber_cost(a, k):
     """Huber cost of an absolute residual."""
     return min(a, k) * (a - f32(0.5) * min(a, k))
 
 
-@kernel
+@scalar
 def tukey_inlier(a, by_k):
     """1 - (a / k)^2 of Tukey's biweight, 0 beyond k (thesis eq. 4.45): its square is the weight."""
     capped = min(a * by_k, f32(1))
     return f32(1) - capped * capped
 
 
-@kernel
+@scalar
 def tukey_cost(inlier, limit):
     """Tukey cost of ``tukey_inlier``; ``limit`` = k^2 / 6 is that of an outlier."""
     return limit * (f32(1) - inlier * inlier * inlier)

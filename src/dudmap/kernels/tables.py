@@ -3,11 +3,11 @@
 Corner ``4 dx + 2 dy + dz`` of a cell lies at offset (dx, dy, dz); bit k of a case is set where corner k is inside
 (sdf < 0). An edge is a pair (corner, axis) of its lower end and its direction.
 
-On each face of the cell the surface runs along one or two segments between crossed edges. They follow from the four
-signs of that face alone - where the face is ambiguous, each inside corner is cut off by itself - so that two cells
-always agree on the face between them, and the mesh has no cracks. The segments form closed loops, which are cut
-into triangles without a diagonal that lies in a face (such a diagonal could meet a neighbour's and give an edge four
-triangles).
+On each face of the cell the surface consists of one or two segments between crossed edges. They depend on the four
+signs of that face alone (on an ambiguous face each inside corner is separated by its own segment), so that two cells
+agree on the face between them, and the mesh has no cracks. The segments form closed loops, which are triangulated
+without a diagonal that lies in a face: such a diagonal could coincide with a neighbour's and give an edge four
+triangles.
 """
 
 import itertools
@@ -22,7 +22,7 @@ EDGES = tuple((corner, axis) for axis in range(3) for corner in range(8) if CORN
 
 
 def _edge_between(a: int, b: int) -> int:
-    """Number of the edge that joins two corners."""
+    """Number of the edge between two corners."""
     axis = next(n for n in range(3) if CORNERS[a][n] != CORNERS[b][n])
     return EDGES.index((min(a, b), axis))
 
@@ -52,10 +52,10 @@ EDGE_FACES = tuple(
 
 
 def _segments(case: int) -> dict[int, int]:
-    """From crossed edge to crossed edge, over all faces, with the inside on the right seen from outside the cell.
+    """Segments of all faces, from crossed edge to crossed edge; the inside is on the right, seen from outside the cell.
 
-    Walking a face's border counter-clockwise, a segment starts where the walk enters the inside and ends where it
-    leaves it again: so it cuts off one run of inside corners.
+    Along the border of a face, counter-clockwise, a segment starts at the edge that enters the inside and ends at the
+    edge that leaves it: it separates one run of inside corners.
     """
     out = {}
     for face in FACES:
@@ -86,7 +86,7 @@ def _loops(case: int) -> list[list[int]]:
 
 @cache
 def _triangulations(n: int) -> list[list[tuple[int, int, int]]]:
-    """All ways to cut a polygon of n corners into triangles."""
+    """All triangulations of a polygon of n corners."""
 
     def cut(i: int, j: int) -> list[list[tuple[int, int, int]]]:
         if j - i < 2:
@@ -97,7 +97,7 @@ def _triangulations(n: int) -> list[list[tuple[int, int, int]]]:
 
 
 def _cut(loop: list[int]) -> list[tuple[int, int, int]]:
-    """Triangles of a loop; of all ways the one with the fewest diagonals within a face."""
+    """Triangulation of a loop with the fewest diagonals within a face."""
     n = len(loop)
 
     def in_faces(triangles: list[tuple[int, int, int]]) -> int:
@@ -125,4 +125,4 @@ def _table() -> tuple[NDArray[np.uint8], NDArray[np.uint8]]:
 
 
 TRIANGLES, TRIANGLE_COUNT = _table()
-"""(256, 15, 2) uint8: per case up to five triangles of three edges (lower corner, axis); (256,) uint8: how many."""
+"""(256, 15, 2) uint8: per case up to five triangles of three edges (lower corner, axis); (256,) uint8: their number."""

@@ -13,7 +13,15 @@ from typing import Any, TypeVar
 from numba import njit
 
 # The part of fast-math that keeps NaN tests: no "nnan", no "ninf".
-kernel = njit(nogil=True, cache=True, fastmath={"nsz", "arcp", "contract", "afn", "reassoc"}, error_model="numpy")
+_OPTIONS: dict[str, Any] = {
+    "nogil": True,
+    "cache": True,
+    "fastmath": {"nsz", "arcp", "contract", "afn", "reassoc"},
+    "error_model": "numpy",
+}
+kernel = njit(**_OPTIONS)
+scalar = njit(**_OPTIONS, forceinline=True)
+"""Compiles scalar mathematics: always inlined, since a call ends the vectorisation of the loop around it."""
 
 Result = TypeVar("Result")
 

@@ -8,7 +8,7 @@ pixel certainly sees free space, both uint16 in steps of ``depth_unit``; red << 
 import numpy as np
 
 from dudmap.kernels.pixel import band_behind, band_front
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import scalar
 from dudmap.kernels.words import bits, upper_half
 
 f32, i32, floor = np.float32, np.int32, np.floor
@@ -18,58 +18,58 @@ YOUNG = f32(8)
 """Weight below which a voxel takes a colour also from a reading away from the surface."""
 
 
-@kernel
+@scalar
 def sdf_steps(word):
     """Signed distance of a voxel in steps of ``sdf_unit``, float32."""
     return upper_half(word)
 
 
-@kernel
+@scalar
 def weight_of(word):
     """Weight of a voxel, float32; 0 = never observed."""
     return bits(word, 8, 0xFF)
 
 
-@kernel
+@scalar
 def intensity_of(word):
     """Intensity of a voxel, 0..255, float32."""
     return bits(word, 0, 0xFF)
 
 
-@kernel
+@scalar
 def pack_voxel(steps, weight, intensity):
     """Geometry word of a voxel; distance and intensity are rounded to the nearest step, the weight is cut."""
     half = f32(0.5)
     return (i32(floor(steps + half)) << i32(16)) | (i32(weight) << i32(8)) | i32(intensity + half)
 
 
-@kernel
+@scalar
 def pack_color(red, green, blue):
     """Colour word of a voxel of channels in quarters of a grey level, rounded."""
     half = f32(0.5)
     return (i32(red + half) << i32(20)) | (i32(green + half) << i32(10)) | i32(blue + half)
 
 
-@kernel
+@scalar
 def pack_reading(depth, free_depth, by_unit):
     """First word of a pixel: a reading, and the depth up to which it sees free space, in steps of 1 / ``by_unit``."""
     return (i32(depth * by_unit + f32(0.5)) << i32(16)) | i32(free_depth * by_unit)
 
 
-@kernel
+@scalar
 def pack_pixel_color(red, green, blue, weight):
     """Second word of a pixel."""
     return (i32(red) << 24) | (i32(green) << 16) | (i32(blue) << 8) | i32(weight)
 
 
-@kernel
+@scalar
 def luma(color):
     """Intensity of a pixel's second word, 0..255 (ITU-R BT.601)."""
     value = f32(0.299) * bits(color, 24, 0xFF) + f32(0.587) * bits(color, 16, 0xFF)
     return value + f32(0.114) * bits(color, 8, 0xFF)
 
 
-@kernel
+@scalar
 def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     """Fuse the reading of the pixel that a voxel projects to.
 
@@ -112,13 +112,13 @@ def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     return i32(fused) if gain > zero else word, color_share
 
 
-@kernel
+@scalar
 def is_occupied(word, p):
     """Whether a voxel holds a surface or was never observed."""
     return (weight_of(word) == f32(0)) | (sdf_steps(word) * p.sdf_unit < p.band.front * SURFACE_SHARE)
 
 
-@kernel
+@scalar
 def fuse_color(old, color, share):
     """Colour word of a voxel that takes on a pixel's colour in the share that ``fuse_voxel`` returned; 0 = no colour
     yet, which takes all of it."""

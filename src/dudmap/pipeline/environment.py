@@ -13,9 +13,17 @@ from dudmap import __version__
 
 
 def peak_rss_mb() -> float | None:
-    """Peak resident memory of this process so far, MB; None on Windows."""
+    """Peak resident memory of this process so far, MB; None on Windows.
+
+    On Linux ``VmHWM`` is read: ``ru_maxrss`` also counts the memory of the process that started this one.
+    """
     if sys.platform == "win32":
         return None
+    status = Path("/proc/self/status")
+    if status.is_file():
+        for line in status.read_text(encoding="utf-8").splitlines():
+            if line.startswith("VmHWM:"):
+                return round(int(line.split()[1]) * 1.024e-3, 1)
     import resource
 
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss

@@ -7,15 +7,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.masks import Labels
-from dudmap.frames.observation import Level, Observation
+from dudmap.frames.observation import Observation
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
-from dudmap.stage_timer import StageTimer
+from dudmap.tracking.estimate import PoseEstimate
+from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.tracker import TrackingResult
 
-Register = Callable[[TsdfVolume, NDArray[np.float64]], tuple[TrackingResult, Labels | None]]
+Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
 """Registers and labels the lost frame against a map, starting from a pose (4, 4) in the world of that map."""
 
 
@@ -24,13 +24,11 @@ class Relocalization:
     """Verified pose of a frame after tracking was lost.
 
     Attributes:
-        tracking: Registration against the map of ``submap``.
-        labels: Dynamic labels of the frame, None if dynamics are not estimated.
+        estimate: Pose and labels of the frame in the map of ``submap``.
         submap: Number of the submap that the frame was recognised in. It may differ from the current one.
     """
 
-    tracking: TrackingResult
-    labels: Labels | None
+    estimate: PoseEstimate
     submap: int
 
 
@@ -68,13 +66,7 @@ class Relocalizer:
         self._lost_since = None
 
     def recover(
-        self,
-        observation: Observation,
-        level: Level,
-        register: Register,
-        accept: Callable[[TrackingResult], bool],
-        timer: StageTimer,
-        static_mask: NDArray[np.bool_] | None = None,
+        self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
     ) -> Relocalization | None:
         """Pose of a lost frame, verified by the registration against the map.
 
@@ -84,12 +76,9 @@ class Relocalizer:
         pose given by the features.
 
         Args:
-            observation: The lost frame.
-            level: Its pyramid level at label resolution (h, w).
+            view: The lost frame; its timer receives the time of feature matching as stage ``recognise``.
             register: Registers and labels this frame against a map.
             accept: Whether the residuals of a registration are plausible.
-            timer: Receives the time of feature matching as stage ``recognise``.
-            static_mask: (H, W) bool, pixels not known to be dynamic; None = all.
 
         Returns:
             None if relocalization is switched off or no candidate passes.
@@ -97,16 +86,18 @@ class Relocalizer:
         limits = self.config.relocalization
         if not limits.enabled:
             return None
-        with timer("recognise"):
+        with view.timer("recognise"):
             keyframes = self.atlas.keyframes
-            candidates = keyframes.match(keyframes.extract(observation, static_mask))
+            static_mask = None if view.known_dynamic is None else ~view.known_dynamic
+            candidates = keyframes.match(keyframes.extract(view.observation, static_mask))
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
         candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
-        num_readings = max(np.count_nonzero(level.depth), 1)
+        num_readings = max(np.count_nonzero(view.labelled.depth), 1)
         for candidate in candidates:
             submap, T_features = candidate.keyframe.submap, candidate.T_world_camera
             volume = self.atlas.volumes[submap] if self.prior_map is None else self.prior_map
-            tracking, labels = register(volume, T_features)
+            estimate = register(volume, T_features)
+            tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
             if (
                 tracking.converged
@@ -114,7 +105,7 @@ class Relocalizer:
                 and static_share * tracking.inlier_share >= limits.min_on_map
                 and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)
             ):
-                return Relocalization(tracking, labels, submap)
+                return Relocalization(estimate, submap)
         return None
 
     def wants_new_submap(self, observation: Observation) -> bool:

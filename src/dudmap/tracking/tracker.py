@@ -1,4 +1,4 @@
-"""Camera pose from the signed distances and intensities of the map (thesis section 4.4, algorithm 2)."""
+"""Direct registration of a frame to the distances and intensities of the map (thesis section 4.4, algorithm 2)."""
 
 from dataclasses import dataclass, replace
 
@@ -13,10 +13,14 @@ from dudmap.kernels.median import median
 from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 
-SHORT = 4
-"""Only steps shorter than this many times that end a level by how little they gain."""
+SHORT_STEP = 4
+"""A step shorter than this multiple of the stop tolerance also ends a level if the cost hardly changes."""
 EXPOSURE_NOISE = 0.01
-"""Changes of gain and offset that together stay below this are noise of the fit, not of the camera."""
+"""A change of gain and offset below this in total is noise of the fit and is not applied."""
+MIN_READINGS = 100
+"""Static readings on the map that a registration needs: well above its six unknowns."""
+MEDIAN_STRIDE = 4
+"""Every so many pixels, across and down, enter the median intensity difference."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,11 +30,11 @@ class LinearSystem:
     Attributes:
         H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
         b: (6,) float64, gradient of the cost.
-        cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
-        num_inliers: Readings on the map.
+        cost: Robust cost; each reading off the map costs a constant, so that costs of different poses are comparable.
+        num_inliers: Number of readings on the map.
         readings: Sum of the static weights of all readings.
         weight: Sum of the static weights of the readings on the map.
-        chi_square: Robustly weighted sum of squared distances, m^2; at one metre if they are weighted by the noise.
+        chi_square: Robustly weighted sum of squared distances, m^2; scaled to 1 m depth with ``noise_weighting``.
         residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
     """
 
@@ -46,20 +50,21 @@ class LinearSystem:
 
 @dataclass(frozen=True, eq=False)
 class TrackingResult:
-    """Outcome of one registration.
+    """Result of one registration.
 
     Attributes:
         T_world_camera: (4, 4).
-        exposure: Gain and offset that make the frame's intensities those of the map.
+        exposure: Gain and offset that map the frame's intensities to those of the map.
         converged: Whether all checks passed.
         reason: The failed check, empty if none.
-        inlier_share: Share of the static readings that fall on the map.
-        residual: Root mean square distance residual, scaled by sigma(1 m) / sigma(z): metres at one metre depth.
-        condition: Ratio of the extreme eigenvalues of the scaled H; near 0 = a direction is not constrained.
-        iterations: Linearisations over all levels.
-        color_residual: Median absolute intensity difference (0..1) to the map at the static readings, a change of
-            exposure apart; NaN where the image shows nothing.
-        settled: Whether the last level ended with a step too small to matter, not for want of iterations.
+        inlier_share: Share of the static readings that lie on the map.
+        residual: Root mean square of the distance residuals scaled by sigma(1 m) / sigma(z), metres at 1 m depth.
+        condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is not
+            constrained.
+        iterations: Number of linearisations over all levels.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings, after the best
+            gain and offset; NaN for a textureless image.
+        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -75,7 +80,12 @@ class TrackingResult:
 
 
 class Tracker:
-    """Direct registration of a frame against the map by Levenberg-Marquardt, coarse to fine."""
+    """Coarse-to-fine registration of a frame to the map by Levenberg-Marquardt.
+
+    Args:
+        config: Residual weights, iterations, stop criteria, checks.
+        sensor: Noise of the depth readings.
+    """
 
     def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
         self.config = config
@@ -95,10 +105,10 @@ class Tracker:
         Args:
             volume: The map.
             levels: Image pyramid, coarse to fine.
-            T_init: (4, 4) first guess of T_world_camera.
-            static_weights: Per level (h, w) float32 in [0, 1]; None counts every pixel.
-            first_level: Number of the first of these levels in the configuration.
-            exposure: Gain and offset; fitted anew if the first of these levels is the coarsest.
+            T_init: (4, 4) initial T_world_camera.
+            static_weights: Per level (h, w) float32 in [0, 1]; None weighs every pixel 1.
+            first_level: Index of the first of these levels in the configuration.
+            exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
         """
         volume.look_at(T_init)
         T, iterations, system, settled = T_init, 0, None, True
@@ -122,7 +132,7 @@ class Tracker:
             stop = self.config.stop if finest else self.config.stop_coarse
             T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop)
             iterations += used
-        if system is None:  # every level is left out: judge the first guess
+        if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
@@ -138,7 +148,12 @@ class Tracker:
         limit: int,
         stop: float,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
-        """Levenberg-Marquardt on one level (Marquardt 1963: damping scaled by the diagonal, accepted on real gain)."""
+        """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
+        accepted if it decreases the cost.
+
+        Returns:
+            Pose, its normal equations, number of linearisations, whether a stop criterion was met.
+        """
         damping, used = self.config.damping, 0
         for _ in range(limit):
             diagonal = np.diag(system.H)
@@ -147,12 +162,12 @@ class Tracker:
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
             step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
             T_trial, length = se3.retract(T, step), np.linalg.norm(step)
-            if length < stop:  # known to be small before it is tried: take it and be done
+            if length < stop:  # too short to need another linearisation
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights)
             used += 1
             gain = abs(trial.cost - system.cost)
-            settled = length < SHORT * stop and gain < self.config.stop_gain * system.cost
+            settled = length < SHORT_STEP * stop and gain < self.config.stop_gain * system.cost
             if trial.cost < system.cost:
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
@@ -169,8 +184,15 @@ class Tracker:
         weights: NDArray[np.float32],
         color_weight: float | None = None,
     ) -> LinearSystem:
-        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose; the colour's weight from the
-        configuration, unless another is given."""
+        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose.
+
+        Args:
+            volume: The map; its window must cover the view.
+            level: The image.
+            T_world_camera: (4, 4).
+            weights: (h, w) float32 static weights in [0, 1].
+            color_weight: Weight of the intensity term; None takes that of the configuration.
+        """
         config, sensor = self.config, self.sensor
         color_weight = config.color_weight if color_weight is None else color_weight
         parameters = RegistrationParameters(
@@ -197,11 +219,11 @@ class Tracker:
         weights: NDArray[np.float32],
         iterations: int,
     ) -> TrackingResult:
-        """Name the first check that a registration fails: readings on the map, residual level, degenerate H.
+        """Result of a registration with the first check it fails: overlap, residual, conditioning of H.
 
-        The figures mean the same in every configuration: distances are judged in units of the sensor's noise also where
-        the registration does not weigh by it, and intensities apart from a change of exposure also where the
-        registration does not compensate it.
+        The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
+        the registration does not weigh by it, and intensities after the best gain and offset even if the registration
+        does not apply them.
         """
         config = self.config
         share = system.weight / max(system.readings, 1.0)
@@ -210,11 +232,11 @@ class Tracker:
         scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
-        if system.weight < 100:
+        if system.weight < MIN_READINGS:
             reason = f"only {system.weight:.0f} static readings fall on the map"
         elif share < config.min_inliers:
             reason = f"only {share:.0%} of the static readings fall on the map"
-        elif residual > config.max_residual * (self.sensor.sigma_base + self.sensor.sigma_scale):
+        elif residual > config.max_residual * self.sensor.sigma(1.0):
             reason = f"readings lie {1000 * residual:.1f} mm off the map"
         elif condition < config.min_condition:
             reason = "the view does not constrain all directions of motion"
@@ -224,7 +246,7 @@ class Tracker:
         if not config.exposure:
             gain, offset = fit_exposure(level.intensity, differences, weights)
             differences = differences + np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = differences[::4, ::4][weights[::4, ::4] > 0.5]
+        difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
         return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
