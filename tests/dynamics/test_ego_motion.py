@@ -110,7 +110,7 @@ def test_motion_and_labels_agree_at_any_resolution(width):
     slam = Slam(full.camera, Config().override([f"tracker.widths=[{width // 4}, {width // 2}, {width}]"]))
     before, after = (slam.prepare(full[index]) for index in (6, 7))
     assert before.pyramid.fine.camera.width == width
-    motion = dominant_motion(before.pyramid, after.pyramid, (before.segmentation(), after.surface()))
+    motion = dominant_motion(before.pyramid, after.pyramid, (before.segmentation(), after.segmentation()))
     truth = full.ground_truth.Ts_world_camera
     off = motion.T_after_before @ se3.inverse(truth[6]) @ truth[7]
     assert np.linalg.norm(off[:3, 3]) < 0.006

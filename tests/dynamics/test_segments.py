@@ -191,16 +191,18 @@ def test_an_object_that_stops_becomes_static_after_the_settle_time():
 
 
 @pytest.mark.parametrize(
-    ("share", "distance", "mismatch", "whole"),
+    ("share", "before", "distance", "mismatch", "whole"),
     [
-        (0.5, 0.3, 0.4, True),  # the rest has moved by 0.4 pixels
-        (0.5, 1.1, 0.1, True),  # and by 1.1 standard deviations
-        (0.5, 0.3, 0.1, False),
-        (0.1, 1.1, 0.4, False),  # nothing moves by itself
-        (0.9, 0.3, 0.1, True),
+        (0.5, 0.0, 0.3, 0.4, True),  # the rest has moved by 0.4 pixels
+        (0.5, 0.0, 1.1, 0.1, True),  # or by 1.1 standard deviations
+        (0.5, 0.0, 0.3, 0.1, False),
+        (0.5, 0.0, 0.3, 0.27, False),
+        (0.5, 1.0, 0.3, 0.27, True),  # it goes on moving
+        (0.1, 1.0, 1.1, 0.4, False),  # nothing moves by itself
+        (0.9, 0.0, 0.3, 0.1, True),
     ],
 )
-def test_motion_is_decided_per_segment(share, distance, mismatch, whole):
+def test_motion_is_decided_per_segment(share, before, distance, mismatch, whole):
     """A segment some of which moves is dynamic if the rest of it fits less well than static segments do."""
     evidence = SegmentEvidence(
         size=np.array([0, 500.0, 20000]),
@@ -209,7 +211,7 @@ def test_motion_is_decided_per_segment(share, distance, mismatch, whole):
         distance=np.array([0, distance, 0.1]),
         mismatch=np.array([0, mismatch, 0.05]),
     )
-    assert classify_segments(evidence).tolist() == [False, whole, False]
+    assert classify_segments(evidence, np.array([0, before, 0])).tolist() == [False, whole, False]
 
 
 def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
@@ -221,4 +223,4 @@ def test_a_large_segment_moves_only_if_nearly_all_of_it_does():
             distance=np.array([0, 3.0, 0.1]),
             mismatch=np.array([0, 1.0, 0.05]),
         )
-        assert classify_segments(evidence).tolist() == [False, whole, False]
+        assert classify_segments(evidence, np.zeros(3)).tolist() == [False, whole, False]

@@ -25,7 +25,7 @@ from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
     (registration, "linearize_rows"): {"loops": 2, "fma": 48, "packed": 140, "converted": 2},
-    (integration, "integrate_blocks"): {"loops": 3, "fma": 9, "packed": 42, "converted": 16},
+    (integration, "integrate_blocks"): {"loops": 3, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
     (labeling, "mean_field"): {"loops": 1},

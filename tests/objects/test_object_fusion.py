@@ -158,8 +158,8 @@ def test_off_by_default_and_without_influence():
         np.testing.assert_array_equal(a.dynamic_mask, b.dynamic_mask)
         assert "bodies" not in a.timings
     assert off.objects.fusion is None
-    assert off.bodies == []
-    assert len(on.bodies) > 0
+    assert off.rigid_objects == []
+    assert len(on.rigid_objects) > 0
     assert off.volume.num_blocks == on.volume.num_blocks
 
 

@@ -292,7 +292,7 @@ class DynamicDetector:
         difference = np.asarray(sample.difference + correction, np.float32)
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
         evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
-        dynamic = dynamic | classify_segments(evidence)[labels]
+        dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]
         settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 

@@ -169,7 +169,7 @@ def segment_evidence(
     )
 
 
-def classify_segments(evidence: SegmentEvidence) -> NDArray[np.bool_]:
+def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Which segments (count + 1,) move as a whole.
 
     A segment of at least ``min_pixels`` is dynamic if
@@ -178,7 +178,7 @@ def classify_segments(evidence: SegmentEvidence) -> NDArray[np.bool_]:
     - it covers at most MAX_SHARE of the readings, at least MIN_DYNAMIC of its pixels are dynamic by themselves, and
       the mean distance s and the intensity mismatch m of its static pixels say that these have moved as well:
 
-          (s / S)^2 + (m / M)^2 >= 1
+          (s / S)^2 + (m / M)^2 >= 1,    or 1/2 where most of the segment was dynamic in the last frame,
 
     with S = DISTANCE_SCALE and M = MISMATCH_SCALE, larger in a badly registered frame: in proportion to the upper
     quartiles of |s| and m over the static segments of the frame, where these exceed COMMON_DISTANCE and
@@ -186,13 +186,15 @@ def classify_segments(evidence: SegmentEvidence) -> NDArray[np.bool_]:
 
     Args:
         evidence: Evidence of each segment.
+        dynamic_before: (count + 1,) share of the pixels that belonged to a dynamic segment in the last frame.
     """
     large = evidence.size >= evidence.min_pixels
     static = large & (evidence.compared > 0.5) & (evidence.dynamic < 0.5)
     static[0] = False
     distance_scale = DISTANCE_SCALE * max(1.0, upper_quartile(np.abs(evidence.distance[static])) / COMMON_DISTANCE)
     mismatch_scale = MISMATCH_SCALE * max(1.0, upper_quartile(evidence.mismatch[static]) / COMMON_MISMATCH)
-    moved = (evidence.distance / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2 >= 1
+    score = (evidence.distance / distance_scale) ** 2 + (evidence.mismatch / mismatch_scale) ** 2
+    moved = score >= np.where(dynamic_before > 0.5, 0.5, 1.0)
     small = evidence.size <= MAX_SHARE * evidence.size[1:].sum()
     dynamic = large & ((evidence.dynamic >= NEARLY_ALL) | (small & moved & (evidence.dynamic >= MIN_DYNAMIC)))
     dynamic[0] = False

@@ -6,7 +6,7 @@ The scalar formulas stand first, each in a function of its own; the loops over h
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.threads import bands, kernel, run_bands
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar
 
 UPSAMPLING_BAND = 60
 """Image rows per band of the upsampling."""
@@ -17,7 +17,7 @@ MISSING_COST = np.float32(64)
 """Cost of pairing a pixel that has a depth with one that has none, metres: more than any depth difference."""
 
 
-@kernel
+@scalar
 def half_normal(square, prior, sigma):
     """Density of a component of the mixture up to the common factor sqrt(2 / pi) (thesis eq. 4.56).
 
@@ -29,7 +29,7 @@ def half_normal(square, prior, sigma):
     return prior / sigma * np.exp(-0.5 * square / (sigma * sigma))
 
 
-@kernel
+@scalar
 def dynamic_responsibility(square, prior, static, dynamic):
     """Posterior probability that a residual belongs to the dynamic component (E-step; thesis eq. 4.53).
 
@@ -43,7 +43,7 @@ def dynamic_responsibility(square, prior, static, dynamic):
     return q / max(p + q, 1e-300)
 
 
-@kernel
+@scalar
 def bounded_sigma(squares, mass, low, high):
     """Maximum-likelihood standard deviation of a half-normal density within bounds (M-step; thesis eq. 4.55).
 
@@ -55,7 +55,7 @@ def bounded_sigma(squares, mass, low, high):
     return min(max(np.sqrt(squares / max(mass, 1e-9)), low), high)
 
 
-@kernel
+@scalar
 def tanh(x):
     """Hyperbolic tangent for |x| <= 5 within 3e-4 (Lambert's continued fraction), in arithmetic that vectorises."""
     square = x * x
@@ -64,20 +64,20 @@ def tanh(x):
     return top / bottom
 
 
-@kernel
+@scalar
 def mean_spin(log_odds):
     """Expectation of a spin (static = 1, dynamic = -1) with these log odds static : dynamic: tanh(log_odds / 2)."""
     return tanh(np.float32(0.5) * log_odds)
 
 
-@kernel
+@scalar
 def same_surface(z, z_neighbour, tolerance):
     """Whether two neighbouring pixels both have a depth, and depths that differ by no more than ``tolerance``."""
     zero = np.float32(0)
     return (z_neighbour > zero) & (z > zero) & (abs(z_neighbour - z) <= tolerance)
 
 
-@kernel
+@scalar
 def depth_cost(z, z_low):
     """Cost of giving a full-resolution pixel of depth ``z`` the label of a low-resolution one: their depth difference,
     metres, or ``MISSING_COST`` where only one of them has a depth."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.threads import bands, kernel, run_bands
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar
 
 PLANE_STEP = np.float32(0.35)
 """Largest distance of a pixel from the plane through its neighbour in the same segment, as a share of the largest
@@ -166,7 +166,7 @@ def surface_end(depth, tolerance, v, u, dv, du, reach):
     return reach
 
 
-@kernel
+@scalar
 def normal_of_gradient(x, y, z, zu, zv):
     """Unit normal, towards the camera, of a surface at the normalised image point (x, y) and depth z, whose gradient
     over normalised image coordinates is (zu, zv)."""
@@ -175,7 +175,7 @@ def normal_of_gradient(x, y, z, zu, zv):
     return nx / length, ny / length, nz / length
 
 
-@kernel
+@scalar
 def is_concave(turn, length, sine):
     """Whether two surface points lie on either side of a concave edge.
 
@@ -188,7 +188,7 @@ def is_concave(turn, length, sine):
     return turn < -np.float32(2) * sine * length
 
 
-@kernel
+@scalar
 def plane_distance(nx, ny, nz, ex, ey, ez):
     """Distance of a point from the plane with unit normal n, when the point lies at e from a point of the plane."""
     return abs(nx * ex + ny * ey + nz * ez)
