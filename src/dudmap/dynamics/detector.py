@@ -177,7 +177,7 @@ class DynamicDetector:
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, np.linspace(0, MAX_RESIDUAL, BINS + 1))
         evidence, seen_static = self._evidence(frame, residual, mixture)
-        probability = labeling.mean_field(evidence, level.depth, tolerance, COUPLING, SWEEPS)
+        probability = volume.backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
         if self.config.regions:

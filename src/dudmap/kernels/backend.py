@@ -173,6 +173,25 @@ class Backend(Protocol):
         ``linearize``; ``free_after`` observations make free space."""
         ...
 
+    def label(
+        self,
+        log_odds: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        coupling: float,
+        sweeps: int,
+    ) -> NDArray[np.float32]:
+        """Static probability (h, w) of each pixel, consistent with its neighbours on the same surface (algorithm 3).
+
+        Args:
+            log_odds: (h, w) float32 log odds static : dynamic of each pixel alone; 0 = unknown.
+            depth: (h, w) float32, metres, 0 = none.
+            tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+            coupling: Log odds that all neighbours together can add.
+            sweeps: Iterations of the mean field.
+        """
+        ...
+
     def raycast(
         self,
         grid: VoxelGrid,

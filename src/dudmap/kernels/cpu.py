@@ -6,7 +6,7 @@ Bands do not depend on the number of threads, and sums are added in their order 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels import filtering, integration, meshing, raycasting, registration, sampling, visibility
+from dudmap.kernels import filtering, integration, labeling, meshing, raycasting, registration, sampling, visibility
 from dudmap.kernels.parameters import (
     BLOCK,
     DepthTiles,
@@ -287,6 +287,17 @@ class CpuBackend:
             bands(shape[0], max(8, -(-shape[0] // 8))),
         )  # fmt: skip
         return out
+
+    def label(
+        self,
+        log_odds: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        coupling: float,
+        sweeps: int,
+    ) -> NDArray[np.float32]:
+        """See ``Backend.label``."""
+        return labeling.mean_field(log_odds, depth, tolerance, coupling, sweeps)
 
 
 def _concatenated(found: list[NDArray[np.int32]], counts: list[int]) -> NDArray[np.int32]:
