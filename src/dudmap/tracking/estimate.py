@@ -82,6 +82,6 @@ def initial_weights(
         if previously_dynamic is not None:
             weights -= np.float32(1 - PREVIOUSLY_DYNAMIC_WEIGHT) * reduced(previously_dynamic, level)
         for mask in excluded:
-            weights[reduced(mask, level)] = 0
+            weights *= ~reduced(mask, level)
         out.append(weights)
     return out

@@ -98,8 +98,8 @@ class FrontEnd:
             return PoseEstimate(tracking, labels, unverified)
         split = max(1, len(levels) - 1)
         with view.timer("track"):
-            weights = initial_weights(levels, self.last_dynamic, excluded)
-            tracking = tracker.align(volume, levels[:split], T_init, weights)
+            coarse = levels[:split]
+            tracking = tracker.align(volume, coarse, T_init, initial_weights(coarse, self.last_dynamic, excluded))
         labels = self._label(volume, view, prediction, tracking)
         with view.timer("track_again"):
             finest_suffices = split < len(levels) and tracking.settled and self._labels_unchanged(labels)
