@@ -1,1 +1,1 @@
-"""Which pixels of a registered frame move."""
+"""Labelling of the static and dynamic pixels of a registered frame."""

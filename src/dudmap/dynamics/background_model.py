@@ -1,4 +1,4 @@
-"""The static background behind pixels without a reading: things too near, too dark, or in a shadow of the sensor."""
+"""The static background behind pixels without a reading: objects too near, too dark, or in a shadow of the sensor."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,7 +26,7 @@ MIN_AREA = 0.005
 class BackgroundModel:
     """The last static reading of every pixel, as a point in the world that is carried from image to image.
 
-    A thing that gives no reading hides the background known to be behind it, and looks different; the sensor's own
+    An object that gives no reading hides the background known to be behind it, and looks different; the sensor's own
     shadow, a screen or a window looks as the background did.
 
     Args:

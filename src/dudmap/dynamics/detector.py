@@ -1,4 +1,4 @@
-"""Which pixels of a frame move: mixture of residual densities, known free space, segments (thesis section 4.6)."""
+"""Labelling of dynamic pixels: mixture of residual densities, known free space, segments (thesis section 4.6)."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

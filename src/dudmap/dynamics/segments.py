@@ -170,7 +170,7 @@ def segment_evidence(
 
 
 def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Which segments (count + 1,) move as a whole.
+    """Segments that move as a whole, (count + 1,) bool.
 
     A segment of at least ``min_pixels`` is dynamic if
 

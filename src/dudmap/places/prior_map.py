@@ -1,4 +1,4 @@
-"""What a first pass over a recording hands to the second."""
+"""Prior map: the result of a first pass over a recording, as input of the second."""
 
 from dataclasses import dataclass
 
