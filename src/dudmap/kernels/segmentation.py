@@ -208,7 +208,7 @@ def plane_step(depth, intrinsics, normals, v, u, vn, un):
 
 @kernel
 def concave_edges(depth, intrinsics, tolerance, reach, normal_reach, sine, normals, edge):
-    """Normals, and pixels on concave edges: an object on the floor is cut off along its foot, the faces of a box are not.
+    """Normals, and pixels on concave edges: an object on the floor is cut off at its foot, faces of a box are not.
 
     Args:
         depth, intrinsics, tolerance, reach, normal_reach, sine: See ``segment_surface``.
