@@ -18,7 +18,7 @@ from dudmap.benchmark.timing import time_frames, time_iteration, time_walk
 from dudmap.errors import DudmapError
 
 
-class Figure(NamedTuple):
+class SpeedFigure(NamedTuple):
     """One row of the table: quantity, unit, largest acceptable value (None = no target), and measured value."""
 
     what: str
@@ -34,7 +34,7 @@ def speed_figures(
     announce: Callable[[str], None] = lambda text: None,
     open3d: str | None = None,
     recording: Path | None = None,
-) -> list[Figure]:
+) -> list[SpeedFigure]:
     """Measure all figures, each in a new process.
 
     Args:
@@ -48,46 +48,46 @@ def speed_figures(
     Raises:
         DudmapError: A measurement failed.
     """
-    figures: list[Figure] = []
+    figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
     for voxel, median, p95 in ((0.01, 33.0, 50.0), (0.02, 20.0, None), (0.005, 70.0, None)):
         row = _measured(time_frames, (voxel, frames))
         name = f"frame, {100 * voxel:g} cm voxels"
-        figures.append(Figure(f"{name}, median", "ms", median, row["median"]))
+        figures.append(SpeedFigure(f"{name}, median", "ms", median, row["median"]))
         if p95 is not None:
-            figures.append(Figure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
+            figures.append(SpeedFigure(f"{name}, 95th percentile", "ms", p95, row["p95"]))
             figures += _map_figures(row)
-            figures.append(Figure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
+            figures.append(SpeedFigure("artificial view, 320x240", "ms", 40.0, row["view_ms"]))
     announce("one registration iteration on one thread")
     with _environment(DUDMAP_THREADS="1"):
         row = _measured(time_iteration, 40)
-    figures.append(Figure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
+    figures.append(SpeedFigure("registration iteration, 320x240, one thread", "ms", 1.5, row["iteration_ms"]))
     announce("starting")
     figures += _start_times()
     if long_frames:
         announce(f"{long_frames} frames through new space")
         row = _measured(time_walk, long_frames)
         remark = f"{long_frames} frames, {row['first_ms']:.1f} to {row['last_ms']:.1f} ms"
-        figures.append(Figure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
+        figures.append(SpeedFigure("growth: last 10 % of the frames over the first", "x", 1.1, row["growth"], remark))
         remark = f"{row['stale']} chunks; all of the map takes {row['mesh_ms']:.0f} ms"
-        figures.append(Figure("mesh again after one frame, end of the walk", "ms", None, row["again_ms"], remark))
+        figures.append(SpeedFigure("mesh again after one frame, end of the walk", "ms", None, row["again_ms"], remark))
     if open3d is not None:
         announce("Open3D's dense SLAM and ours in turn")
         figures += _open3d_figures(open3d, recording, frames)
     return figures
 
 
-def _map_figures(row: Row) -> list[Figure]:
+def _map_figures(row: Row) -> list[SpeedFigure]:
     again = f"{row['stale']} chunks; all of the map takes {1000 * row['mesh_whole_s']:.0f} ms"
     return [
-        Figure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, row["bytes_per_block"] / 1024),
-        Figure("free space, share of what its voxels would cost", "%", 1.0, 100 * row["free_share"]),
-        Figure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
-        Figure("mesh again after one frame", "ms", None, row["again_ms"], again),
+        SpeedFigure("map memory per occupied block, KB of 1024 bytes", "KB", 4.2, row["bytes_per_block"] / 1024),
+        SpeedFigure("free space, share of what its voxels would cost", "%", 1.0, 100 * row["free_share"]),
+        SpeedFigure("mesh, per million triangles", "s", 0.5, row["mesh_s"], f"{row['triangles']} triangles"),
+        SpeedFigure("mesh again after one frame", "ms", None, row["again_ms"], again),
     ]
 
 
-def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[Figure]:
+def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[SpeedFigure]:
     from dudmap.benchmark.interleaved import compare_with_open3d
 
     static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
@@ -95,15 +95,19 @@ def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[Fi
     result = compare_with_open3d(python, entry, frames)
     name, times = f"{entry.name}, {result.frames} frames", f"{result.ours_ms:.1f} to {result.theirs_ms:.1f} ms"
     figures = [
-        Figure("frame, over Open3D's dense SLAM", "x", 1 / 3, result.ours_ms / result.theirs_ms, f"{name}, {times}")
+        SpeedFigure(
+            "frame, over Open3D's dense SLAM", "x", 1 / 3, result.ours_ms / result.theirs_ms, f"{name}, {times}"
+        )
     ]
     if result.ours_ate is not None and result.theirs_ate is not None:
         errors = f"{100 * result.ours_ate:.2f} to {100 * result.theirs_ate:.2f} cm; Open3D {result.version}"
-        figures.append(Figure("ATE, over Open3D's dense SLAM", "x", 1.0, result.ours_ate / result.theirs_ate, errors))
+        figures.append(
+            SpeedFigure("ATE, over Open3D's dense SLAM", "x", 1.0, result.ours_ate / result.theirs_ate, errors)
+        )
     return figures
 
 
-def markdown(figures: list[Figure]) -> str:
+def markdown(figures: list[SpeedFigure]) -> str:
     """The figures as a Markdown table."""
     body = [
         [
@@ -160,22 +164,22 @@ run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=
 """Program that ends at the first computed pose, that of the second frame; the first one is the identity."""
 
 
-def _start_times() -> list[Figure]:
+def _start_times() -> list[SpeedFigure]:
     """Times of the import, of the help page, and from the start of the program to the first computed pose."""
     from dudmap.synthetic.folder import write_folder
 
     figures = [
-        Figure("import dudmap", "s", 0.15, program_seconds(["-c", "import dudmap"]) - program_seconds(["-c", ""])),
-        Figure("dudmap --help", "s", 0.4, program_seconds(["-m", "dudmap", "--help"])),
+        SpeedFigure("import dudmap", "s", 0.15, program_seconds(["-c", "import dudmap"]) - program_seconds(["-c", ""])),
+        SpeedFigure("dudmap --help", "s", 0.4, program_seconds(["-m", "dudmap", "--help"])),
     ]
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         recording = Path(temporary) / "recording"
         write_folder(Entry("room-person", parameters={"frames": 3}).open(), recording, surface=False)  # type: ignore[arg-type]
         first_pose = ["-c", FIRST_POSE, str(recording)]
         program_seconds(first_pose, 1)
-        figures.append(Figure("to the first pose, kernels cached", "s", 1.5, program_seconds(first_pose, 3)))
+        figures.append(SpeedFigure("to the first pose, kernels cached", "s", 1.5, program_seconds(first_pose, 3)))
         with _environment(NUMBA_CACHE_DIR=str(Path(temporary) / "cache")):
-            figures.append(Figure("to the first pose, nothing cached", "s", 20.0, program_seconds(first_pose, 1)))
+            figures.append(SpeedFigure("to the first pose, nothing cached", "s", 20.0, program_seconds(first_pose, 1)))
     return figures
 
 
