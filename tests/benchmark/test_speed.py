@@ -14,9 +14,9 @@ from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 def test_the_table_says_what_is_reached():
     figures = [
-        speed.Figure("frame", "ms", 33, 20.44),
-        speed.Figure("view", "ms", 40, 41.0, "slow"),
-        speed.Figure("walk", "x", 1.1, None),
+        speed.SpeedFigure("frame", "ms", 33, 20.44),
+        speed.SpeedFigure("view", "ms", 40, 41.0, "slow"),
+        speed.SpeedFigure("walk", "x", 1.1, None),
     ]
     lines = speed.markdown(figures).splitlines()
     assert lines[2] == "| frame | <= 33 ms | 20.4 ms | yes |  |"
@@ -66,7 +66,7 @@ def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():
 
 
 def test_a_figure_without_a_target_is_only_shown():
-    lines = speed.markdown([speed.Figure("mesh again", "ms", None, 12.3, "40 chunks")]).splitlines()
+    lines = speed.markdown([speed.SpeedFigure("mesh again", "ms", None, 12.3, "40 chunks")]).splitlines()
     assert lines[2] == "| mesh again |  | 12.3 ms |  | 40 chunks |"
 
 
