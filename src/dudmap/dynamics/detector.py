@@ -32,8 +32,7 @@ MAP_ROUGHNESS = 0.4
 """Standard deviation of the map's surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
 """Largest depth step to a neighbour of the same surface: standard deviations of a reading, plus a share of the depth
-per
-pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
+per pixel at REFERENCE_WIDTH (a surface inclined by 69 degrees, with a focal length of 131 pixels)."""
 MAX_LOG_ODDS = 6
 """Log odds static : dynamic of a pixel that is certain: an error probability of 0.25 %."""
 COUPLING = 4
