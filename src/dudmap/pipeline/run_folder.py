@@ -158,12 +158,12 @@ def write_run_folder(
 def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:
     """Write mesh and trajectory of every rigid object; returns the entries of all objects in metrics.json."""
     out = []
-    for body in objects:
-        row = {"id": body.id, "rigid": body.rigid, "why_not": body.reason or None, "frames": body.frames}
-        if body.mesh is not None and body.trajectory is not None:
+    for obj in objects:
+        row = {"id": obj.id, "rigid": obj.rigid, "why_not": obj.reason or None, "frames": obj.frames}
+        if obj.mesh is not None and obj.trajectory is not None:
             folder.mkdir(exist_ok=True)
-            body.mesh.save(folder / f"{body.id}.ply")
-            body.trajectory.save(folder / f"{body.id}.txt")
-            row["mesh_triangles"] = len(body.mesh.faces)
+            obj.mesh.save(folder / f"{obj.id}.ply")
+            obj.trajectory.save(folder / f"{obj.id}.txt")
+            row["mesh_triangles"] = len(obj.mesh.faces)
         out.append(row)
     return out
