@@ -91,10 +91,10 @@ class TsdfVolume:
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
-        self._reset()
+        self.clear()
 
-    def _reset(self) -> None:
-        """Become an empty map."""
+    def clear(self) -> None:
+        """Remove everything that was integrated."""
         self.window = BlockWindow(self.block_size, self._window_cells)
         self.blocks = VoxelBlocks()
         self._frame_number = 0
@@ -173,10 +173,6 @@ class TsdfVolume:
             self.blocks, self.window, self.camera, depth, frame.color, weights, T_world_camera, self._frame_number,
             count,
         )  # fmt: skip
-
-    def clear(self) -> None:
-        """Remove everything that was integrated."""
-        self._reset()
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""

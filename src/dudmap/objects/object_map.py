@@ -62,10 +62,6 @@ class ObjectVolume(TsdfVolume):
         self._T_object_window = np.eye(4)
         self._T_object_window[2, 3] = -self._reach
 
-    def clear(self) -> None:
-        """Remove everything from the map."""
-        self.__init__(self.camera, self.config, self.sensor, self.depth_max)
-
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Place the window around the origin; the camera's pose has no influence."""
         del T_world_camera
