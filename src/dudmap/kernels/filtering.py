@@ -103,13 +103,17 @@ def range_weight(difference, inverse):
 
 @kernel
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
-    """Add one tap on each side of every pixel of a line to the sums of the filter."""
+    """Add one tap on each side of every pixel of a line to the sums of the filter, both with the smaller weight.
+
+    The sum over a pair of opposite taps is free of the slope of the surface; a single tap at the border of the image or
+    of a surface would pull every slanted surface towards the side that remains.
+    """
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]
         d, e = before[u] - z, after[u] - z
-        s, t = range_weight(d, scale) * spatial, range_weight(e, scale) * spatial
-        numerator[u] += s * d + t * e
-        denominator[u] += s + t
+        pair = min(range_weight(d, scale), range_weight(e, scale)) * spatial
+        numerator[u] += pair * (d + e)
+        denominator[u] += pair + pair
 
 
 @kernel
@@ -126,6 +130,8 @@ def _start(middle, alpha, inverse, numerator, denominator):
 @kernel
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
+
+    Unlike in the thesis, opposite taps have one weight (``_accumulate``).
 
     Args:
         row_start, row_stop: Rows of the band.
