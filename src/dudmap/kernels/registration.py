@@ -123,10 +123,10 @@ def linearize_rows(
             r = distance * sdf_unit
             gx, gy, gz = gx * by_unit, gy * by_unit, gz * by_unit
             # intensity in 0..1 and its gradient per metre
-            shade, kx_, ky_, kz_ = trilinear(
-                intensity_of(c0), intensity_of(c1), intensity_of(c2), intensity_of(c3),
-                intensity_of(c4), intensity_of(c5), intensity_of(c6), intensity_of(c7), ax, ay, az,
-            )  # fmt: skip
+            i0, i1, i2, i3 = intensity_of(c0), intensity_of(c1), intensity_of(c2), intensity_of(c3)
+            i4, i5, i6, i7 = intensity_of(c4), intensity_of(c5), intensity_of(c6), intensity_of(c7)
+            darkest = min(min(min(i0, i1), min(i2, i3)), min(min(i4, i5), min(i6, i7)))
+            shade, kx_, ky_, kz_ = trilinear(i0, i1, i2, i3, i4, i5, i6, i7, ax, ay, az)
             rc = shade * by_255 - intensity[v, u]
             scale_c = by_255 * by_voxel
             kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
@@ -135,10 +135,11 @@ def linearize_rows(
             scaled = min(sigma_one / max(sigma(z, band.noise), np.float32(1e-6)), one)
             scale = noisy * scaled + (one - noisy)
             static = weights[v, u]
-            known = (low > 0) & (inside[u] > zero)
+            known = (low > 0) & (inside[u] > zero) & (darkest > zero)
             valid = known & (abs(r) < gate)
             residuals[0, v, u] = r if known else np.float32(np.nan)
-            residuals[1, v, u] = rc if valid else np.float32(np.nan)
+            colored = valid & (darkest > zero)
+            residuals[1, v, u] = rc if colored else np.float32(np.nan)
 
             rn = r * scale
             a = abs(rn)
@@ -147,7 +148,8 @@ def linearize_rows(
             geometric_cost = tukey_cost(inlier, tukey_limit) if use_tukey else huber_cost(a, huber)
             worst = tukey_limit if use_tukey else huber_cost(gate * scale, huber)
             ac = abs(rc)
-            color_robust, color_cost = huber_weight(ac, color_huber), huber_cost(ac, color_huber)
+            color_robust = huber_weight(ac, color_huber) if colored else zero
+            color_cost = huber_cost(ac, color_huber) if colored else worst_color
 
             used = static if valid else zero
             missing = static - used if z > zero else zero

@@ -32,7 +32,7 @@ def weight_of(word):
 
 @scalar
 def intensity_of(word):
-    """Intensity of a voxel, 0..255, float32."""
+    """Intensity of a voxel, 1..255, float32; 0 = never seen near a surface."""
     return bits(word, 0, 0xFF)
 
 
@@ -105,7 +105,8 @@ def fuse_voxel(word, reading, color, z, repeats, by_sdf_unit, p):
     cap = max(old_weight, min(p.max_weight, p.max_readings * bits(color, 0, 0xFF)))
     sdf = old_sdf + (min(s, tau) - old_sdf) * share
     share = share if banded else zero  # intensity and colour belong to the surface: emptiness does not repaint it
-    intensity = old_intensity + (luma(color) - old_intensity) * share
+    intensity_share = one if banded & (old_intensity == zero) else share
+    intensity = old_intensity + (max(luma(color), one) - old_intensity) * intensity_share
     fused = pack_voxel(sdf * by_sdf_unit, min(weight, cap), intensity)
     near = abs(s) < max(f32(2.5) * p.voxel_size, f32(0.4) * tau)
     color_share = share if near else (-one if banded & (old_weight < YOUNG) else zero)
