@@ -243,7 +243,7 @@ class MapSample(NamedTuple):
 
     Attributes:
         distance: (h, w) float32 signed distance in metres, NaN where the map has none.
-        difference: (h, w) float32 map minus image intensity (0..1), NaN likewise.
+        difference: (h, w) float32 map minus image intensity (0..1), NaN where the map has none.
         occupancy: (h, w) uint8: UNKNOWN (also without a reading), SURFACE or FREE.
     """
 

@@ -135,11 +135,10 @@ def linearize_rows(
             scaled = min(sigma_one / max(sigma(z, band.noise), np.float32(1e-6)), one)
             scale = noisy * scaled + (one - noisy)
             static = weights[v, u]
-            known = (low > 0) & (inside[u] > zero) & (darkest > zero)
+            known = (low > 0) & (inside[u] > zero) & (darkest > zero)  # a corner in the air is not part of a surface
             valid = known & (abs(r) < gate)
             residuals[0, v, u] = r if known else np.float32(np.nan)
-            colored = valid & (darkest > zero)
-            residuals[1, v, u] = rc if colored else np.float32(np.nan)
+            residuals[1, v, u] = rc if valid else np.float32(np.nan)
 
             rn = r * scale
             a = abs(rn)
@@ -148,8 +147,7 @@ def linearize_rows(
             geometric_cost = tukey_cost(inlier, tukey_limit) if use_tukey else huber_cost(a, huber)
             worst = tukey_limit if use_tukey else huber_cost(gate * scale, huber)
             ac = abs(rc)
-            color_robust = huber_weight(ac, color_huber) if colored else zero
-            color_cost = huber_cost(ac, color_huber) if colored else worst_color
+            color_robust, color_cost = huber_weight(ac, color_huber), huber_cost(ac, color_huber)
 
             used = static if valid else zero
             missing = static - used if z > zero else zero

@@ -36,7 +36,7 @@ def sample_rows(
         free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
         free_after: Observations that make free space.
         distance: (h, w) float32 out, metres, NaN where the map has no distance.
-        difference: (h, w) float32 out, map minus image intensity, NaN likewise.
+        difference: (h, w) float32 out, map minus image intensity, NaN where the map has none.
         occupancy: (h, w) uint8 out: UNKNOWN (also without a reading), SURFACE or FREE.
     """
     nan = np.float32(np.nan)
@@ -57,7 +57,7 @@ def sample_rows(
                 if slot <= -2 and free_count[-2 - slot] >= free_after:
                     occupancy[v, u] = FREE
                 continue
-            sdf, shade, total = np.float32(0), np.float32(0), np.float32(0)
+            sdf, shade, total, shaded = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
             ax, ay, az = gx - np.float32(ix), gy - np.float32(iy), gz - np.float32(iz)
             for k in range(8):
                 i, j, m = ix + (k >> 2), iy + ((k >> 1) & 1), iz + (k & 1)
@@ -69,10 +69,12 @@ def sample_rows(
                     continue
                 part = _corner_weight(k, ax, ay, az)
                 sdf += part * sdf_steps(word)
-                shade += part * intensity_of(word)
                 total += part
+                intensity_part = part if intensity_of(word) > 0 else np.float32(0)
+                shade += intensity_part * intensity_of(word)
+                shaded += intensity_part
             if total < np.float32(0.5):
                 continue
             distance[v, u] = sdf / total * sdf_unit
-            difference[v, u] = shade / total / np.float32(255) - intensity[v, u]
+            difference[v, u] = shade / shaded / np.float32(255) - intensity[v, u] if shaded > 0 else nan
             occupancy[v, u] = SURFACE
