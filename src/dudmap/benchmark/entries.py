@@ -41,10 +41,13 @@ class Entry:
 
             return open_sequence(self.path)
         from dudmap.synthetic import sequence
+        from dudmap.synthetic.cameras import find_camera
         from dudmap.synthetic.recording import DEFAULT_CAMERA
 
         size = self.parameters.get("camera", (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height))
-        return sequence(**{**self.parameters, "camera": DEFAULT_CAMERA.resized(*size)})
+        sensor = self.parameters.get("sensor")
+        camera = find_camera(sensor).camera(*size) if sensor else DEFAULT_CAMERA.resized(*size)
+        return sequence(**{**self.parameters, "camera": camera})
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
         """True static surface and its observed part, in the frame of the ground truth, if known."""

@@ -23,7 +23,8 @@ def __getattr__(name: str) -> object:
 
 
 def names() -> dict[str, list[str]]:
-    """Names of all scenes, movers, camera paths, situations and noise models."""
+    """Names of all scenes, movers, camera paths, situations, noise models and sensors."""
+    from dudmap.synthetic.cameras import CAMERAS
     from dudmap.synthetic.movers import MOVERS
     from dudmap.synthetic.paths import FOLLOW, PATHS
     from dudmap.synthetic.rooms import SCENES
@@ -36,4 +37,5 @@ def names() -> dict[str, list[str]]:
         "camera_paths": [*PATHS, FOLLOW],
         "situations": list(SITUATIONS),
         "noise": list(SENSORS),
+        "sensors": list(CAMERAS),
     }

@@ -125,8 +125,8 @@ def _write_parameters(sequence: SyntheticSequence, out: Path) -> None:
         "sensor": asdict(sensor) if sensor else None,
     }
     (out / "scene.json").write_text(json.dumps(parameters, indent=2) + "\n", encoding="utf-8")
-    truth = sequence.faults.truth(camera)
-    (out / "sensor_truth.json").write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
+    truth = json.dumps(sequence.sensor_truth(), indent=2)
+    (out / "sensor_truth.json").write_text(truth + "\n", encoding="utf-8")
 
 
 def _write_lists(sequence: SyntheticSequence, out: Path, shares: list[float]) -> None:

@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,14 +16,17 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.synthetic.cameras import find_camera
+from dudmap.synthetic.color_faults import Lens, compressed, exposure_gains, vignette, white_balance
 from dudmap.synthetic.crowd import crowd_of
+from dudmap.synthetic.depth_faults import DepthFaults
 from dudmap.synthetic.faults import SensorFaults
 from dudmap.synthetic.movers import MOVING_SPEED, Staging, SyntheticMover, build_movers
 from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.rooms import build_scene
 from dudmap.synthetic.scene import Scene
-from dudmap.synthetic.sensors import Sensor, SensorModel
+from dudmap.synthetic.sensors import Sensor, SensorModel, TimeOfFlightModel
 from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 
@@ -85,6 +89,7 @@ class SyntheticSequence:
         self._movers, self._noise, self._seed, self._fps = movers, noise, seed, fps
         self._motion_blur, self._exposure_change = motion_blur, exposure_change
         self._sensor = Sensor(noise, seed)
+        self._depth_faults = DepthFaults(self.faults, camera, seed)
         owned = [p for mover in movers for p in mover.primitives]
         self._owner = np.repeat(np.arange(len(movers)), [len(mover.primitives) for mover in movers])
         self._renderer = Renderer(scene, scene.primitives + owned)
@@ -114,7 +119,11 @@ class SyntheticSequence:
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth and visible primitive of a frame, and colour as the colour camera sees it, without noise."""
+        """Ideal depth and visible primitive of a frame, and what falls on the colour camera.
+
+        The colour has the place, time and lens of the colour camera, but no noise, and neither its exposure, white
+        balance, vignetting nor compression.
+        """
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
@@ -127,7 +136,7 @@ class SyntheticSequence:
         return self.faults.color_camera(self.camera)
 
     @property
-    def sensor_model(self) -> SensorModel | None:
+    def sensor_model(self) -> SensorModel | TimeOfFlightModel | None:
         """Noise model of the sensor, None for an ideal one."""
         return self._sensor.model
 
@@ -204,13 +213,58 @@ class SyntheticSequence:
         index = self._number(index)
         if index not in self._kept:
             rendering = self._render(index, with_color=True)
-            depth, color = self._sensor.measure(rendering, self.camera.fx, index)
+            depth, color = self._sensor.measure(self._with_errors(rendering, index), self.camera.fx, index)
+            if self.faults.jpeg_quality:
+                color = compressed(color, self.faults.jpeg_quality)
             frame = Frame(float(self.timestamps[index]), depth, color)
             self._kept[index] = (frame, self._mask_of(rendering, index))
             while len(self._kept) > 2:
                 self._kept.popitem(last=False)
         frame, mask = self._kept[index]
         return replace(frame, depth=frame.depth.copy(), color=frame.color.copy()), mask
+
+    def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
+        """What the sensor measures apart from noise: depth with its systematic errors, colour with its exposure."""
+        faults, color, depth = self.faults, rendering.color, rendering.depth
+        assert color is not None
+        if faults.auto_exposure:
+            color = color * np.float32(self.exposure_gains[index])
+        if faults.white_balance_drift:
+            color = color * white_balance(faults, float(self.timestamps[index]))
+        if faults.vignetting:
+            color = color * vignette(faults, self.camera)
+        if self._depth_faults:
+            depth = self._depth_faults.apply(depth, index)
+        return replace(rendering, depth=depth, color=color)
+
+    @cached_property
+    def exposure_gains(self) -> NDArray[np.float64]:
+        """Factors (N,) of the automatic exposure; they follow the mean brightness of small images of every frame."""
+        if not self.faults.auto_exposure:
+            return np.ones(len(self))
+        camera = self.color_camera.resized(max(self.camera.width // 8, 16), max(self.camera.height // 8, 16))
+        levels = np.empty(len(self))
+        for k, t in enumerate(self.timestamps):
+            T_world_color = self.ground_truth.Ts_world_camera[k] @ self.faults.T_depth_color
+            small = self._render_at(float(t), T_world_color, camera, True).color
+            assert small is not None
+            levels[k] = small.mean()
+        return exposure_gains(levels, self.timestamps, self.faults.auto_exposure)
+
+    def sensor_truth(self) -> dict[str, object]:
+        """Everything that the sensor does and its files do not say, for a JSON file."""
+        truth = self.faults.truth(self.camera)
+        if self._depth_faults:
+            truth |= self._depth_faults.truth()
+        if self.faults.auto_exposure:
+            truth["exposure_gains"] = self.exposure_gains.tolist()
+        if self.faults.white_balance_drift:
+            truth["white_balance_rgb"] = [white_balance(self.faults, float(t)).tolist() for t in self.timestamps]
+        return truth
+
+    @cached_property
+    def _lens(self) -> Lens:
+        return Lens(self.color_camera)
 
     def _mask_of(self, rendering: Rendering, index: int) -> NDArray[np.bool_]:
         t = float(self.timestamps[index])
@@ -244,17 +298,20 @@ class SyntheticSequence:
     def _separate_color(self, t: float) -> NDArray[np.float32]:
         """Colour (H, W, 3) of the frame stamped ``t`` from the place of the colour camera, at the time of every row."""
         camera, T_depth_color = self.color_camera, self.faults.T_depth_color
-        color = np.zeros((*camera.shape, 3), dtype=np.float32)
+        margin = self._lens.margin if camera.distortion else 0
+        height, width = camera.height + 2 * margin, camera.width + 2 * margin
+        camera = replace(camera, cx=camera.cx + margin, cy=camera.cy + margin, width=width, distortion=())
+        color = np.zeros((height, width, 3), dtype=np.float32)
         shares = self._exposure_shares()
-        for first, last, offset in self.faults.row_bands(camera.height):
-            low, high = max(first - 1, 0), min(last + 1, camera.height)  # pixels at a border look at their neighbours
+        for first, last, offset in self.faults.row_bands(self.camera.height, margin):
+            low, high = max(first - 1, 0), min(last + 1, height)  # pixels at a border look at their neighbours
             band = replace(camera, cy=camera.cy - low, height=high - low)
             for share in shares:
                 moment = t + offset + share / self._fps
                 seen = self._render_at(moment, self._pose_at(moment) @ T_depth_color, band, True).color
                 assert seen is not None
                 color[first:last] += seen[first - low : last - low] / np.float32(len(shares))
-        return color
+        return self._lens.distort(color) if margin else color
 
     def _pose_at(self, t: float) -> NDArray[np.float64]:
         """Pose of the depth camera at any time; before the first and after the last frame with constant velocity."""
@@ -288,15 +345,16 @@ def sequence(
     camera_path: str | Path | None = None,
     frames: int = 120,
     fps: float = 30.0,
-    noise: str = "kinect",
+    noise: str | None = None,
     speed: float | None = None,
     coverage: float | None = None,
     start_dynamic: bool = False,
     situation: str | None = None,
     seed: int = 0,
     camera: Camera | None = None,
-    motion_blur: float = 0.0,
+    motion_blur: float | None = None,
     exposure_change: float = 0.0,
+    sensor: str | None = None,
     faults: SensorFaults | None = None,
 ) -> SyntheticSequence:
     """Set up a synthetic recording; its frames are rendered on access.
@@ -308,23 +366,29 @@ def sequence(
             situation.
         frames: Number of frames.
         fps: Frames per second.
-        noise: Sensor: ``kinect``, ``realsense`` or ``none`` (exact depth).
+        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or that of the sensor.
         speed: Speed of the movers in m/s; None for the natural speed of each.
         coverage: Share of the image, 0 to 0.95, that a stream of people covers on average; it replaces the movers,
             and 0 means no movers.
         start_dynamic: Whether the movers are in view from the first frame on.
         situation: Name of a difficult situation (``names()["situations"]``).
         seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics; None for 640x480 with 525 px focal length.
-        motion_blur: Exposure time as a share of the frame interval.
+        camera: Intrinsics; None for 640x480 with 525 px focal length, or with the view of the sensor.
+        motion_blur: Exposure time as a share of the frame interval; None for 0, or that of the sensor.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
-        faults: What the sensor does and its files do not say; None for a sensor without faults.
+        sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
+        faults: What the sensor does and its files do not say; None for no faults, or those of the sensor.
 
     Raises:
         ConfigError: An argument is invalid; the message names the known values.
     """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)
+    model = find_camera(sensor) if sensor is not None else None
+    noise = noise or (model.noise if model else "kinect")
+    motion_blur = motion_blur if motion_blur is not None else model.motion_blur if model else 0.0
+    faults = faults or (model.faults if model else SensorFaults())
+    camera = camera or (model.camera(640, 480) if model else DEFAULT_CAMERA)
     _check("motion_blur", motion_blur, 0, 1)
     _check("exposure_change", exposure_change, 0, 0.9)
     if speed is not None:
@@ -334,7 +398,7 @@ def sequence(
     names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
     path = special.camera_path if camera_path is None else camera_path
     at_once = start_dynamic or special.start_dynamic
-    times = np.round(np.arange(frames) / fps, 6)
+    times = faults.frame_times(frames, fps, seed)
     staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
     if coverage is not None and coverage > 0:
         if movers is not None and set(names) - {"person", "people"}:
@@ -363,6 +427,7 @@ def sequence(
         "camera_path": str(path),
         "frames": frames,
         "fps": fps,
+        "sensor": sensor,
         "noise": noise,
         "speed": speed,
         "coverage": coverage,
@@ -378,7 +443,7 @@ def sequence(
         world,
         actors,
         ground_truth,
-        camera or DEFAULT_CAMERA,
+        camera,
         noise=noise,
         seed=seed,
         fps=fps,
