@@ -66,6 +66,35 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 
 @app.command()
+def sensors(
+    out: Annotated[Path, typer.Option("--out", help="Output folder for sensors.md, .csv and .json.")] = Path(
+        "runs/benchmark/sensors"
+    ),
+    only: Annotated[str, typer.Option("--only", help="Comma-separated sensors; default: all.")] = "",
+    jobs: JobsOption = 1,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Measure the same synthetic room with faulty sensors and named cameras, with colour, without it, and by default.
+
+    The default must be within 5 % of the better of the other two columns.
+    """
+    from dudmap.benchmark.color_columns import color_table, measure_columns
+    from dudmap.benchmark.suites import sensor_entries
+    from dudmap.benchmark.table import save
+    from dudmap.config import Config
+    from dudmap.pipeline.environment import machine, versions
+
+    entries = sensor_entries([name for name in only.split(",") if name])
+    rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
+    text = color_table(rows)
+    save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
+    typer.echo(text)
+    typer.echo(f"written to {out}")
+
+
+@app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
         "tests/gate.toml"
