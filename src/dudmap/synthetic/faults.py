@@ -37,7 +37,7 @@ LIMITS: dict[str, tuple[float, float]] = {
 BAND_ROWS, MOST_BANDS = 16, 24
 """Rows of a colour image with a rolling shutter are rendered in up to ``MOST_BANDS`` bands of one time each, of at
 least ``BAND_ROWS`` rows; the time of a row is then wrong by at most 1/30 of the readout at 240 rows, 1/48 from 384
-rows on."""
+rows on. Blurred images need fewer: there it is wrong by at most half the step between two moments of the exposure."""
 
 
 @dataclass(frozen=True)
@@ -137,12 +137,15 @@ class SensorFaults:
         rows = np.arange(-margin, height + margin)
         return self.color_delay + self.color_readout * ((rows + 0.5) / height - 0.5)
 
-    def row_bands(self, height: int, margin: int = 0) -> list[tuple[int, int, float]]:
+    def row_bands(self, height: int, margin: int = 0, step: float = 0.0) -> list[tuple[int, int, float]]:
         """Bands of rows rendered at one time: first row, row after the last, and time relative to the stamp, s.
 
         Rows count from 0 at the upper edge of an image that is ``margin`` rows larger at the top and at the bottom.
+        Bands need not differ by less than ``step`` seconds, the resolution of a blurred exposure.
         """
         count = max(min(MOST_BANDS, height // BAND_ROWS), 1) if self.color_readout else 1
+        if step > 0:
+            count = min(count, max(int(np.ceil(abs(self.color_readout) / step)), 1))
         times = self.row_times(height, margin)
         edges = np.linspace(0, len(times), count + 1).astype(int)
         return [(int(a), int(b), float(times[a:b].mean())) for a, b in pairwise(edges)]

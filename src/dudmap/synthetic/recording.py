@@ -282,7 +282,7 @@ class SyntheticSequence:
         if self._motion_blur <= 0 or sharp.color is None:
             return sharp
         color = np.zeros_like(sharp.color)
-        shares = self._exposure_shares()
+        shares = (np.arange(5) - 2) / 5 * self._motion_blur  # of the time between two frames
         for share in shares:
             moment = t + share / self._fps
             inside = min(max(moment, self.timestamps[0]), self.timestamps[-1])
@@ -291,10 +291,6 @@ class SyntheticSequence:
             color += blurred.color / len(shares)
         return replace(sharp, color=color)
 
-    def _exposure_shares(self) -> NDArray[np.float64]:
-        """Moments of a blurred exposure around its middle, as shares of the time between two frames."""
-        return (np.arange(5) - 2) / 5 * self._motion_blur if self._motion_blur > 0 else np.zeros(1)
-
     def _separate_color(self, t: float) -> NDArray[np.float32]:
         """Colour (H, W, 3) of the frame stamped ``t`` from the place of the colour camera, at the time of every row."""
         camera, T_depth_color = self.color_camera, self.faults.T_depth_color
@@ -302,8 +298,10 @@ class SyntheticSequence:
         height, width = camera.height + 2 * margin, camera.width + 2 * margin
         camera = replace(camera, cx=camera.cx + margin, cy=camera.cy + margin, width=width, distortion=())
         color = np.zeros((height, width, 3), dtype=np.float32)
-        shares = self._exposure_shares()
-        for first, last, offset in self.faults.row_bands(self.camera.height, margin):
+        moments = int(np.clip(round(self._motion_blur / 0.1), 3, 5)) if self._motion_blur > 0 else 1
+        shares = (np.arange(moments) - (moments - 1) / 2) / moments * self._motion_blur
+        step = self._motion_blur / moments / self._fps
+        for first, last, offset in self.faults.row_bands(self.camera.height, margin, step):
             low, high = max(first - 1, 0), min(last + 1, height)  # pixels at a border look at their neighbours
             band = replace(camera, cy=camera.cy - low, height=high - low)
             for share in shares:
@@ -427,7 +425,7 @@ def sequence(
         "camera_path": str(path),
         "frames": frames,
         "fps": fps,
-        "sensor": sensor,
+        "sensor_name": sensor,
         "noise": noise,
         "speed": speed,
         "coverage": coverage,
