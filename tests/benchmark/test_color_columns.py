@@ -62,6 +62,7 @@ def test_suite_takes_one_room_with_every_sensor():
     entries = {entry.name: entry for entry in sensor_entries()}
     assert set(entries) == set(SENSORS)
     assert set(CAMERAS) <= set(entries)
+    assert {entry.parameters["camera"] for entry in sensor_entries(quick=True)} == {(320, 240)}
     small = {"frames": 2, "camera": (64, 48)}
     delayed = Entry("a", parameters={**entries["delay"].parameters, **small}).open()
     assert delayed.faults.color_delay == 0.025

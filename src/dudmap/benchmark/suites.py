@@ -56,7 +56,7 @@ SYNTHETIC: dict[str, dict[str, object]] = {
     "plane-person": {"scene": "plane"},
     "room-realsense": {"noise": "realsense"},
 }
-ROOM = {"movers": (), "camera": (320, 240), "frames": 120}
+ROOM = {"movers": (), "frames": 120}
 UNREGISTERED = {"color_translation": (0.025, 0.0, 0.0), "color_focal_ratio": 0.95}
 DELAY = {"color_delay": 0.025}
 ROLLING = {"color_readout": 0.025}
@@ -127,8 +127,8 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     return Suite(name, [_short(entry) for entry in found] if quick else found, missing)
 
 
-def sensor_entries(names: list[str] | None = None) -> list[Entry]:
-    """The room of suite ``sensors``, taken with every sensor or with the named ones.
+def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> list[Entry]:
+    """The room of suite ``sensors``, taken with every sensor or with the named ones, ``quick`` in small images.
 
     Raises:
         ConfigError: A name is unknown.
@@ -136,7 +136,8 @@ def sensor_entries(names: list[str] | None = None) -> list[Entry]:
     unknown = [name for name in names or [] if name not in SENSORS]
     if unknown:
         raise ConfigError(f"unknown sensor of the suite {unknown[0]!r}; known are {', '.join(SENSORS)}")
-    return [Entry(name, parameters=ROOM | SENSORS[name]) for name in names or SENSORS]
+    size = {"camera": (320, 240) if quick else (640, 480)}
+    return [Entry(name, parameters=ROOM | size | SENSORS[name]) for name in names or SENSORS]
 
 
 def _short(entry: Entry) -> Entry:

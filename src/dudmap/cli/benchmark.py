@@ -72,6 +72,7 @@ def sensors(
     ),
     only: Annotated[str, typer.Option("--only", help="Comma-separated sensors; default: all.")] = "",
     jobs: JobsOption = 1,
+    quick: QuickOption = False,
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
@@ -86,7 +87,7 @@ def sensors(
     from dudmap.config import Config
     from dudmap.pipeline.environment import machine, versions
 
-    entries = sensor_entries([name for name in only.split(",") if name])
+    entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
     rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
     text = color_table(rows)
     save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
