@@ -10,7 +10,7 @@ from dudmap.errors import ConfigError
 from dudmap.geometry.camera import Camera
 from dudmap.synthetic import SensorFaults
 from dudmap.synthetic.cameras import CAMERAS
-from dudmap.synthetic.color_faults import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
+from dudmap.synthetic.color_camera import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
 from dudmap.synthetic.depth_faults import WAVE_NUMBER, with_flying_pixels, with_multipath
 from dudmap.synthetic.faults import LIMITS, parse_faults
 from dudmap.synthetic.folder import write_folder

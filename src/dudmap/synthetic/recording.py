@@ -17,7 +17,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.cameras import find_camera
-from dudmap.synthetic.color_faults import Lens, compressed, exposure_gains, vignette, white_balance
+from dudmap.synthetic.color_camera import ColorCamera, compressed, exposure_gains, white_balance
 from dudmap.synthetic.crowd import crowd_of
 from dudmap.synthetic.depth_faults import DepthFaults
 from dudmap.synthetic.faults import SensorFaults
@@ -90,6 +90,7 @@ class SyntheticSequence:
         self._motion_blur, self._exposure_change = motion_blur, exposure_change
         self._sensor = Sensor(noise, seed)
         self._depth_faults = DepthFaults(self.faults, camera, seed)
+        self._color_camera = ColorCamera(self.faults, camera, motion_blur / fps, 1 / fps)
         owned = [p for mover in movers for p in mover.primitives]
         self._owner = np.repeat(np.arange(len(movers)), [len(mover.primitives) for mover in movers])
         self._renderer = Renderer(scene, scene.primitives + owned)
@@ -133,7 +134,7 @@ class SyntheticSequence:
     @property
     def color_camera(self) -> Camera:
         """True intrinsics of the colour camera."""
-        return self.faults.color_camera(self.camera)
+        return self._color_camera.camera
 
     @property
     def sensor_model(self) -> SensorModel | TimeOfFlightModel | None:
@@ -225,16 +226,10 @@ class SyntheticSequence:
 
     def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
         """What the sensor measures apart from noise: depth with its systematic errors, colour with its exposure."""
-        faults, color, depth = self.faults, rendering.color, rendering.depth
-        assert color is not None
-        if faults.auto_exposure:
-            color = color * np.float32(self.exposure_gains[index])
-        if faults.white_balance_drift:
-            color = color * white_balance(faults, float(self.timestamps[index]))
-        if faults.vignetting:
-            color = color * vignette(faults, self.camera)
-        if self._depth_faults:
-            depth = self._depth_faults.apply(depth, index)
+        assert rendering.color is not None
+        gain = float(self.exposure_gains[index])
+        color = self._color_camera.exposed(rendering.color, float(self.timestamps[index]), gain)
+        depth = self._depth_faults.apply(rendering.depth, index) if self._depth_faults else rendering.depth
         return replace(rendering, depth=depth, color=color)
 
     @cached_property
@@ -243,12 +238,7 @@ class SyntheticSequence:
         if not self.faults.auto_exposure:
             return np.ones(len(self))
         camera = self.color_camera.resized(max(self.camera.width // 8, 16), max(self.camera.height // 8, 16))
-        levels = np.empty(len(self))
-        for k, t in enumerate(self.timestamps):
-            T_world_color = self.ground_truth.Ts_world_camera[k] @ self.faults.T_depth_color
-            small = self._render_at(float(t), T_world_color, camera, True).color
-            assert small is not None
-            levels[k] = small.mean()
+        levels = np.array([self._seen_by_color_camera(float(t), camera).mean() for t in self.timestamps])
         return exposure_gains(levels, self.timestamps, self.faults.auto_exposure)
 
     def sensor_truth(self) -> dict[str, object]:
@@ -262,10 +252,6 @@ class SyntheticSequence:
             truth["white_balance_rgb"] = [white_balance(self.faults, float(t)).tolist() for t in self.timestamps]
         return truth
 
-    @cached_property
-    def _lens(self) -> Lens:
-        return Lens(self.color_camera)
-
     def _mask_of(self, rendering: Rendering, index: int) -> NDArray[np.bool_]:
         t = float(self.timestamps[index])
         moving = np.array([mover.present(t) and self._moves(mover, t) for mover in self._movers], dtype=bool)
@@ -278,7 +264,7 @@ class SyntheticSequence:
         if not with_color:
             return sharp
         if self.faults.color_is_separate:
-            return replace(sharp, color=self._separate_color(t))
+            return replace(sharp, color=self._color_camera.view(t, self._seen_by_color_camera))
         if self._motion_blur <= 0 or sharp.color is None:
             return sharp
         color = np.zeros_like(sharp.color)
@@ -291,25 +277,11 @@ class SyntheticSequence:
             color += blurred.color / len(shares)
         return replace(sharp, color=color)
 
-    def _separate_color(self, t: float) -> NDArray[np.float32]:
-        """Colour (H, W, 3) of the frame stamped ``t`` from the place of the colour camera, at the time of every row."""
-        camera, T_depth_color = self.color_camera, self.faults.T_depth_color
-        margin = self._lens.margin if camera.distortion else 0
-        height, width = camera.height + 2 * margin, camera.width + 2 * margin
-        camera = replace(camera, cx=camera.cx + margin, cy=camera.cy + margin, width=width, distortion=())
-        color = np.zeros((height, width, 3), dtype=np.float32)
-        moments = int(np.clip(round(self._motion_blur / 0.1), 3, 5)) if self._motion_blur > 0 else 1
-        shares = (np.arange(moments) - (moments - 1) / 2) / moments * self._motion_blur
-        step = self._motion_blur / moments / self._fps
-        for first, last, offset in self.faults.row_bands(self.camera.height, margin, step):
-            low, high = max(first - 1, 0), min(last + 1, height)  # pixels at a border look at their neighbours
-            band = replace(camera, cy=camera.cy - low, height=high - low)
-            for share in shares:
-                moment = t + offset + share / self._fps
-                seen = self._render_at(moment, self._pose_at(moment) @ T_depth_color, band, True).color
-                assert seen is not None
-                color[first:last] += seen[first - low : last - low] / np.float32(len(shares))
-        return self._lens.distort(color) if margin else color
+    def _seen_by_color_camera(self, t: float, camera: Camera) -> NDArray[np.float32]:
+        """Colour (H, W, 3) at time ``t`` of an ideal camera at the place of the colour camera."""
+        color = self._render_at(t, self._pose_at(t) @ self.faults.T_depth_color, camera, True).color
+        assert color is not None
+        return color
 
     def _pose_at(self, t: float) -> NDArray[np.float64]:
         """Pose of the depth camera at any time; before the first and after the last frame with constant velocity."""
