@@ -1,19 +1,23 @@
 """Figures of the development recordings, compared with their targets.
 
     python benchmarks/recordings.py --data FOLDER [--systems dudmap,none] [--only fr1_xyz_static] [--out DIR]
+    python benchmarks/recordings.py --data FOLDER --columns color
 
 Runs every system on every recording of a folder, one after the other, each in its own process. The semi-synthetic
 recordings fr1_xyz_static, fr1_xyz_confusao, pan_confusao and ist_confusao (by folder name) have targets; others are
-scored only. Prints the table and writes recordings.md, .csv and .json.
+scored only. Prints the table and writes recordings.md, .csv and .json. With ``--columns color`` the columns are the
+default, the registration with and without the colour term, and the better of these two.
 """
 
 import argparse
 from pathlib import Path
 
+from dudmap.benchmark.color_columns import color_table, measure_columns
 from dudmap.benchmark.entries import local_entries
 from dudmap.benchmark.measure import Job, Row, measure_all
 from dudmap.benchmark.systems import systems
 from dudmap.benchmark.table import COLUMNS, Column, grid, markdown, save
+from dudmap.config import Config
 from dudmap.pipeline.environment import machine, versions
 
 TWINS = {"fr1_xyz_confusao": "fr1_xyz_static"}
@@ -29,6 +33,11 @@ TARGETS: dict[str, list[tuple[str, str, float, str]]] = {
     "ist_confusao": [("drift_rmse_m", "translation RMSE from the first frame, m", 0.015, "<=")],
 }
 """Key, meaning, bound and direction of the targets, by recording."""
+COMPARED = {
+    "pan_confusao": Column("rotation_rmse_deg", "rotation RMSE, deg", 1, 3),
+    "ist_confusao": Column("drift_rmse_m", "drift RMSE, mm", 1000, 2),
+}
+"""Figure of ``--columns color`` of the recordings whose ATE says little."""
 EVERYWHERE = [("ms_per_frame_median", "ms per frame, median", 100.0, "<="), ("peak_rss_mb", "peak MB", 2000.0, "<=")]
 
 
@@ -56,6 +65,10 @@ def verdicts(rows: list[Row]) -> str:
     return grid(["sequence", "system", "what", "target", "measured", "reached"], lines, words=3)
 
 
+def _announce(row: Row) -> None:
+    print(row["sequence"], row["system"], row.get("error", "done"), flush=True)
+
+
 def main() -> None:
     """Command line of the script."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -64,18 +77,25 @@ def main() -> None:
     parser.add_argument("--only", default="", help="comma-separated names of recordings")
     parser.add_argument("--out", type=Path, default=Path("runs/recordings"))
     parser.add_argument("--max-frames", type=int, default=None)
+    parser.add_argument("--columns", choices=["color"], default=None, help="what colour brings")
     parser.add_argument("--set", action="append", default=[], help="key=value applied to every system")
     arguments = parser.parse_args()
     wanted = [name for name in arguments.only.split(",") if name]
     entries = [entry for entry in local_entries(arguments.data) if not wanted or entry.name in wanted]
     if arguments.max_frames:
         entries = [type(entry)(entry.name, entry.path, max_frames=arguments.max_frames) for entry in entries]
+    if arguments.columns:
+        rows = measure_columns(entries, Config().override(arguments.set), done=_announce)
+        text = color_table(rows, COMPARED)
+        save(rows, text, arguments.out, "color", {"machine": machine(), "versions": versions()})
+        print(text)
+        return
     jobs = [
         Job(entry, name, config.override(arguments.set), arguments.out / name / entry.name)
         for entry in entries
         for name, config in systems(arguments.systems).items()
     ]
-    rows = measure_all(jobs, 1, lambda row: print(row["sequence"], row["system"], row.get("error", "done"), flush=True))
+    rows = measure_all(jobs, 1, _announce)
     with_twins(rows)
     columns = [*COLUMNS[:3], Column("twin_ratio", "x static twin", 1, 2), *COLUMNS[3:]]
     text = markdown(rows, columns) + "\nTargets:\n\n" + verdicts(rows)

@@ -150,7 +150,7 @@ def test_frames_depend_on_seed_and_index_only():
     assert not np.array_equal(other[7].depth, later.depth)
 
 
-@pytest.mark.parametrize("noise", ["kinect", "realsense"])
+@pytest.mark.parametrize("noise", ["kinect", "realsense", "d435"])
 def test_depth_noise_grows_with_the_square_of_depth(noise):
     model = SENSORS[noise]
     camera = Camera(525, 525, 319.5, 239.5, 640, 480)

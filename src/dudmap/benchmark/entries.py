@@ -1,7 +1,7 @@
 """Entries of a benchmark suite: descriptions of recordings, which another process can open."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,7 +19,8 @@ class Entry:
     Attributes:
         name: Name in tables, folders and published figures.
         path: Folder of a recording on disk; None for a synthetic one.
-        parameters: Arguments of ``dudmap.synthetic.sequence``; ``camera`` is a (width, height) in pixels.
+        parameters: Arguments of ``dudmap.synthetic.sequence``; ``camera`` is a (width, height) in pixels, ``faults`` a
+            mapping of the fields of ``SensorFaults`` that differ from those of the sensor.
         address: Public page it can be downloaded from, empty if there is none.
         max_frames: Use only this many frames from the start.
     """
@@ -41,10 +42,16 @@ class Entry:
 
             return open_sequence(self.path)
         from dudmap.synthetic import sequence
+        from dudmap.synthetic.cameras import find_camera
+        from dudmap.synthetic.faults import SensorFaults
         from dudmap.synthetic.recording import DEFAULT_CAMERA
 
         size = self.parameters.get("camera", (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height))
-        return sequence(**{**self.parameters, "camera": DEFAULT_CAMERA.resized(*size)})
+        sensor = self.parameters.get("sensor")
+        camera = find_camera(sensor).camera(*size) if sensor else DEFAULT_CAMERA.resized(*size)
+        usual = find_camera(sensor).faults if sensor else SensorFaults()
+        faults = replace(usual, **self.parameters.get("faults", {}))
+        return sequence(**{**self.parameters, "camera": camera, "faults": faults})
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
         """True static surface and its observed part, in the frame of the ground truth, if known."""

@@ -17,6 +17,17 @@ WORLDS: dict[str, dict[str, Any]] = {
     "room-people-at-start": {"frames": 40, "situation": "people_at_start"},
     "room-crowd": {"frames": 64, "coverage": 0.35},
     "desk-fast-camera": {"frames": 40, "scene": "desk", "movers": (), "camera_path": "fast"},
+    "colour-faults": {
+        "frames": 60,
+        "movers": (),
+        "faults": {
+            "color_translation": (0.025, 0.0, 0.0),
+            "color_focal_ratio": 0.95,
+            "color_delay": 0.025,
+            "color_readout": 0.025,
+        },
+    },
+    "kinect-v1": {"frames": 40, "situation": "people_at_start", "sensor": "kinect_v1"},
 }
 EXCERPT = "freiburg1_xyz"
 """Twelve real frames among the test fixtures."""

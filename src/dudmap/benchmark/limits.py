@@ -135,12 +135,12 @@ ConditionJob = tuple[Condition, dict[str, tuple[Config, Path]]]
 
 def _fingerprint(condition: Condition, config: Config) -> str:
     """File name that is unique to the code, the configuration and the condition."""
-    text = f"{_code_hash()}{astuple(condition)}{SIZE}{FPS}{LARGEST_ATE}{SAMPLES}{config.to_toml()}"
+    text = f"{code_hash()}{astuple(condition)}{SIZE}{FPS}{LARGEST_ATE}{SAMPLES}{config.to_toml()}"
     return hashlib.sha256(text.encode()).hexdigest()[:20]
 
 
 @cache
-def _code_hash() -> str:
+def code_hash() -> str:
     """SHA-256 of all sources of the package."""
     import dudmap
 

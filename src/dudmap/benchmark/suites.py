@@ -56,6 +56,25 @@ SYNTHETIC: dict[str, dict[str, object]] = {
     "plane-person": {"scene": "plane"},
     "room-realsense": {"noise": "realsense"},
 }
+ROOM = {"movers": (), "frames": 120}
+UNREGISTERED = {"color_translation": (0.025, 0.0, 0.0), "color_focal_ratio": 0.95}
+DELAY = {"color_delay": 0.025}
+ROLLING = {"color_readout": 0.025}
+EXPOSURE = {"auto_exposure": 0.3, "white_balance_drift": 0.05, "vignetting": 0.3}
+SENSORS: dict[str, dict[str, object]] = {
+    "clean": {},
+    "unregistered": {"faults": UNREGISTERED},
+    "delay": {"faults": DELAY},
+    "rolling-blur": {"faults": ROLLING, "motion_blur": 0.5},
+    "exposure": {"faults": EXPOSURE},
+    "all-colour-faults": {"faults": UNREGISTERED | DELAY | ROLLING | EXPOSURE, "motion_blur": 0.5},
+    "depth-faults": {"faults": {"depth_distortion": 0.01, "depth_bands": 0.001, "depth_scale_error": 0.005}},
+    **{
+        name: {"sensor": name}
+        for name in ("kinect_v1", "kinect_v2", "realsense_d435", "realsense_l515", "iphone_lidar")
+    },
+}
+"""The same static room, taken with sensors of different faults and with named cameras."""
 QUICK = ("room-static", "room-person", "room-people-at-start")
 
 
@@ -106,6 +125,19 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
             raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
         found, missing = _located(_entries(name), data)
     return Suite(name, [_short(entry) for entry in found] if quick else found, missing)
+
+
+def sensor_entries(names: list[str] | None = None, *, quick: bool = False) -> list[Entry]:
+    """The room of suite ``sensors``, taken with every sensor or with the named ones, ``quick`` in small images.
+
+    Raises:
+        ConfigError: A name is unknown.
+    """
+    unknown = [name for name in names or [] if name not in SENSORS]
+    if unknown:
+        raise ConfigError(f"unknown sensor of the suite {unknown[0]!r}; known are {', '.join(SENSORS)}")
+    size = {"camera": (320, 240) if quick else (640, 480)}
+    return [Entry(name, parameters=ROOM | size | SENSORS[name]) for name in names or SENSORS]
 
 
 def _short(entry: Entry) -> Entry:

@@ -66,6 +66,74 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 
 @app.command()
+def sensors(
+    out: Annotated[Path, typer.Option("--out", help="Output folder for sensors.md, .csv and .json.")] = Path(
+        "runs/benchmark/sensors"
+    ),
+    only: Annotated[str, typer.Option("--only", help="Comma-separated sensors; default: all.")] = "",
+    jobs: JobsOption = 1,
+    quick: QuickOption = False,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Measure the same synthetic room with faulty sensors and named cameras, with colour, without it, and by default.
+
+    The default must be within 5 % of the better of the other two columns.
+    """
+    from dudmap.benchmark.color_columns import color_table, measure_columns
+    from dudmap.benchmark.suites import sensor_entries
+    from dudmap.benchmark.table import save
+    from dudmap.config import Config
+    from dudmap.pipeline.environment import machine, versions
+
+    entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
+    rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
+    text = color_table(rows)
+    save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
+    typer.echo(text)
+    typer.echo(f"written to {out}")
+
+
+@app.command()
+def random(
+    count: Annotated[int, typer.Option("--count", min=1, help="Number of worlds.")] = 40,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the worlds.")] = 0,
+    only: Annotated[str, typer.Option("--only", help="Comma-separated numbers of worlds, instead of --count.")] = "",
+    out: Annotated[Path, typer.Option("--out", help="Output folder for the rows and the report.")] = Path(
+        "runs/benchmark/random"
+    ),
+    jobs: JobsOption = 1,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Measure random worlds with random sensors: distribution of the ATE, silent failures, and the worst worlds.
+
+    Every world is written to the folder as soon as it is measured; an interrupted run of the same code continues.
+    """
+    from dudmap.benchmark.random_worlds import measure_worlds, report
+    from dudmap.config import Config
+    from dudmap.errors import ConfigError
+
+    try:
+        numbers = [int(number) for number in only.split(",") if number] or list(range(count))
+    except ValueError:
+        raise ConfigError(f"cannot understand --only {only!r}; expected numbers of worlds, such as 3,17") from None
+    rows = measure_worlds(seed, numbers, Config().override(assignments or []), out, jobs, _print_world)
+    text = report(rows, seed)
+    (out / f"seed-{seed}.md").write_text(text, encoding="utf-8")
+    typer.echo(text)
+    typer.echo(f"written to {out}")
+
+
+def _print_world(row: dict[str, Any]) -> None:
+    ate = row.get("ate_rmse_m")
+    figure = row.get("error") or "no ATE" if ate is None else f"{100 * ate:.2f} cm, {row['lost']} lost"
+    typer.echo(f"world {row['world']}: {figure}", err=True)
+
+
+@app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
         "tests/gate.toml"

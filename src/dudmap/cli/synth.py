@@ -52,27 +52,56 @@ def synth(
     ] = None,
     frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 120,
     fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0,
-    noise: Annotated[str, typer.Option("--noise", help="Sensor: kinect, realsense or none.")] = "kinect",
+    sensor: Annotated[
+        str | None,
+        typer.Option(
+            "--sensor",
+            help="A camera with its noise, faults and view: kinect_v1, kinect_v2, realsense_d435, realsense_l515 or "
+            "iphone_lidar.",
+        ),
+    ] = None,
+    noise: Annotated[
+        str | None,
+        typer.Option(
+            "--noise",
+            help="Noise of depth and colour: kinect (default without --sensor), realsense, d435, kinect_v2, l515, "
+            "iphone, or none.",
+        ),
+    ] = None,
     seed: Annotated[int, typer.Option("--seed", help="Seed of path, appearance and noise.", min=0)] = 0,
     size: Annotated[str, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = "640x480",
     motion_blur: Annotated[
-        float, typer.Option("--motion-blur", help="Exposure time as a share of the frame interval.")
-    ] = 0.0,
+        float | None,
+        typer.Option("--motion-blur", help="Exposure time as a share of the frame interval, by default 0."),
+    ] = None,
     exposure_change: Annotated[
         float, typer.Option("--exposure-change", help="Relative amplitude of a slow oscillation of the exposure.")
     ] = 0.0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="NAME=VALUE",
+            help="A fault of the sensor, on top of --sensor, such as color_delay=0.025; repeatable. "
+            "The names are in docs/synthetic.md; an unknown one lists them.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
     """Render a synthetic recording with exact ground truth.
 
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
-    surface_observed.ply and scene.json.
+    surface_observed.ply, scene.json and sensor_truth.json.
     """
     from dudmap import synthetic
+    from dudmap.synthetic.cameras import find_camera
+    from dudmap.synthetic.faults import parse_faults
     from dudmap.synthetic.folder import write_folder
     from dudmap.synthetic.recording import DEFAULT_CAMERA
 
+    model = find_camera(sensor) if sensor is not None else None
+    width, height = _size(size)
     sequence = synthetic.sequence(
         scene=scene,
         movers=_names(movers),
@@ -85,9 +114,11 @@ def synth(
         start_dynamic=start_dynamic,
         situation=situation,
         seed=seed,
-        camera=DEFAULT_CAMERA.resized(*_size(size)),
+        camera=model.camera(width, height) if model else DEFAULT_CAMERA.resized(width, height),
         motion_blur=motion_blur,
         exposure_change=exposure_change,
+        sensor=sensor,
+        faults=parse_faults(fault or [], model.faults if model else None),
     )
     if quiet:
         write_folder(sequence, out, overwrite=overwrite)

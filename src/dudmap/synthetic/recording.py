@@ -3,6 +3,7 @@
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -15,13 +16,17 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.synthetic.cameras import find_camera
+from dudmap.synthetic.color_camera import ColorCamera, compressed, exposure_gains, white_balance
 from dudmap.synthetic.crowd import crowd_of
+from dudmap.synthetic.depth_faults import DepthFaults
+from dudmap.synthetic.faults import SensorFaults
 from dudmap.synthetic.movers import MOVING_SPEED, Staging, SyntheticMover, build_movers
 from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
 from dudmap.synthetic.rooms import build_scene
 from dudmap.synthetic.scene import Scene
-from dudmap.synthetic.sensors import Sensor, SensorModel
+from dudmap.synthetic.sensors import Sensor, SensorModel, TimeOfFlightModel
 from dudmap.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
 from dudmap.synthetic.surface import count_views, tessellate, with_faces
 
@@ -53,7 +58,8 @@ class SyntheticSequence:
 
     Attributes:
         name: Names of scene and movers.
-        camera: Intrinsics.
+        camera: Intrinsics of the depth camera, which are also those that the files state for colour.
+        faults: What the sensor does and its files do not say.
         timestamps: (N,) seconds.
         ground_truth: Exact camera poses.
         parameters: Arguments from which it was made.
@@ -72,15 +78,19 @@ class SyntheticSequence:
         fps: float,
         motion_blur: float = 0.0,
         exposure_change: float = 0.0,
+        faults: SensorFaults | None = None,
         parameters: dict[str, object] | None = None,
     ) -> None:
         self.scene, self.camera, self.ground_truth = scene, camera, ground_truth
+        self.faults = faults or SensorFaults()
         self.timestamps = ground_truth.timestamps
         self.parameters = dict(parameters or {})
         self.name = "-".join([scene.name, *dict.fromkeys(mover.name for mover in movers)])
         self._movers, self._noise, self._seed, self._fps = movers, noise, seed, fps
         self._motion_blur, self._exposure_change = motion_blur, exposure_change
         self._sensor = Sensor(noise, seed)
+        self._depth_faults = DepthFaults(self.faults, camera, seed)
+        self._color_camera = ColorCamera(self.faults, camera, motion_blur / fps, 1 / fps)
         owned = [p for mover in movers for p in mover.primitives]
         self._owner = np.repeat(np.arange(len(movers)), [len(mover.primitives) for mover in movers])
         self._renderer = Renderer(scene, scene.primitives + owned)
@@ -110,7 +120,11 @@ class SyntheticSequence:
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth, colour and visible primitive of a frame, without sensor noise."""
+        """Ideal depth and visible primitive of a frame, and what falls on the colour camera.
+
+        The colour has the place, time and lens of the colour camera, but no noise, and neither its exposure, white
+        balance, vignetting nor compression.
+        """
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
@@ -118,7 +132,12 @@ class SyntheticSequence:
         return self._render(self._number(index), with_color=False).depth
 
     @property
-    def sensor_model(self) -> SensorModel | None:
+    def color_camera(self) -> Camera:
+        """True intrinsics of the colour camera."""
+        return self._color_camera.camera
+
+    @property
+    def sensor_model(self) -> SensorModel | TimeOfFlightModel | None:
         """Noise model of the sensor, None for an ideal one."""
         return self._sensor.model
 
@@ -144,6 +163,7 @@ class SyntheticSequence:
             fps=self._fps,
             motion_blur=self._motion_blur,
             exposure_change=self._exposure_change,
+            faults=self.faults,
             parameters=self.parameters | {"movers": []},
         )
 
@@ -194,13 +214,43 @@ class SyntheticSequence:
         index = self._number(index)
         if index not in self._kept:
             rendering = self._render(index, with_color=True)
-            depth, color = self._sensor.measure(rendering, self.camera.fx, index)
+            depth, color = self._sensor.measure(self._with_errors(rendering, index), self.camera.fx, index)
+            if self.faults.jpeg_quality:
+                color = compressed(color, self.faults.jpeg_quality)
             frame = Frame(float(self.timestamps[index]), depth, color)
             self._kept[index] = (frame, self._mask_of(rendering, index))
             while len(self._kept) > 2:
                 self._kept.popitem(last=False)
         frame, mask = self._kept[index]
         return replace(frame, depth=frame.depth.copy(), color=frame.color.copy()), mask
+
+    def _with_errors(self, rendering: Rendering, index: int) -> Rendering:
+        """What the sensor measures apart from noise: depth with its systematic errors, colour with its exposure."""
+        assert rendering.color is not None
+        gain = float(self.exposure_gains[index])
+        color = self._color_camera.exposed(rendering.color, float(self.timestamps[index]), gain)
+        depth = self._depth_faults.apply(rendering.depth, index) if self._depth_faults else rendering.depth
+        return replace(rendering, depth=depth, color=color)
+
+    @cached_property
+    def exposure_gains(self) -> NDArray[np.float64]:
+        """Factors (N,) of the automatic exposure; they follow the mean brightness of small images of every frame."""
+        if not self.faults.auto_exposure:
+            return np.ones(len(self))
+        camera = self.color_camera.resized(max(self.camera.width // 8, 16), max(self.camera.height // 8, 16))
+        levels = np.array([self._seen_by_color_camera(float(t), camera).mean() for t in self.timestamps])
+        return exposure_gains(levels, self.timestamps, self.faults.auto_exposure)
+
+    def sensor_truth(self) -> dict[str, object]:
+        """Everything that the sensor does and its files do not say, for a JSON file."""
+        truth = self.faults.truth(self.camera)
+        if self._depth_faults:
+            truth |= self._depth_faults.truth()
+        if self.faults.auto_exposure:
+            truth["exposure_gains"] = self.exposure_gains.tolist()
+        if self.faults.white_balance_drift:
+            truth["white_balance_rgb"] = [white_balance(self.faults, float(t)).tolist() for t in self.timestamps]
+        return truth
 
     def _mask_of(self, rendering: Rendering, index: int) -> NDArray[np.bool_]:
         t = float(self.timestamps[index])
@@ -210,20 +260,40 @@ class SyntheticSequence:
 
     def _render(self, index: int, with_color: bool) -> Rendering:
         t = float(self.timestamps[index])
-        sharp = self._render_at(t, self.ground_truth.Ts_world_camera[index], with_color)
-        if not with_color or self._motion_blur <= 0 or sharp.color is None:
+        sharp = self._render_at(t, self.ground_truth.Ts_world_camera[index], self.camera, with_color)
+        if not with_color:
+            return sharp
+        if self.faults.color_is_separate:
+            return replace(sharp, color=self._color_camera.view(t, self._seen_by_color_camera))
+        if self._motion_blur <= 0 or sharp.color is None:
             return sharp
         color = np.zeros_like(sharp.color)
         shares = (np.arange(5) - 2) / 5 * self._motion_blur  # of the time between two frames
         for share in shares:
             moment = t + share / self._fps
             inside = min(max(moment, self.timestamps[0]), self.timestamps[-1])
-            blurred = self._render_at(moment, self.ground_truth.interpolate(inside), True)
+            blurred = self._render_at(moment, self.ground_truth.interpolate(inside), self.camera, True)
             assert blurred.color is not None
             color += blurred.color / len(shares)
         return replace(sharp, color=color)
 
-    def _render_at(self, t: float, T_world_camera: NDArray[np.float64], with_color: bool) -> Rendering:
+    def _seen_by_color_camera(self, t: float, camera: Camera) -> NDArray[np.float32]:
+        """Colour (H, W, 3) at time ``t`` of an ideal camera at the place of the colour camera."""
+        color = self._render_at(t, self._pose_at(t) @ self.faults.T_depth_color, camera, True).color
+        assert color is not None
+        return color
+
+    def _pose_at(self, t: float) -> NDArray[np.float64]:
+        """Pose of the depth camera at any time; before the first and after the last frame with constant velocity."""
+        stamps, Ts = self.timestamps, self.ground_truth.Ts_world_camera
+        if stamps[0] <= t <= stamps[-1]:
+            return self.ground_truth.interpolate(t)
+        if len(stamps) == 1:
+            return Ts[0]
+        at = 0 if t < stamps[0] else len(stamps) - 2
+        return se3.interpolate(Ts[at], Ts[at + 1], (t - stamps[at]) / (stamps[at + 1] - stamps[at]))
+
+    def _render_at(self, t: float, T_world_camera: NDArray[np.float64], camera: Camera, with_color: bool) -> Rendering:
         Ts = np.empty((len(self._owner), 4, 4))
         present = np.zeros(len(self._owner), dtype=bool)
         start = 0
@@ -236,7 +306,7 @@ class SyntheticSequence:
                 Ts[start:end] = np.eye(4)
             start = end
         gain = 1.0 + self._exposure_change * np.sin(2 * np.pi * t / 2.7)
-        return self._renderer.render(self.camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
+        return self._renderer.render(camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
 
 
 def sequence(
@@ -245,15 +315,17 @@ def sequence(
     camera_path: str | Path | None = None,
     frames: int = 120,
     fps: float = 30.0,
-    noise: str = "kinect",
+    noise: str | None = None,
     speed: float | None = None,
     coverage: float | None = None,
     start_dynamic: bool = False,
     situation: str | None = None,
     seed: int = 0,
     camera: Camera | None = None,
-    motion_blur: float = 0.0,
+    motion_blur: float | None = None,
     exposure_change: float = 0.0,
+    sensor: str | None = None,
+    faults: SensorFaults | None = None,
 ) -> SyntheticSequence:
     """Set up a synthetic recording; its frames are rendered on access.
 
@@ -264,22 +336,29 @@ def sequence(
             situation.
         frames: Number of frames.
         fps: Frames per second.
-        noise: Sensor: ``kinect``, ``realsense`` or ``none`` (exact depth).
+        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or that of the sensor.
         speed: Speed of the movers in m/s; None for the natural speed of each.
         coverage: Share of the image, 0 to 0.95, that a stream of people covers on average; it replaces the movers,
             and 0 means no movers.
         start_dynamic: Whether the movers are in view from the first frame on.
         situation: Name of a difficult situation (``names()["situations"]``).
         seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics; None for 640x480 with 525 px focal length.
-        motion_blur: Exposure time as a share of the frame interval.
+        camera: Intrinsics; None for 640x480 with 525 px focal length, or with the view of the sensor.
+        motion_blur: Exposure time as a share of the frame interval; None for 0, or that of the sensor.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
+        sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
+        faults: What the sensor does and its files do not say; None for no faults, or those of the sensor.
 
     Raises:
         ConfigError: An argument is invalid; the message names the known values.
     """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)
+    model = find_camera(sensor) if sensor is not None else None
+    noise = noise or (model.noise if model else "kinect")
+    motion_blur = motion_blur if motion_blur is not None else model.motion_blur if model else 0.0
+    faults = faults or (model.faults if model else SensorFaults())
+    camera = camera or (model.camera(640, 480) if model else DEFAULT_CAMERA)
     _check("motion_blur", motion_blur, 0, 1)
     _check("exposure_change", exposure_change, 0, 0.9)
     if speed is not None:
@@ -289,7 +368,7 @@ def sequence(
     names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
     path = special.camera_path if camera_path is None else camera_path
     at_once = start_dynamic or special.start_dynamic
-    times = np.round(np.arange(frames) / fps, 6)
+    times = faults.frame_times(frames, fps, seed)
     staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
     if coverage is not None and coverage > 0:
         if movers is not None and set(names) - {"person", "people"}:
@@ -318,6 +397,7 @@ def sequence(
         "camera_path": str(path),
         "frames": frames,
         "fps": fps,
+        "sensor_name": sensor,
         "noise": noise,
         "speed": speed,
         "coverage": coverage,
@@ -333,12 +413,13 @@ def sequence(
         world,
         actors,
         ground_truth,
-        camera or DEFAULT_CAMERA,
+        camera,
         noise=noise,
         seed=seed,
         fps=fps,
         motion_blur=motion_blur,
         exposure_change=exposure_change,
+        faults=faults,
         parameters=parameters,
     )
 

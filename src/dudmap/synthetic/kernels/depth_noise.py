@@ -105,3 +105,90 @@ def measure_color(row_from, row_to, exact, table, key, sigma, color):
                 noise = table[(bits >> np.uint64(16 * channel)) & np.uint64(0xFFFF)]
                 value = exact[v, u, channel] + sigma * noise + np.float32(0.5)
                 color[v, u, channel] = np.uint8(min(max(value, np.float32(0.0)), np.float32(255.0)))
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def measure_range(row_from, row_to, exact, cosines, smooth, offsets, key, model, depth):
+    """Depth readings of a time-of-flight sensor in the rows; ``model`` is ``sensors.TimeOfFlightModel.row``.
+
+    Arguments as of ``measure_depth``. The standard deviation is (s0 + s1 z + s2 z^2) plus
+    s_angle z^1.5 (theta / (pi/2 - theta))^2, theta the angle of incidence.
+    """
+    height, width = exact.shape
+    wrap = smooth.shape[0] - 1
+    s0, s1, s2, s_angle, lateral = model[0], model[1], model[2], model[3], model[4]
+    nearest, fade, farthest = model[5], model[6], model[7]
+    grazing, edge_loss, speckle = model[8], model[9], model[10]
+    for v in range(row_from, row_to):
+        for u in range(width):
+            depth[v, u] = 0
+            a = smooth[(v + offsets[0, 0]) & wrap, (u + offsets[0, 1]) & wrap]
+            b = smooth[(v + offsets[1, 0]) & wrap, (u + offsets[1, 1]) & wrap]
+            x = min(max(int(np.floor(u + lateral * a + 0.5)), 0), width - 1)
+            y = min(max(int(np.floor(v + lateral * b + 0.5)), 0), height - 1)
+            z = exact[y, x]
+            if not nearest <= z <= farthest:
+                continue
+            bits = _mix(v, u, key)
+            chance = np.float32(bits & np.uint64(0xFFFF)) / np.float32(65536.0)
+            other_chance = np.float32((bits >> np.uint64(16)) & np.uint64(0xFFFF)) / np.float32(65536.0)
+            lost = np.float32(speckle)
+            if z > fade:
+                lost += np.float32((z - fade) / (farthest - fade)) ** 2
+            jump = np.float32(0.0)
+            for k in range(4):
+                uu = min(max(u + (1 if k == 0 else -1 if k == 1 else 0), 0), width - 1)
+                vv = min(max(v + (1 if k == 2 else -1 if k == 3 else 0), 0), height - 1)
+                jump = max(jump, abs(z - exact[vv, uu]))
+            if jump > 0.04 * z + 0.02:
+                lost += np.float32(edge_loss)
+            cosine = cosines[y, x]
+            if cosine < grazing:
+                lost += np.float32(1.5 * (grazing - cosine) / grazing)
+            if chance < lost:
+                continue
+            theta = np.arccos(min(max(cosine, np.float32(0.05)), np.float32(1.0)))
+            slant = theta / (0.5 * np.pi - theta)
+            sigma = s0 + z * (s1 + z * s2) + s_angle * z * np.sqrt(z) * slant * slant
+            c = smooth[(v + offsets[2, 0]) & wrap, (u + offsets[2, 1]) & wrap]
+            d = smooth[(v + offsets[3, 0]) & wrap, (wrap - u + offsets[3, 1]) & wrap]
+            white = np.float32(np.sqrt(12.0)) * (other_chance - np.float32(0.5))
+            reading = z + sigma * (0.65 * (c + d) + 0.394 * white)
+            if nearest <= reading <= farthest:
+                depth[v, u] = np.float32(reading)
+
+
+@njit(nogil=True, cache=True, error_model="numpy")
+def multipath(row_from, row_to, points, normals, patches, gain, wave_number, ratio):
+    """Measured over true depth (H, W) in the rows [row_from, row_to); see ``depth_faults.with_multipath``.
+
+    points, normals (H, W, 3) float32, camera frame; patches (Q, 9) float32: point, normal, distance from the camera,
+    area and irradiance; gain = reflectance / pi; wave_number of the modulation, rad/m of path.
+    """
+    _, width, _ = points.shape
+    for v in range(row_from, row_to):
+        for u in range(width):
+            px, py, pz = points[v, u, 0], points[v, u, 1], points[v, u, 2]
+            nx, ny, nz = normals[v, u, 0], normals[v, u, 1], normals[v, u, 2]
+            ratio[v, u] = 1
+            d = np.sqrt(px * px + py * py + pz * pz)
+            direct = -(px * nx + py * ny + pz * nz) / max(d * d * d, np.float32(1e-9))
+            if pz <= 0 or direct <= np.float32(0.02) / (d * d):
+                continue
+            real, imaginary = np.float32(1.0), np.float32(0.0)
+            for q in range(patches.shape[0]):
+                rx, ry, rz = patches[q, 0] - px, patches[q, 1] - py, patches[q, 2] - pz
+                out = rx * nx + ry * ny + rz * nz
+                back = -(rx * patches[q, 3] + ry * patches[q, 4] + rz * patches[q, 5])
+                if out <= 0 or back <= 0:
+                    continue
+                squared = rx * rx + ry * ry + rz * rz
+                r = np.sqrt(squared)
+                # A patch is no point: its solid angle is bounded by smoothing 1 / r^2 with its area.
+                form = out * back / (squared * (squared + patches[q, 7]))
+                share = gain * patches[q, 8] / direct * form * patches[q, 7]
+                if share > np.float32(1e-4):
+                    phase = wave_number * (patches[q, 6] + r - d)
+                    real += share * np.cos(phase)
+                    imaginary += share * np.sin(phase)
+            ratio[v, u] = 1 + np.float32(0.5) * np.arctan2(imaginary, real) / (wave_number * d)
