@@ -101,7 +101,7 @@ def test_bilateral_is_close_to_the_equations_and_removes_noise():
 
 
 def test_a_slanted_plane_stays_where_it_is():
-    """A window that lacks one side, at the border of the image or of a hole, does not pull a slope towards the other."""
+    """A window that lacks a side, at the border of the image or of a hole, does not pull a slope to the other."""
     depth = np.repeat(1.0 + 0.004 * np.arange(48, dtype=np.float32)[:, None], 64, axis=1)
     depth[20:28, 30:40] = 0
     found = observe(depth, filter="bilateral", fill_holes=False).depth

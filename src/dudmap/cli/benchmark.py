@@ -134,6 +134,34 @@ def _print_world(row: dict[str, Any]) -> None:
 
 
 @app.command()
+def bias(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Static recording with true poses; default: exact synthetic rooms.")
+    ] = None,
+    stride: Annotated[int, typer.Option("--stride", min=1, help="Register every so many frames.")] = 4,
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of synthetic rooms.")] = 3,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Measure how far each term of the registration pulls a frame from its true pose."""
+    from dudmap import synthetic
+    from dudmap.benchmark.bias import bias_table, measure_pulls
+    from dudmap.config import Config
+    from dudmap.sequences import open_sequence
+
+    config = Config().override(assignments or [])
+    if recording is not None:
+        typer.echo(bias_table(measure_pulls(open_sequence(recording), config, stride)))
+        return
+    for scene in ("room", "corridor"):
+        for seed in range(seeds):
+            world = synthetic.sequence(scene, movers=(), frames=120, noise="none", seed=seed)
+            typer.echo(f"{scene}, seed {seed}, exact:\n")
+            typer.echo(bias_table(measure_pulls(world, config, stride)))
+
+
+@app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
         "tests/gate.toml"

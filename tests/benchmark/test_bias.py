@@ -1,0 +1,70 @@
+"""The instrument for systematic errors of the registration."""
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from dudmap import Config, synthetic
+from dudmap.benchmark.bias import bias_table, measure_pulls
+from dudmap.errors import DatasetError
+from dudmap.geometry.camera import Camera
+
+CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return synthetic.sequence("room", movers=(), frames=30, noise="none", seed=5, camera=CAMERA)
+
+
+def test_no_term_pulls_in_an_exact_world(room):
+    for pull in measure_pulls(room, Config(), stride=3):
+        # the size of an image pixel there is 1 cm, twice that of the full images for which the docs state the figures
+        assert np.abs(pull.mean[:3]).max() < 1.0, pull
+        assert np.abs(pull.mean[3:]).max() < 0.03, pull
+
+
+class Displaced:
+    """The recording with colours of a camera whose principal point is ``shift`` pixels off."""
+
+    def __init__(self, sequence, shift):
+        self._sequence, self._shift = sequence, shift
+
+    def __getattr__(self, name) -> Any:
+        return getattr(self._sequence, name)
+
+    def __len__(self):
+        return len(self._sequence)
+
+    def __getitem__(self, index):
+        frame = self._sequence[index]
+        shift = self._shift if index % 2 else -self._shift
+        return replace(frame, color=np.ascontiguousarray(np.roll(frame.color, shift, axis=1)))
+
+
+def test_colours_that_alternate_sideways_spread_the_poses_that_colour_wants(room):
+    """A shift of every other image by 2 f / z pixels is a sideways motion; distances must not notice it."""
+    displaced: Any = Displaced(room, 2)
+    exact = {pull.term: pull for pull in measure_pulls(room, Config())}
+    shifted = {pull.term: pull for pull in measure_pulls(displaced, Config())}
+
+    def sideways(pull):
+        """Shift of the image that the correction causes at 2 m, pixels: both motions move it alike."""
+        return CAMERA.fx * (pull.spread[0] / 1000 / 2 + np.radians(pull.spread[4]))
+
+    assert sideways(shifted["colour"]) > 1.0 > 2 * sideways(exact["colour"])
+    assert np.allclose(shifted["distances"].corrections, exact["distances"].corrections, atol=1e-6)
+
+
+def test_table_has_a_row_for_each_term(room):
+    table = bias_table(measure_pulls(room, Config(), stride=15))
+    assert [row.split("|")[1].strip() for row in table.splitlines()[2:]] == ["distances", "colour", "both"]
+
+
+def test_a_recording_without_true_poses_is_refused(room):
+    untrue: Any = Displaced(room, 0)
+    untrue.ground_truth = None
+    with pytest.raises(DatasetError, match="has no true poses"):
+        measure_pulls(untrue, Config())
