@@ -105,7 +105,8 @@ def _registered(
             "both": (both.H, both.b),
         }[term]
         diagonal = np.diag(H)
-        step = -np.linalg.solve(H + np.diag(DAMPING * diagonal + 1e-12 * (1 + diagonal.max())), b)
+        damped = H + np.diag(DAMPING * diagonal + 1e-12 * (1 + diagonal.max()))
+        step = np.asarray(-np.linalg.solve(damped, b), dtype=np.float64)
         T = se3.retract(T, step)
         if np.linalg.norm(step) < tracker.config.stop / 10:
             break
