@@ -32,6 +32,10 @@ class SensorConfig(ConfigSection):
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
 
+    color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
+    """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
+    row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""
+
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
         return self.sigma_base + self.sigma_scale * z**2

@@ -99,6 +99,7 @@ class Tracker:
         static_weights: list[NDArray[np.float32]] | None = None,
         first_level: int = 0,
         exposure: tuple[float, float] = (1.0, 0.0),
+        color_weight: float | None = None,
     ) -> TrackingResult:
         """Pose that minimises the distances and intensity differences of a frame to the map (eq. 4.32).
 
@@ -109,6 +110,7 @@ class Tracker:
             static_weights: Per level (h, w) float32 in [0, 1]; None weighs every pixel 1.
             first_level: Index of the first of these levels in the configuration.
             exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
+            color_weight: Weight of the intensity term; None takes that of the configuration.
         """
         volume.look_at(T_init)
         T, iterations, system, settled = T_init, 0, None, True
@@ -119,21 +121,21 @@ class Tracker:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
             lit = exposed(level, exposure)
-            system = self.linearize(volume, lit, T, weights)
+            system = self.linearize(volume, lit, T, weights, color_weight)
             iterations += 1
             if self.config.exposure and index == 0 and first_level == 0:
                 change = fit_exposure(lit.intensity, system.residuals[1], weights)
                 if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
                     lit = exposed(level, exposure)
-                    system = self.linearize(volume, lit, T, weights)
+                    system = self.linearize(volume, lit, T, weights, color_weight)
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
             stop = self.config.stop if finest else self.config.stop_coarse
-            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop)
+            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight)
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
-            system = self.linearize(volume, lit, T, weights)
+            system = self.linearize(volume, lit, T, weights, color_weight)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
         return replace(self._judge(T, exposure, system, lit, weights, iterations), settled=settled)
@@ -147,6 +149,7 @@ class Tracker:
         system: LinearSystem,
         limit: int,
         stop: float,
+        color_weight: float | None,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
         accepted if it decreases the cost.
@@ -164,7 +167,7 @@ class Tracker:
             T_trial, length = se3.retract(T, step), np.linalg.norm(step)
             if length < stop:  # too short to need another linearisation
                 return T_trial, system, used, True
-            trial = self.linearize(volume, level, T_trial, weights)
+            trial = self.linearize(volume, level, T_trial, weights, color_weight)
             used += 1
             gain = abs(trial.cost - system.cost)
             settled = length < SHORT_STEP * stop and gain < self.config.stop_gain * system.cost
