@@ -72,7 +72,7 @@ class Slam:
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
-        self.redundancy = RedundantViews(config.similarity)
+        self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -149,16 +149,15 @@ class Slam:
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
-        is_redundant = self.redundancy.compare(view.observation.rgb, prediction.T_world_camera)
         estimate = self.front_end.register(self.reference, view, prediction)
         reason = self.monitor.rejection_reason(view, estimate)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
-        with view.timer("similarity"):
-            fuse = not (is_redundant(estimate.T_world_camera) or view.blind)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
         self._accept(view, estimate)
+        with view.timer("similarity"):
+            fuse = not (view.blind or self.redundancy.is_redundant(self.volume, view, estimate))
         mask = self._dynamic_mask(view, estimate)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
@@ -255,7 +254,7 @@ class Slam:
             color = exposed_color(observation.rgb, estimate.exposure)
             frame = Frame(observation.timestamp, observation.depth, color)
             self.atlas.integrate(frame, static, estimate.T_world_camera)
-            self.redundancy.set_reference(observation.rgb, estimate.T_world_camera)
+            self.redundancy.update(self.volume, view, estimate)
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
