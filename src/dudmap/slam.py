@@ -150,7 +150,7 @@ class Slam:
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        reason = self.monitor.rejection_reason(view, estimate)
+        reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
         if reason and not relocalized:
@@ -188,6 +188,7 @@ class Slam:
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
+        self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:

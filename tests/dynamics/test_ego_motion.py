@@ -217,8 +217,8 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
-    assert monitor.rejection_reason(view, well_known) == ""
-    assert "rest where the map" in monitor.rejection_reason(view, unknown)
+    assert monitor.rejection_reason(view, well_known, lambda: None) == ""
+    assert "rest where the map" in monitor.rejection_reason(view, unknown, lambda: None)
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
