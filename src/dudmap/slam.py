@@ -214,9 +214,9 @@ class Slam:
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
+        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
         self.front_end.lose(view.timestamp)
-        self.relocalizer.lost(view.timestamp)
-        if self.relocalizer.wants_new_submap(view.observation):
+        if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
             self.relocalizer.found()

@@ -65,6 +65,11 @@ class PosePredictor:
         self.ego_motion.start(view.timestamp)
         self._single_frame_map = self._crowded_start = True
 
+    def is_crowded(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
+        """Whether most of the view has moved since the map was begun, or in the last tracked frame, whose dynamic
+        pixels (h, w) are given; None for none."""
+        return self._crowded_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
+
     def predict(
         self, volume: TsdfVolume, view: FrameView, previously_dynamic: NDArray[np.bool_] | None
     ) -> PosePrediction:
