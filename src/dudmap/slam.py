@@ -156,8 +156,9 @@ class Slam:
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
         self._accept(view, estimate)
+        uncertain = self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
-            fuse = not (view.blind or self.redundancy.is_redundant(self.volume, view, estimate))
+            fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
         mask = self._dynamic_mask(view, estimate)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
@@ -166,7 +167,7 @@ class Slam:
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers,
+            corrected=corrected, movers=movers, uncertain=uncertain,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -287,6 +288,7 @@ class Slam:
         relocalized: bool = False,
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
+        uncertain: str = "",
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
@@ -297,7 +299,7 @@ class Slam:
             lost_reason=reason,
             T_world_camera=T_world_camera,
             fused=fused,
-            skipped_similar=not (fused or reason or view.blind),
+            skipped_similar=not (fused or reason or uncertain or view.blind),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
@@ -309,6 +311,7 @@ class Slam:
             submap=self.atlas.current,
             corrected=corrected,
             blind=view.blind,
+            uncertain=uncertain,
         )
 
     def _make_volume(self) -> TsdfVolume:
