@@ -29,6 +29,7 @@ class FakeResult:
     relocalized: bool = False
     corrected: bool = False
     blind: bool = False
+    uncertain: str = ""
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None

@@ -157,14 +157,15 @@ def test_nothing_to_start_from_is_lost():
 
 
 def test_a_redundant_view_gets_a_pose_but_is_not_fused():
-    camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
-    sequence = synthetic.sequence("room", movers=(), frames=3, camera=camera, noise="none")
-    frame = sequence[0]
-    slam = Slam(camera)
-    slam.process(frame)
-    result = slam.process(Frame(frame.timestamp + 0.03, frame.depth, frame.color))
-    assert (result.state, result.fused, result.skipped_similar) == ("tracked", False, True)
-    assert len(slam.trajectory) == 2
+    sequence = synthetic.sequence("room", movers=(), camera_path="still", frames=24, camera=SMALL)
+    slam = Slam(SMALL)
+    results = [slam.process(sequence[index]) for index in range(24)]
+    redundant = [result.skipped_similar for result in results]
+    assert not any(redundant[: 2 * slam.config.volume.free_after])
+    assert sum(redundant) >= 4
+    assert [result.fused for result in results] == [not skipped for skipped in redundant]
+    assert {result.state for result in results} == {"tracked"}
+    assert len(slam.trajectory) == 24
 
 
 def test_frames_that_do_not_fit_the_camera_are_refused():

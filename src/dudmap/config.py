@@ -70,22 +70,22 @@ class SimilarityConfig(ConfigSection):
     """Detection of redundant views, which are not fused (thesis section 4.3)."""
 
     enabled: bool = True
-    """Do not fuse frames that show the same as the last fused frame; they are still tracked."""
+    """Do not fuse frames that show what the map already has; they are still tracked."""
+    measure: Literal["information", "features"] = "information"
+    """What the map knows of the view by its weights (information), or the SIFT features of the last fused frame that
+    are found again (features; thesis section 4.3)."""
     threshold: float = Field(default=0.84, gt=0, le=1)
-    """Share of matched SIFT features of the last fused frame above which a view is redundant (thesis section 4.3)."""
+    """Share of the view that is known, by either measure, above which it is redundant (thesis section 4.3)."""
     ratio: float = Field(default=0.7, gt=0, lt=1)
-    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance."""
+    """Threshold of Lowe's ratio test: nearest over second nearest descriptor distance (features only)."""
     image_width: int = Field(default=320, ge=80)
-    """Width of the image in which features are detected, pixels."""
+    """Width of the image in which features are detected, pixels (features only)."""
     max_features: int = Field(default=500, ge=50)
-    """Largest number of features per frame."""
+    """Largest number of features per frame (features only)."""
     max_translation: float = Field(default=0.005, ge=0)
     """Translation since the last fused frame above which a view counts as new without the test, metres; 0 tests all."""
     max_rotation_deg: float = Field(default=0.3, ge=0)
     """Rotation since the last fused frame above which a view counts as new without the test, degrees."""
-    patience: int = Field(default=5, ge=0)
-    """Number of frames without a test after a test that found no redundant view, since the test takes as long as the
-    rest of a frame. Doubles with every further such test, at most to eightfold (exponential back-off)."""
 
 
 class VolumeConfig(ConfigSection):
@@ -410,7 +410,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "stop_coarse": 1e-3,
             "stop_gain": 0.0,
         },
-        "similarity": {"threshold": 0.84, "patience": 0},
+        "similarity": {"measure": "features", "threshold": 0.84},
         "preprocess": {"filter_alpha": 0.012, "filter_sigma_px": 4.0},
         # Algorithm 1 gives all voxels the distance d_max: a point in seen empty space has the largest residual.
         "dynamics": {"method": "em", "free_space": True, "regions": False, "start_seconds": 0.0},

@@ -72,7 +72,7 @@ class Slam:
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
-        self.redundancy = RedundantViews(config.similarity)
+        self.redundancy = RedundantViews(config)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -149,16 +149,16 @@ class Slam:
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
-        is_redundant = self.redundancy.compare(view.observation.rgb, prediction.T_world_camera)
         estimate = self.front_end.register(self.reference, view, prediction)
-        reason = self.monitor.rejection_reason(view, estimate)
+        reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
-        with view.timer("similarity"):
-            fuse = not (is_redundant(estimate.T_world_camera) or view.blind)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
         self._accept(view, estimate)
+        uncertain = self.predictor.doubt(view, prediction, estimate)
+        with view.timer("similarity"):
+            fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
         mask = self._dynamic_mask(view, estimate)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
@@ -167,7 +167,7 @@ class Slam:
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers,
+            corrected=corrected, movers=movers, uncertain=uncertain,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -189,6 +189,7 @@ class Slam:
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
+        self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
@@ -214,9 +215,9 @@ class Slam:
 
     def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
         """Report a lost frame, or start a new submap with it after a while."""
+        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
         self.front_end.lose(view.timestamp)
-        self.relocalizer.lost(view.timestamp)
-        if self.relocalizer.wants_new_submap(view.observation):
+        if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
             self.relocalizer.found()
@@ -255,7 +256,7 @@ class Slam:
             color = exposed_color(observation.rgb, estimate.exposure)
             frame = Frame(observation.timestamp, observation.depth, color)
             self.atlas.integrate(frame, static, estimate.T_world_camera)
-            self.redundancy.set_reference(observation.rgb, estimate.T_world_camera)
+            self.redundancy.update(self.volume, view, estimate)
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
@@ -287,6 +288,7 @@ class Slam:
         relocalized: bool = False,
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
+        uncertain: str = "",
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
@@ -297,7 +299,7 @@ class Slam:
             lost_reason=reason,
             T_world_camera=T_world_camera,
             fused=fused,
-            skipped_similar=not (fused or reason or view.blind),
+            skipped_similar=not (fused or reason or uncertain or view.blind),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
@@ -309,6 +311,7 @@ class Slam:
             submap=self.atlas.current,
             corrected=corrected,
             blind=view.blind,
+            uncertain=uncertain,
         )
 
     def _make_volume(self) -> TsdfVolume:

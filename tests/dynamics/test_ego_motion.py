@@ -217,8 +217,8 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
-    assert monitor.rejection_reason(view, well_known) == ""
-    assert "rest where the map" in monitor.rejection_reason(view, unknown)
+    assert monitor.rejection_reason(view, well_known, lambda: None) == ""
+    assert "rest where the map" in monitor.rejection_reason(view, unknown, lambda: None)
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
@@ -328,3 +328,30 @@ def test_labels_at_full_size_take_after_the_low_pixel_most_alike_in_depth_else_t
                 if gap < best - 1e-5:
                     best, label = gap, low[i, j]
             assert out[v, u] == label
+
+
+def uncertain_frames(sequence):
+    """Results of a sequence, after the checks that hold for every uncertain frame."""
+    slam = Slam(sequence.camera)
+    results = [slam.process(sequence[index]) for index in range(len(sequence))]
+    assert not any(result.fused or result.skipped_similar for result in results if result.uncertain)
+    return results
+
+
+def test_a_slow_crowd_does_not_bend_a_young_map():
+    camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
+    sequence = synthetic.sequence(
+        "room", coverage=0.42, speed=0.3, start_dynamic=True, frames=16, camera=camera, seed=0
+    )
+    results = uncertain_frames(sequence)
+    assert [bool(result.uncertain) for result in results] == [0 < index < 12 for index in range(16)]
+    truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
+    errors = [np.linalg.norm(result.T_world_camera[:3, 3] - T[:3, 3]) for result, T in zip(results, truth, strict=True)]
+    assert max(errors[12:]) < 0.03, errors  # 6 cm where the first frames are fused
+
+
+def test_an_empty_room_and_a_crowd_that_is_seen_to_move_are_not_uncertain():
+    room = synthetic.sequence("room", movers=(), frames=4, camera=CAMERA)
+    assert not any(result.uncertain for result in uncertain_frames(room))
+    dense = synthetic.sequence("room", coverage=0.7, speed=1.0, start_dynamic=True, frames=4, camera=CAMERA, seed=0)
+    assert not any(result.uncertain for result in uncertain_frames(dense))

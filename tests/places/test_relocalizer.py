@@ -82,6 +82,18 @@ def recover(subject, register, accept=lambda tracking: True, static_mask=None):
     return subject.recover(view, register, accept)
 
 
+def lost_view(timestamp, depth=1.0):
+    """What of a FrameView is used to decide on a new submap."""
+    level = Level(CAMERA, np.full(CAMERA.shape, depth, np.float32), np.ones(CAMERA.shape, np.float32))
+    return SimpleNamespace(
+        observation=frame(timestamp, depth),
+        timestamp=timestamp,
+        labelled=level,
+        pyramid=None,
+        segmentation=lambda: None,
+    )
+
+
 def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
     subject, register = relocalizer([match(0, 0.1), match(1, 0.2), match(0, 0.3), match(1, 0.4)]), Registration()
     assert recover(subject, register, accept=lambda tracking: False) is None
@@ -134,16 +146,16 @@ def test_a_second_pass_verifies_against_the_map_of_the_first():
 
 
 def test_a_new_submap_is_wanted_after_a_while():
-    subject = relocalizer()
-    assert not subject.wants_new_submap(frame(100.0))  # not lost
+    subject = relocalizer(overrides=["dynamics.start_seconds=0"])
+    assert not subject.wants_new_submap(lost_view(100.0))  # not lost
     subject.lost(1.0)
     subject.lost(1.5)  # lost since 1.0 still
     assert subject.is_lost
-    assert not subject.wants_new_submap(frame(1.9))
-    assert subject.wants_new_submap(frame(2.1))
+    assert not subject.wants_new_submap(lost_view(1.9))
+    assert subject.wants_new_submap(lost_view(2.1))
     subject.found()
     assert not subject.is_lost
-    assert not subject.wants_new_submap(frame(2.1))
+    assert not subject.wants_new_submap(lost_view(2.1))
 
 
 @pytest.mark.parametrize(
@@ -153,10 +165,40 @@ def test_a_new_submap_is_wanted_after_a_while():
 def test_reasons_against_a_new_submap(options):
     subject = relocalizer(**options)
     subject.lost(0.0)
-    assert not subject.wants_new_submap(frame(10.0))
+    assert not subject.wants_new_submap(lost_view(10.0))
 
 
 def test_a_frame_without_depth_starts_no_submap():
     subject = relocalizer()
     subject.lost(0.0)
-    assert not subject.wants_new_submap(frame(10.0, depth=0.0))
+    assert not subject.wants_new_submap(lost_view(10.0, depth=0.0))
+
+
+def motion_of(*, moving_share, share):
+    """What of a DominantMotion is used."""
+    moving = np.zeros(CAMERA.shape, bool)
+    moving[: round(moving_share * CAMERA.height)] = True
+    return SimpleNamespace(share=share, moving_after=moving)
+
+
+@pytest.mark.parametrize(
+    ("moving_share", "share", "wanted"),
+    [(0.2, 0.9, True), (0.7, 0.8, False), (0.3, 0.5, False)],
+    ids=["few people", "a near crowd", "a far wall seen between people"],
+)
+@pytest.mark.parametrize("crowded", [False, True])
+def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, share, wanted, crowded):
+    motion = motion_of(moving_share=moving_share, share=share)
+    monkeypatch.setattr("dudmap.places.relocalizer.dominant_motion", lambda *_: motion)
+    subject = relocalizer()
+    subject.lost(0.0, crowded=crowded)
+    assert not subject.wants_new_submap(lost_view(0.5))
+    assert subject.wants_new_submap(lost_view(10.0)) == wanted
+
+
+@pytest.mark.parametrize("crowded", [False, True])
+def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monkeypatch, crowded):
+    monkeypatch.setattr("dudmap.places.relocalizer.dominant_motion", lambda *_: None)
+    subject = relocalizer()
+    subject.lost(0.0, crowded=crowded)
+    assert subject.wants_new_submap(lost_view(10.0)) != crowded

@@ -122,7 +122,7 @@ class DynamicDetector:
         """
 
         def compute() -> Segmentation:
-            return segment(level, self._tolerance(self._sigma(level.depth, voxel_size), level))
+            return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
@@ -165,9 +165,9 @@ class DynamicDetector:
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        sigma = self._sigma(level.depth, volume.voxel_size)
-        noise = np.maximum(np.float32(self.config.noise_threshold), self.config.noise_sigmas * sigma)
-        tolerance = self._tolerance(sigma, level)
+        sigma = distance_sigma(self.sensor, level.depth, volume.voxel_size)
+        noise = noise_threshold(self.config, sigma)
+        tolerance = depth_tolerance(sigma, level)
         frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise, tolerance)
         residual = np.asarray(np.abs(sample.distance) / sigma, np.float32)
         histogram = residual_histogram(residual[frame.surface])
@@ -218,16 +218,6 @@ class DynamicDetector:
         """Forget the remembered frames after a loss of tracking."""
         self.memory.reset()
         self.background.reset()
-
-    def _sigma(self, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
-        """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
-        return np.hypot(self.sensor.sigma(depth), MAP_ROUGHNESS * voxel_size).astype(np.float32)
-
-    @staticmethod
-    def _tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
-        """Largest depth step (h, w) to a neighbour of the same surface, metres."""
-        slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
-        return np.asarray(DEPTH_EDGE_SIGMAS * sigma + slope * level.depth, np.float32)
 
     def _evidence(
         self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture
@@ -312,3 +302,19 @@ class DynamicDetector:
         open_pixels = (distance > frame.noise) | frame.free
         labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0
+
+
+def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
+    """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
+    return np.hypot(sensor.sigma(depth), MAP_ROUGHNESS * voxel_size).astype(np.float32)
+
+
+def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
+    """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w) is that of the depth."""
+    slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
+    return np.asarray(DEPTH_EDGE_SIGMAS * sigma + slope * level.depth, np.float32)
+
+
+def noise_threshold(config: DynamicsConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Distance (h, w) to the map below which nothing is called motion (theta in eq. 4.57), metres."""
+    return np.maximum(np.float32(config.noise_threshold), np.float32(config.noise_sigmas) * sigma)

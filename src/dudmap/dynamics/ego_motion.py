@@ -117,6 +117,7 @@ class EgoMotionSegmenter:
         self.seconds = seconds
         self.active = False
         self._young_until, self._latest_end = -np.inf, -np.inf
+        self._slow_motion_hidden_until = -np.inf
         self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
         self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Segmentation]] = deque()
         self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
@@ -124,6 +125,7 @@ class EgoMotionSegmenter:
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._young_until, self._latest_end = timestamp + self.seconds, timestamp + 2 * self.seconds
+        self._slow_motion_hidden_until = timestamp + min(LONGEST_BASELINE, self.seconds)
 
     @property
     def started(self) -> bool:
@@ -133,6 +135,10 @@ class EgoMotionSegmenter:
     def map_is_young(self, timestamp: float) -> bool:
         """Whether the map cannot tell static from moving yet."""
         return timestamp < self._young_until
+
+    def slow_motion_is_hidden(self, timestamp: float) -> bool:
+        """Whether the map is younger than the longest baseline over which slow motion is looked for."""
+        return timestamp < self._slow_motion_hidden_until
 
     def update(
         self,

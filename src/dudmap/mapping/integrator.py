@@ -102,7 +102,7 @@ class Integrator:
         T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
         view = self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_world)
         self._allocate(blocks, window, view, frame_number)
-        weights = self._reading_weights(depth, camera) if weights is None else weights
+        weights = self.reading_weights(depth, camera) if weights is None else weights
         self._average(blocks, window, view, color, weights, frame_number, count)
         if self.config.carving:
             self._observe_free(blocks, window, view, frame_number, count)
@@ -127,7 +127,7 @@ class Integrator:
         if len(cells):
             window.allocate(cells, blocks, frame_number)
 
-    def _reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
+    def reading_weights(self, depth: NDArray[np.float32], camera: Camera) -> NDArray[np.uint8]:
         """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
         if self.config.weighting == "constant":
             return np.ones(depth.shape, dtype=np.uint8)

@@ -203,6 +203,30 @@ class TsdfVolume:
         T = self.window.T_grid_camera(T_world_camera)
         return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
 
+    def known_share(
+        self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Share of the information on the surface at each reading (h, w) that the map has without it.
+
+        Weights are information: the running average of readings of weight g has the variance 1 / w where w is the sum
+        of their weights (eq. 4.19), and one more reading brings it to 1 / (w + g). The share is w / (w + g), n / (n +
+        1) after n equal readings; 0 where the map has no surface or there is no reading.
+
+        Args:
+            depth: (h, w) float32, metres, 0 = none.
+            camera: Its camera.
+            T_world_camera: (4, 4).
+        """
+        rows, columns = np.nonzero(depth)
+        points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
+        voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
+        slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
+        words = self.blocks.geometry[np.maximum(slots, 0), (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]]
+        weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
+        out = np.zeros(depth.shape, np.float32)
+        out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
+        return out
+
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
         """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
         camera = camera or self.camera

@@ -29,7 +29,7 @@ class RunRecord:
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the JSON object of movers.jsonl.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
-        fused, skipped_similar, relocalized, corrected, blind: Numbers of frames, as in ``FrameResult``.
+        fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
         masked: Number of frames with an external mask, None without external masks.
         dropped: Number of frames dropped by a live run, None otherwise.
     """
@@ -45,6 +45,7 @@ class RunRecord:
     relocalized: int = 0
     corrected: int = 0
     blind: int = 0
+    uncertain: int = 0
     masked: int | None = None
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -85,6 +86,7 @@ class RunRecord:
         self.relocalized += result.relocalized
         self.corrected += result.corrected
         self.blind += result.blind
+        self.uncertain += bool(result.uncertain)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -133,6 +135,7 @@ class RunRecord:
             "relocalized": self.relocalized,
             "corrected": self.corrected,
             "blind": self.blind,
+            "uncertain": self.uncertain,
             "unreadable": len(self.unreadable),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),

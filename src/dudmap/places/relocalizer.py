@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.frames.observation import Observation
+from dudmap.dynamics.ego_motion import AGREED, dominant_motion
+from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
@@ -50,20 +51,27 @@ class Relocalizer:
         self.atlas = atlas
         self.prior_map = prior_map
         self._lost_since: float | None = None
+        self._crowded = False  # most of the view moved in the last tracked frame
+        self._last: FrameView | None = None  # the last lost frame
 
     @property
     def is_lost(self) -> bool:
         """Whether no frame has been tracked since the last call of ``lost``."""
         return self._lost_since is not None
 
-    def lost(self, timestamp: float) -> None:
-        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized."""
+    def lost(self, timestamp: float, *, crowded: bool = False) -> None:
+        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized.
+
+        Args:
+            timestamp: Seconds.
+            crowded: Whether most of the view moved in the last tracked frame.
+        """
         if self._lost_since is None:
-            self._lost_since = timestamp
+            self._lost_since, self._crowded = timestamp, crowded
 
     def found(self) -> None:
         """Record that the camera is tracked again or that a new submap was started."""
-        self._lost_since = None
+        self._lost_since, self._crowded, self._last = None, False, None
 
     def recover(
         self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
@@ -108,17 +116,38 @@ class Relocalizer:
                 return Relocalization(estimate, submap)
         return None
 
-    def wants_new_submap(self, observation: Observation) -> bool:
-        """Whether tracking should go on in a new, empty submap that starts with this frame.
+    def wants_new_submap(self, view: FrameView) -> bool:
+        """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
-        That is the case if the camera has been lost for ``submaps.patience`` seconds, and the frame has enough depth
-        readings for a map and enough features for a keyframe.
+        That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
+        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``.
         """
-        config = self.config.submaps
+        config, observation = self.config.submaps, view.observation
+        last, self._last = self._last, view
         if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
         if observation.timestamp - self._lost_since < config.patience:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
-        return len(self.atlas.keyframes.extract(observation)) >= self.config.relocalization.min_inliers
+        if len(self.atlas.keyframes.extract(observation)) < self.config.relocalization.min_inliers:
+            return False
+        return self._shows_static_world(last, view)
+
+    def _shows_static_world(self, last: FrameView | None, view: FrameView) -> bool:
+        """Whether the motion from the last lost image to this one is certainly that of the camera.
+
+        Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
+        near; the static world may fill most of the surface, since it is far. A map is only begun where one motion does
+        both: at least AGREED of the surface and most of the pixels follow it. Without a common motion, as in images
+        without texture, it is begun unless most of the view moved when the camera was lost. Nothing is examined where
+        images are not compared (``dynamics.start_seconds`` = 0).
+        """
+        if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
+            return True
+        motion = None
+        if last is not None:
+            motion = dominant_motion(last.pyramid, view.pyramid, (last.segmentation(), view.segmentation()))
+        if motion is None:
+            return not self._crowded
+        return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

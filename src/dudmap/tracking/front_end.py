@@ -122,6 +122,7 @@ class FrontEnd:
         velocity = self.motion.update(view.timestamp, tracking.T_world_camera)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
+        self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
         coarse = view.pyramid.coarse

@@ -65,6 +65,27 @@ class PosePredictor:
         self.ego_motion.start(view.timestamp)
         self._single_frame_map = self._crowded_start = True
 
+    def is_crowded(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
+        """Whether most of the view has moved since the map was begun, or in the last tracked frame, whose dynamic
+        pixels (h, w) are given; None for none."""
+        return self._crowded_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
+
+    def doubt(self, view: FrameView, prediction: PosePrediction, estimate: PoseEstimate) -> str:
+        """Sentence on why the labels of a tracked frame cannot be trusted yet, empty if they can.
+
+        In the first moments of a map motion of less than MOVES_PX from image to image cannot be told from that of the
+        camera. If something moves in view, more of it may move, more slowly, and drag the camera along. Where most of
+        the view is seen to move, the rest has been verified to be static corner by corner (``unverified_mask``).
+        """
+        if not self.ego_motion.slow_motion_is_hidden(view.timestamp):
+            return ""
+        moving = np.zeros(view.labelled.depth.shape, bool)
+        for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
+            moving = moving if mask is None else moving | mask
+        if not exceeds_noise_share(moving, view.labelled) or is_majority_dynamic(moving, view.labelled):
+            return ""
+        return "something moves in view, and the map is too young to show what else does"
+
     def predict(
         self, volume: TsdfVolume, view: FrameView, previously_dynamic: NDArray[np.bool_] | None
     ) -> PosePrediction:

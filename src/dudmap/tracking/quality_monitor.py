@@ -8,6 +8,7 @@ from dudmap.config import Config
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
+from dudmap.tracking.image_consistency import ImageConsistency, ImagePose
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.tracker import TrackingResult
 
@@ -40,6 +41,7 @@ class QualityMonitor:
     def __init__(self, config: Config, motion: MotionModel) -> None:
         self.config = config
         self.motion = motion
+        self.images = ImageConsistency(config, motion)
         self.reset()
 
     def reset(self) -> None:
@@ -48,12 +50,14 @@ class QualityMonitor:
         self._shares: deque[float] = deque(maxlen=HISTORY)
         self._colors: deque[float] = deque(maxlen=HISTORY)
         self.recovering = False
+        self.images.reset()
 
-    def rejection_reason(self, view: FrameView, estimate: PoseEstimate) -> str:
+    def rejection_reason(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> str:
         """Sentence on the first check that a registered frame fails, empty if it passes all.
 
         The checks are those of the registration itself (overlap, residual, conditioning), of the camera's velocity, of
-        the residuals against those of the previous frames, and of the share of the view that is static and known.
+        the residuals against those of the previous frames, of the share of the view that is static and known, and of
+        the last image, seen from the new pose. ``image_pose`` computes the pose that two images alone predict.
         """
         tracking, labels = estimate.tracking, estimate.labels
         crowded = labels is not None and is_majority_dynamic(labels.dynamic, view.labelled)
@@ -62,6 +66,7 @@ class QualityMonitor:
             or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
             or self.deviation(tracking, crowded=crowded)
             or self._undetermined(view, estimate)
+            or self.images.contradicts(view, estimate, image_pose)
         )
 
     def deviation(self, tracking: TrackingResult, *, recognized: bool = False, crowded: bool = False) -> str:
