@@ -61,6 +61,7 @@ class FakeSlam:
     def __init__(self, camera, config, first_pass=None):
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
+        self.disparity_drift = SimpleNamespace(state=np.array([0.001, -0.002]), sigma=np.array([0.0003, 0.0004]))
 
     @property
     def trajectory(self):

@@ -31,6 +31,9 @@ class SensorConfig(ConfigSection):
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
+    drift: bool = True
+    """Estimate and correct the drift of the disparity of a sensor that warms up, while the camera is at rest where its
+    map was begun."""
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
@@ -383,6 +386,7 @@ class Config(ConfigSection):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
+        "sensor": {"drift": False},
         "volume": {
             "voxel_size": 0.01,
             # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on

@@ -10,7 +10,7 @@ from dudmap.bootstrap import Bootstrap
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
-from dudmap.frames.exposure import exposed_color
+from dudmap.frames.exposure import exposed, exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
@@ -30,6 +30,7 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.disparity_drift import DisparityDrift
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.front_end import FrontEnd
@@ -73,6 +74,7 @@ class Slam:
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config.similarity)
+        self.disparity_drift = DisparityDrift()
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -143,7 +145,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self.prepare(frame, dynamic_mask)
+        view = self._corrected(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
@@ -171,6 +173,15 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _corrected(self, view: FrameView) -> FrameView:
+        """The frame with its depth corrected for the drift of the sensor; the segments remain as prepared."""
+        correction = self.disparity_drift.correction
+        if not correction:
+            return view
+        with view.timer("correct"):
+            observation = correction.observation(view.observation)
+            return replace(view, observation=observation, pyramid=Pyramid.of(observation, self.camera, self.config))
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -227,9 +238,22 @@ class Slam:
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
         self.front_end.update(self.reference, view, estimate)
+        self._learn_drift(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
+
+    def _learn_drift(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Compare the readings of a static view with the map for a drift of the sensor."""
+        if not self.config.sensor.drift or view.blind:
+            return
+        with view.timer("correct"):
+            level = exposed(view.pyramid.coarse, estimate.exposure)
+            weights = estimate.static_weights([level])
+            self.disparity_drift.update(
+                self.tracker, self.reference, level, estimate.T_world_camera,
+                np.ones_like(level.depth) if weights is None else weights[0], view.timestamp,
+            )  # fmt: skip
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
