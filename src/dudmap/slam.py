@@ -30,6 +30,7 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.disparity_drift import DisparityDrift
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
@@ -75,6 +76,7 @@ class Slam:
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config.similarity)
         self.disparity_drift = DisparityDrift()
+        self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -162,6 +164,7 @@ class Slam:
             return self._lose(view, estimate, reason)
         self._accept(view, estimate)
         mask = self._dynamic_mask(view, estimate)
+        self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
         if fuse:
@@ -254,6 +257,11 @@ class Slam:
                 self.tracker, self.reference, level, estimate.T_world_camera,
                 np.ones_like(level.depth) if weights is None else weights[0], view.timestamp,
             )  # fmt: skip
+
+    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Compare the static readings with the map for the noise of the sensor."""
+        with view.timer("noise"):
+            self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""

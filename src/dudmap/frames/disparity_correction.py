@@ -32,7 +32,9 @@ class DisparityCorrection:
         """Corrected depth (h, w) in metres of ``camera``: z / (1 + z (offset + stretch x)); 0 stays 0."""
         x = (np.arange(camera.width) - camera.cx) / camera.fx
         change = (self.offset + self.stretch * x).astype(np.float32)
-        return depth / (np.float32(1) + depth * change).astype(np.float32)
+        divisor = depth * change
+        divisor += np.float32(1)
+        return np.divide(depth, divisor, out=divisor)
 
     def observation(self, observation: Observation) -> Observation:
         """The observation with corrected depth, also where it has been halved."""
