@@ -59,7 +59,7 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None):
+    def __init__(self, camera, config, first_pass=None, depth_model=None):
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))

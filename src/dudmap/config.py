@@ -34,6 +34,9 @@ class SensorConfig(ConfigSection):
     drift: bool = True
     """Estimate and correct the drift of the disparity of a sensor that warms up, while the camera is at rest where its
     map was begun."""
+    distortion: bool = False
+    """Learn the static distortion of the depth images against the map and write it to ``depth_model.npz``, which the
+    option ``--depth-model`` of later runs with the same camera applies."""
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""

@@ -10,6 +10,7 @@ from dudmap.bootstrap import Bootstrap
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
+from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.exposure import exposed, exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
@@ -30,6 +31,7 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.depth_distortion import DepthDistortion
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.disparity_drift import DisparityDrift
 from dudmap.tracking.estimate import PoseEstimate
@@ -50,9 +52,17 @@ class Slam:
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
+        depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
+            as it is, and with ``sensor.distortion`` learnt further for the next run.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, first_pass: "Slam | None" = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        first_pass: "Slam | None" = None,
+        depth_model: DepthDistortion | None = None,
+    ) -> None:
         self.config = config = config or Config()
         self.preprocess = Preprocessor(camera, config.preprocess)
         self.camera = self.preprocess.camera
@@ -76,6 +86,8 @@ class Slam:
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config.similarity)
         self.disparity_drift = DisparityDrift()
+        self.depth_distortion = depth_model or DepthDistortion()
+        self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
@@ -178,8 +190,8 @@ class Slam:
     # -- steps of process ---------------------------------------------------------------------------------------------
 
     def _corrected(self, view: FrameView) -> FrameView:
-        """The frame with its depth corrected for the drift of the sensor; the segments remain as prepared."""
-        correction = self.disparity_drift.correction
+        """The frame with its depth corrected for what is known of the sensor; the segments remain as prepared."""
+        correction = self.disparity_drift.correction + self._known_distortion
         if not correction:
             return view
         with view.timer("correct"):
@@ -241,22 +253,24 @@ class Slam:
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
         self.front_end.update(self.reference, view, estimate)
-        self._learn_drift(view, estimate)
+        self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _learn_drift(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Compare the readings of a static view with the map for a drift of the sensor."""
-        if not self.config.sensor.drift or view.blind:
+    def _learn_sensor(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Compare the readings of a static view with the map for drift and distortion of the sensor."""
+        sensor, volume, T_world_camera = self.config.sensor, self.reference, estimate.T_world_camera
+        if view.blind or not (sensor.drift or sensor.distortion):
             return
         with view.timer("correct"):
             level = exposed(view.pyramid.coarse, estimate.exposure)
-            weights = estimate.static_weights([level])
-            self.disparity_drift.update(
-                self.tracker, self.reference, level, estimate.T_world_camera,
-                np.ones_like(level.depth) if weights is None else weights[0], view.timestamp,
-            )  # fmt: skip
+            weights = (estimate.static_weights([level]) or [np.ones_like(level.depth)])[0]
+            if sensor.drift:
+                self.disparity_drift.update(self.tracker, volume, level, T_world_camera, weights, view.timestamp)
+            if sensor.distortion:
+                known = self._known_distortion
+                self.depth_distortion.update(self.tracker, volume, level, T_world_camera, weights, known)
 
     def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Compare the static readings with the map for the noise of the sensor."""

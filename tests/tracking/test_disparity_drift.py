@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dudmap.config import TrackerConfig
-from dudmap.frames.disparity_correction import DisparityCorrection
+from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.observation import Level, Observation
 from dudmap.frames.pyramid import halved
 from dudmap.geometry import se3
@@ -50,8 +50,8 @@ def watched(volume, drift, twist=None, noise=0.0, frames=90):
 @pytest.mark.parametrize("drift", [(0.0, 0.012), (-0.01, 0.012)])
 def test_a_drift_is_learnt_and_the_pose_stays(volume, drift):
     found, T = watched(volume, drift, noise=0.002)
-    assert found.correction.offset == pytest.approx(drift[0], abs=0.002)
-    assert found.correction.stretch == pytest.approx(drift[1], abs=0.003)
+    assert found.correction.coefficients[0, 0] == pytest.approx(drift[0], abs=0.002)
+    assert found.correction.coefficients[1, 0] == pytest.approx(drift[1], abs=0.003)
     tracker, exact = Tracker(CONFIG, SENSOR), level_of(corner())
     level = Level(CAMERA, measured(exact.depth, *drift), exact.intensity)
     without = tracker.align(volume, [level], np.eye(4), [ones(level)], first_level=2).T_world_camera
@@ -76,7 +76,7 @@ def test_a_new_map_takes_the_sensor_as_it_is(volume):
     other, level = corner_map(), level_of(corner())
     other.look_at(np.eye(4))
     found.update(Tracker(CONFIG, SENSOR), other, level, np.eye(4), ones(level), 60 / 30)
-    assert found.state == pytest.approx([found.correction.offset, found.correction.stretch], abs=0.01)
+    assert found.state == pytest.approx(found.correction.coefficients[:2, 0].tolist(), abs=0.01)
     assert np.all(found.sigma < 1e-3)
 
 
@@ -87,11 +87,11 @@ def test_the_correction_undoes_the_error_at_every_level():
     gray = frame.color[..., 0].astype(np.float32) / 255
     seen = Observation(0.0, CAMERA, wrong, gray, frame.color, CpuBackend())
     halved(seen, 1)
-    corrected = DisparityCorrection(-0.01, 0.02).observation(seen)
+    corrected = DepthCorrection.linear(-0.01, 0.02).observation(seen)
     np.testing.assert_allclose(corrected.depth, frame.depth, rtol=1e-6)
     true = Observation(0.0, CAMERA, frame.depth, gray, frame.color, CpuBackend())
     depth, expected = halved(corrected, 1)[0], halved(true, 1)[0]
     assert np.array_equal(depth == 0, expected == 0)
     assert np.abs(depth - expected).max() < 5e-4  # the mean of a block is not quite linear in 1 / z
-    assert not DisparityCorrection()
-    assert DisparityCorrection(0.0, 1e-4)
+    assert not DepthCorrection()
+    assert DepthCorrection.linear(0.0, 1e-4)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl",
+    "residuals.npz", "movers.jsonl", "depth_model.npz",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -143,6 +143,10 @@ def write_run_folder(
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
+    if config.sensor.distortion:
+        model = slam.depth_distortion
+        metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
+        steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:
         steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
     problems = []

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.frames.disparity_correction import DisparityCorrection
+from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels.median import median
@@ -57,7 +57,7 @@ class DisparityDrift:
 
     def __init__(self) -> None:
         self.state, self.covariance = np.zeros(2), np.zeros((2, 2))
-        self.correction = DisparityCorrection()
+        self.correction = DepthCorrection()
         self._timestamp: float | None = None
         self._map_id: int | None = None
 
@@ -85,7 +85,7 @@ class DisparityDrift:
             weights: (h, w) float32 static weights in [0, 1].
             timestamp: Seconds.
         """
-        applied = np.array([self.correction.offset, self.correction.stretch])
+        applied = self.correction.coefficients[:2, 0]
         if volume.map_id != self._map_id:  # the map was made of readings corrected in this way, which it now defines
             self._map_id, self.state, self.covariance = volume.map_id, applied, np.zeros((2, 2))
         elapsed = min(timestamp - self._timestamp, MAX_GAP) if self._timestamp is not None else 0.0
@@ -101,7 +101,7 @@ class DisparityDrift:
         self.state = np.clip(
             self.state - self.covariance @ (e + S @ (self.state - applied)), -MAX_CHANGE, MAX_CHANGE
         )  # fmt: skip
-        self.correction = DisparityCorrection(*_significant(self.state, self.covariance).tolist())
+        self.correction = DepthCorrection.linear(*_significant(self.state, self.covariance).tolist())
 
 
 def _at_rest(level: Level, T_world_camera: NDArray[np.float64]) -> bool:
@@ -131,7 +131,7 @@ def _without_pose(
     geometric = tracker.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
     cross = []
     for unit in ((STEP, 0.0), (0.0, STEP)):
-        moved = Level(camera, DisparityCorrection(*unit).depth(level.depth, camera), level.intensity)
+        moved = Level(camera, DepthCorrection.linear(*unit).depth(level.depth, camera), level.intensity)
         cross.append(
             (tracker.linearize(volume, moved, T_world_camera, weights, color_weight=0.0).b - geometric.b) / STEP
         )
