@@ -50,6 +50,8 @@ class PreprocessConfig(ConfigSection):
     """Smallest valid depth, metres; nearer readings are ignored."""
     depth_max: float = Field(default=6.0, gt=0)
     """Largest valid depth, metres; farther readings are ignored."""
+    drop_mixed: bool = False
+    """Drop readings between foreground and background at depth edges (flying pixels), for sensors that give many."""
     fill_holes: bool = True
     """Fill pixels without a reading with the mean of their 5x5 neighbours, where these lie on one surface."""
     filter: Literal["bilateral", "none"] = "bilateral"
