@@ -84,7 +84,7 @@ def test_the_correction_undoes_the_error_at_every_level():
     frame = corner()
     frame.depth[:5] = 0
     wrong = measured(frame.depth, -0.01, 0.02)
-    gray = frame.color[..., 0].astype(np.float32) / 255
+    gray = np.asarray(frame.color[..., 0] / 255, np.float32)
     seen = Observation(0.0, CAMERA, wrong, gray, frame.color, CpuBackend())
     halved(seen, 1)
     corrected = DepthCorrection.linear(-0.01, 0.02).observation(seen)
