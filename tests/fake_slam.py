@@ -8,6 +8,7 @@ import numpy as np
 
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.kernels.parameters import SensorNoise
 from recordings import HEIGHT, WIDTH
 
 TRIANGLE = Mesh(
@@ -59,9 +60,11 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None):
+    def __init__(self, camera, config, first_pass=None, depth_model=None):
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
+        self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
+        self.disparity_drift = SimpleNamespace(state=np.array([0.001, -0.002]), sigma=np.array([0.0003, 0.0004]))
 
     @property
     def trajectory(self):

@@ -10,7 +10,8 @@ from dudmap.bootstrap import Bootstrap
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
-from dudmap.frames.exposure import exposed_color
+from dudmap.frames.depth_correction import DepthCorrection
+from dudmap.frames.exposure import exposed, exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
@@ -30,6 +31,9 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.depth_distortion import DepthDistortion
+from dudmap.tracking.depth_noise import DepthNoise
+from dudmap.tracking.disparity_drift import DisparityDrift
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.front_end import FrontEnd
@@ -48,9 +52,17 @@ class Slam:
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
+        depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
+            as it is, and with ``sensor.distortion`` learnt further for the next run.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, first_pass: "Slam | None" = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        first_pass: "Slam | None" = None,
+        depth_model: DepthDistortion | None = None,
+    ) -> None:
         self.config = config = config or Config()
         self.preprocess = Preprocessor(camera, config.preprocess)
         self.camera = self.preprocess.camera
@@ -73,6 +85,10 @@ class Slam:
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
+        self.disparity_drift = DisparityDrift()
+        self.depth_distortion = depth_model or DepthDistortion()
+        self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
+        self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -143,7 +159,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self.prepare(frame, dynamic_mask)
+        view = self._corrected(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
@@ -160,6 +176,7 @@ class Slam:
         with view.timer("similarity"):
             fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
         mask = self._dynamic_mask(view, estimate)
+        self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
         if fuse:
@@ -171,6 +188,15 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _corrected(self, view: FrameView) -> FrameView:
+        """The frame with its depth corrected for what is known of the sensor; the segments remain as prepared."""
+        correction = self.disparity_drift.correction + self._known_distortion
+        if not correction:
+            return view
+        with view.timer("correct"):
+            observation = correction.observation(view.observation)
+            return replace(view, observation=observation, pyramid=Pyramid.of(observation, self.camera, self.config))
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -228,9 +254,29 @@ class Slam:
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
         self.front_end.update(self.reference, view, estimate)
+        self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
+
+    def _learn_sensor(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Compare the readings of a static view with the map for drift and distortion of the sensor."""
+        sensor, volume, T_world_camera = self.config.sensor, self.reference, estimate.T_world_camera
+        if view.blind or not (sensor.drift or sensor.distortion):
+            return
+        with view.timer("correct"):
+            level = exposed(view.pyramid.coarse, estimate.exposure)
+            weights = (estimate.static_weights([level]) or [np.ones_like(level.depth)])[0]
+            if sensor.drift:
+                self.disparity_drift.update(self.tracker, volume, level, T_world_camera, weights, view.timestamp)
+            if sensor.distortion:
+                known = self._known_distortion
+                self.depth_distortion.update(self.tracker, volume, level, T_world_camera, weights, known)
+
+    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Compare the static readings with the map for the noise of the sensor."""
+        with view.timer("noise"):
+            self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""

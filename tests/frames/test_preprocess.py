@@ -78,6 +78,38 @@ def filtered_separably(depth, alpha, sigma, radius):
     return one_pass(one_pass(depth.astype(np.float64)).T).T
 
 
+def mixed_exactly(depth, focal):
+    """Pixels between two others on both sides, one at a time."""
+    h, w = depth.shape
+    out = np.zeros(depth.shape, bool)
+    for v, u in zip(*np.nonzero(depth), strict=True):
+        z = float(depth[v, u])
+        for k in (1, 2):
+            gap = max(0.01, 0.012 * z * z) + k * 9.5 / focal * z
+            pairs = [(v, u - k, v, u + k), (v - k, u, v + k, u)]
+            for y0, x0, y1, x1 in pairs:
+                if min(y0, x0) < 0 or y1 >= h or x1 >= w:
+                    continue
+                low, high = sorted((float(depth[y0, x0]), float(depth[y1, x1])))
+                out[v, u] |= low > 0 and low + gap < z < high - gap
+    return out
+
+
+def test_flying_pixels_are_dropped_and_steep_surfaces_kept():
+    camera = Camera(500.0, 500.0, 31.5, 23.5, 64, 48)
+    depth = noisy_step()
+    depth[:, 29] = np.where(depth[:, 29] > 0, np.linspace(1.3, 2.0, 48), 0)  # a column between the two surfaces
+    seen = observe(depth, camera, drop_mixed=True).depth
+    expected = mixed_exactly(depth, 500.0)
+    assert np.array_equal(seen, np.where(expected, 0, depth))
+    assert expected[:, 29].mean() > 0.6
+    assert expected[:, :28].sum() == expected[:, 32:].sum() == 0
+    assert np.array_equal(observe(depth, camera, drop_mixed=False).depth, depth)
+    slope = 1.5 * np.tan(np.radians(80)) / 500  # per pixel, of a wall seen at 80 degrees
+    steep = np.broadcast_to(1.5 + slope * np.arange(64, dtype=np.float32), (48, 64)).astype(np.float32)
+    assert np.array_equal(observe(steep, camera, drop_mixed=True).depth, steep)
+
+
 def test_bilateral_equals_separable_oracle():
     depth = noisy_step()
     found = observe(depth, filter="bilateral").depth

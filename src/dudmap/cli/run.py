@@ -47,6 +47,10 @@ def run(
         int,
         typer.Option("--passes", min=1, max=2, help="2: second pass with the map of the first; removes ghosts."),
     ] = 1,
+    depth_model: Annotated[
+        Path | None,
+        typer.Option("--depth-model", help="depth_model.npz of an earlier run: distortion of the depth to remove."),
+    ] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -64,6 +68,7 @@ def run(
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
+        depth_model=depth_model,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

@@ -16,6 +16,8 @@ from dudmap.kernels.parameters import FilterParameters
 
 HOLE_NOISE = 0.01
 """Readings around a small hole may always differ by this much, metres."""
+STEEPEST = 9.5
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
 DEPTH_MIN = 1e-3
 """Smallest lower limit of the depth, metres: 0 means no reading."""
 
@@ -43,6 +45,8 @@ class Preprocessor:
         self._parameters = FilterParameters(
             depth_min=max(self.config.depth_min, DEPTH_MIN),
             depth_max=self.config.depth_max,
+            drop_mixed=self.config.drop_mixed,
+            steepest=STEEPEST / camera.fx,
             fill_holes=self.config.fill_holes,
             hole_noise=HOLE_NOISE,
             smooth=self.config.filter == "bilateral",

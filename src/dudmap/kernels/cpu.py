@@ -64,6 +64,13 @@ class CpuBackend:
         filtering.limit_depth(depth, np.float32(p.depth_min), np.float32(p.depth_max), limited)
         alpha, hole_noise = np.float32(p.alpha), np.float32(p.hole_noise)
         ranges = bands(depth.shape[0], FILTER_ROWS)
+        if p.drop_mixed:
+            whole, limited = limited, np.empty_like(limited)
+            steepest = np.float32(p.steepest)
+            run_bands(
+                lambda start, stop: filtering.drop_mixed(start, stop, whole, alpha, hole_noise, steepest, limited),
+                ranges,
+            )
         if p.fill_holes:
             run_bands(lambda start, stop: filtering.fill_holes(start, stop, limited, alpha, hole_noise, smooth), ranges)
         else:

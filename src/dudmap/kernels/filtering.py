@@ -25,6 +25,49 @@ def limit_depth(depth, low, high, out):
         target[n] = z if (z >= low) & (z <= high) else np.float32(0)
 
 
+@scalar
+def _between(z, a, b, gap):
+    """Whether a reading ``z`` lies between two others by more than ``gap`` of both; none of them may be missing."""
+    low, high = min(a, b), max(a, b)
+    return (low > np.float32(0)) & (z > low + gap) & (z < high - gap)
+
+
+@kernel
+def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
+    """Readings of ``depth`` (H, W) without those between a foreground and a background (flying pixels), which become 0.
+
+    A pixel whose light comes from two surfaces reads a depth between them. It lies behind the one neighbour and in
+    front of the other, one or two pixels away in its row or column, by more than ``max(noise_floor, noise z^2) + slope
+    z``, which no readable surface does.
+
+    Args:
+        row_start, row_stop: Rows.
+        depth: (H, W) float32, metres, 0 = none.
+        noise, noise_floor: Tolerance, 1/m and metres.
+        slope: Step per pixel of the steepest surface that a sensor still reads, as a share of the depth.
+        out: (H, W) float32 out.
+    """
+    h, w = depth.shape
+    zero = np.float32(0)
+    for v in range(row_start, row_stop):
+        middle, row = depth[v], out[v]
+        row[:] = middle
+        for k in range(1, 3):
+            before, here, after = middle[: w - 2 * k], middle[k : w - k], middle[2 * k :]
+            target = row[k : w - k]
+            steepest = np.float32(k) * slope
+            for u in range(here.size):
+                z = here[u]
+                gap = max(noise_floor, noise * z * z) + steepest * z
+                target[u] = zero if _between(z, before[u], after[u], gap) else target[u]
+            if v >= k and v + k < h:
+                above, below = depth[v - k], depth[v + k]
+                for u in range(w):
+                    z = middle[u]
+                    gap = max(noise_floor, noise * z * z) + steepest * z
+                    row[u] = zero if _between(z, above[u], below[u], gap) else row[u]
+
+
 @kernel
 def _distance(line, at, step):
     """Pixels from ``at`` to the next reading along a line; 0 = none within LONGEST_RUN."""

@@ -127,6 +127,8 @@ class FilterParameters(NamedTuple):
 
     Attributes:
         depth_min, depth_max: Range of the readings that are kept, metres.
+        drop_mixed: Whether readings between foreground and background are dropped.
+        steepest: Depth step per pixel of the steepest surface that is kept, as a share of the depth.
         fill_holes: Whether small holes are filled.
         hole_noise: Readings around a small hole may always differ by this much, metres.
         smooth: Whether the bilateral filter is applied.
@@ -137,6 +139,8 @@ class FilterParameters(NamedTuple):
 
     depth_min: float
     depth_max: float
+    drop_mixed: bool
+    steepest: float
     fill_holes: bool
     hole_noise: float
     smooth: bool

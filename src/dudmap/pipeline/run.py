@@ -33,6 +33,7 @@ def run(
     ahead: int = AHEAD,
     live: bool = False,
     passes: int = 1,
+    depth_model: str | Path | None = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -63,6 +64,7 @@ def run(
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
+        depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         observe: Called after each processed frame with its number, what was read, and the result.
 
     Raises:
@@ -71,6 +73,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.slam import Slam
+    from dudmap.tracking.depth_distortion import DepthDistortion
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -83,7 +86,8 @@ def run(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
         )
     given_masks = None if masks is None else _open_masks(masks, sequence)
-    slam = Slam(sequence.camera, config)
+    models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
+    slam = Slam(sequence.camera, config, depth_model=models[0])
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -96,7 +100,7 @@ def run(
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
-                    slam = Slam(sequence.camera, config, first_pass=slam)
+                    slam = Slam(sequence.camera, config, first_pass=slam, depth_model=models[number])
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(

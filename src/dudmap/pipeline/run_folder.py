@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl",
+    "residuals.npz", "movers.jsonl", "depth_model.npz",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -107,6 +107,10 @@ def write_run_folder(
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
     metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
+    noise, drift = slam.depth_noise.fitted(), slam.disparity_drift
+    metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
+    numbers = [round(float(number), 6) for number in (*drift.state, *drift.sigma)]
+    metrics["depth_drift"] = dict(zip(("offset", "stretch", "offset_sigma", "stretch_sigma"), numbers, strict=True))
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()
@@ -139,6 +143,10 @@ def write_run_folder(
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
+    if config.sensor.distortion:
+        model = slam.depth_distortion
+        metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
+        steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:
         steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
     problems = []
