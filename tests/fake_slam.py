@@ -64,7 +64,6 @@ class FakeSlam:
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
-        self.disparity_drift = SimpleNamespace(state=np.array([0.001, -0.002]), sigma=np.array([0.0003, 0.0004]))
 
     @property
     def trajectory(self):

@@ -12,7 +12,6 @@ import pytest
 from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
@@ -98,10 +97,6 @@ def test_a_blank_image_is_lost_not_fused_and_the_next_good_one_is_found(recordin
 def test_frames_made_ready_ahead_by_another_thread_give_the_same(recording):
     sequence, frames = recording
     alone, ahead = Slam(sequence.camera), Slam(sequence.camera)
-    for slam in (alone, ahead):
-        slam.disparity_drift.correction = DepthCorrection.linear(
-            0.0, 0.002
-        )  # while it is prepared the frame is as it came
     with ThreadPoolExecutor(1) as reader:
         for frame, prepared in zip(
             frames[:8], [reader.submit(ahead.prepare, frame) for frame in frames[:8]], strict=True

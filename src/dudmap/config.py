@@ -31,13 +31,9 @@ class SensorConfig(ConfigSection):
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
-    drift: bool = True
-    """Estimate and correct the drift of the disparity of a sensor that warms up, while the camera is at rest where its
-    map was begun."""
     distortion: bool = False
     """Learn the static distortion of the depth images against the map and write it to ``depth_model.npz``, which the
     option ``--depth-model`` of later runs with the same camera applies."""
-
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
     row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""
@@ -395,7 +391,7 @@ class Config(ConfigSection):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
-        "sensor": {"drift": False},
+        "sensor": {"color_time_sigma": 0.0},
         "volume": {
             "voxel_size": 0.01,
             # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on

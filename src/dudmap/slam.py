@@ -33,7 +33,6 @@ from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.depth_distortion import DepthDistortion
 from dudmap.tracking.depth_noise import DepthNoise
-from dudmap.tracking.disparity_drift import DisparityDrift
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.front_end import FrontEnd
@@ -85,7 +84,6 @@ class Slam:
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
-        self.disparity_drift = DisparityDrift()
         self.depth_distortion = depth_model or DepthDistortion()
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
@@ -137,7 +135,7 @@ class Slam:
         """
         if isinstance(frame, Frame):
             start = time.perf_counter()
-            observation = self.preprocess(frame)
+            observation = self._known_distortion.observation(self.preprocess(frame))
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active:
                 _ = pyramid.corners  # cached there for the comparison with other images
@@ -159,7 +157,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self._corrected(self.prepare(frame, dynamic_mask))
+        view = self.prepare(frame, dynamic_mask)
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
@@ -188,15 +186,6 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
-
-    def _corrected(self, view: FrameView) -> FrameView:
-        """The frame with its depth corrected for what is known of the sensor; the segments remain as prepared."""
-        correction = self.disparity_drift.correction + self._known_distortion
-        if not correction:
-            return view
-        with view.timer("correct"):
-            observation = correction.observation(view.observation)
-            return replace(view, observation=observation, pyramid=Pyramid.of(observation, self.camera, self.config))
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -260,18 +249,14 @@ class Slam:
         self.predictor.update(view, estimate)
 
     def _learn_sensor(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Compare the readings of a static view with the map for drift and distortion of the sensor."""
-        sensor, volume, T_world_camera = self.config.sensor, self.reference, estimate.T_world_camera
-        if view.blind or not (sensor.drift or sensor.distortion):
+        """Compare the readings of a static view with the map for the distortion of the sensor."""
+        if view.blind or not self.config.sensor.distortion:
             return
         with view.timer("correct"):
             level = exposed(view.pyramid.coarse, estimate.exposure)
             weights = (estimate.static_weights([level]) or [np.ones_like(level.depth)])[0]
-            if sensor.drift:
-                self.disparity_drift.update(self.tracker, volume, level, T_world_camera, weights, view.timestamp)
-            if sensor.distortion:
-                known = self._known_distortion
-                self.depth_distortion.update(self.tracker, volume, level, T_world_camera, weights, known)
+            T_world_camera, known = estimate.T_world_camera, self._known_distortion
+            self.depth_distortion.update(self.tracker, self.reference, level, T_world_camera, weights, known)
 
     def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Compare the static readings with the map for the noise of the sensor."""

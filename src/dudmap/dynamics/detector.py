@@ -278,7 +278,7 @@ class DynamicDetector:
         dynamic = dynamic & (known | started[labels])
         gain, offset = frame.exposure
         correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = np.nan_to_num(sample.difference + correction)  # the map has no intensity in the air
+        difference = np.asarray(np.nan_to_num(sample.difference + correction), np.float32)  # NaN in the air
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
         evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
         dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]

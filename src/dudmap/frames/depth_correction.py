@@ -26,19 +26,6 @@ class DepthCorrection:
 
     coefficients: NDArray[np.float64] = field(default_factory=lambda: np.zeros((ORDER + 1, ORDER + 1)))
 
-    @classmethod
-    def linear(cls, offset: float, stretch: float) -> "DepthCorrection":
-        """The correction ``offset + stretch x``, 1/m."""
-        coefficients = np.zeros((ORDER + 1, ORDER + 1))
-        coefficients[0, 0], coefficients[1, 0] = offset, stretch
-        return cls(coefficients)
-
-    def __bool__(self) -> bool:
-        return bool(self.coefficients.any())
-
-    def __add__(self, other: "DepthCorrection") -> "DepthCorrection":
-        return DepthCorrection(self.coefficients + other.coefficients)
-
     def change(self, camera: Camera) -> NDArray[np.float32]:
         """c(x, y) at the pixels (h, w) of ``camera``, 1/m."""
         x = (np.arange(camera.width) - camera.cx) / camera.fx
@@ -54,10 +41,7 @@ class DepthCorrection:
         return np.divide(depth, divisor, out=divisor)
 
     def observation(self, observation: Observation) -> Observation:
-        """The observation with corrected depth, also where it has been halved."""
-        camera = observation.camera
-        halvings = [
-            (self.depth(depth, camera.scaled(level)), intensity)
-            for level, (depth, intensity) in enumerate(observation._halvings, start=1)
-        ]
-        return replace(observation, depth=self.depth(observation.depth, camera), _halvings=halvings)
+        """The observation with corrected depth, before it is halved."""
+        if not self.coefficients.any():
+            return observation
+        return replace(observation, depth=self.depth(observation.depth, observation.camera))

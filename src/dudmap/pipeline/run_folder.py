@@ -107,10 +107,8 @@ def write_run_folder(
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
     metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
-    noise, drift = slam.depth_noise.fitted(), slam.disparity_drift
+    noise = slam.depth_noise.fitted()
     metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
-    numbers = [round(float(number), 6) for number in (*drift.state, *drift.sigma)]
-    metrics["depth_drift"] = dict(zip(("offset", "stretch", "offset_sigma", "stretch_sigma"), numbers, strict=True))
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()

@@ -12,9 +12,11 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.median import median
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.disparity_drift import CORRELATED_READINGS
 from dudmap.tracking.tracker import MIN_READINGS, Tracker
 
+CORRELATED_READINGS = 64.0
+"""Neighbouring readings of a level 80 pixels wide whose errors are correlated and which together count as one: a tenth
+of the width, the width of a band of equal disparity, squared."""
 TERMS = [(i, order - i) for order in range(2, ORDER + 1) for i in range(order + 1)]
 """Exponents (i, j) of the terms x^i y^j. Without those below the second order: 1, x and y turn planes into planes, and
 a rigid motion imitates them."""

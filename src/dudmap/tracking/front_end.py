@@ -90,27 +90,24 @@ class FrontEnd:
         """
         levels, unverified = view.pyramid.tracked, prediction.unverified_mask
         tracker = self.blind_tracker if view.blind else self.tracker
-        color_weight = tracker.config.color_weight * self._motion_discount(volume, view, prediction)
         excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
         if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
             with view.timer("track"):
-                tracking = tracker.align(
-                    volume, levels, T_init, initial_weights(levels, None, excluded), color_weight=color_weight
-                )
+                tracking = tracker.align(volume, levels, T_init, initial_weights(levels, None, excluded))
             labelled = self.config.dynamics.method != "none"
             labels = self._label(volume, view, prediction, tracking) if labelled else None
             return PoseEstimate(tracking, labels, unverified)
         split = max(1, len(levels) - 1)
         with view.timer("track"):
             coarse = levels[:split]
-            weights = initial_weights(coarse, self.last_dynamic, excluded)
-            tracking = tracker.align(volume, coarse, T_init, weights, color_weight=color_weight)
+            tracking = tracker.align(volume, coarse, T_init, initial_weights(coarse, self.last_dynamic, excluded))
         labels = self._label(volume, view, prediction, tracking)
         with view.timer("track_again"):
             finest_suffices = split < len(levels) and tracking.settled and self._labels_unchanged(labels)
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], unverified)
             pose, exposure = tracking.T_world_camera, tracking.exposure
+            color_weight = tracker.config.color_weight * self._motion_discount(volume, view, pose)
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.blind:
             tracking = replace(tracking, color_residual=np.nan)
@@ -137,9 +134,9 @@ class FrontEnd:
             self.detector.reset()
             self.last_dynamic = None
 
-    def _motion_discount(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> float:
-        """Factor of the weight of the intensities at the predicted velocity."""
-        velocity = self.motion.velocity_to(view.timestamp, prediction.T_world_camera)
+    def _motion_discount(self, volume: TsdfVolume, view: FrameView, T_world_camera: NDArray[np.float64]) -> float:
+        """Factor of the weight of the intensities at the velocity that leads to a pose (4, 4)."""
+        velocity = self.motion.velocity_to(view.timestamp, T_world_camera)
         time_sigma = self.config.sensor.color_time_sigma
         return motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
 
