@@ -14,6 +14,7 @@ from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
@@ -30,6 +31,7 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.color_motion import ColorMotion
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.front_end import FrontEnd
@@ -48,11 +50,22 @@ class Slam:
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
+        calibration: Of the colour camera; None for colour that is registered to depth.
     """
 
-    def __init__(self, camera: Camera, config: Config | None = None, first_pass: "Slam | None" = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        first_pass: "Slam | None" = None,
+        calibration: Calibration | None = None,
+    ) -> None:
         self.config = config = config or Config()
-        self.preprocess = Preprocessor(camera, config.preprocess)
+        given = (
+            None if calibration is None or calibration.is_registered(replace(camera, distortion=())) else calibration
+        )
+        self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
+        self.color_motion = ColorMotion(config, given)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.tracker = Tracker(config.tracker, config.sensor)
@@ -95,6 +108,11 @@ class Slam:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the colour camera in use."""
+        return self.color_motion.calibration or Calibration.registered(self.camera)
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
@@ -143,7 +161,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self.prepare(frame, dynamic_mask)
+        view = self.color_motion.registered(self.prepare(frame, dynamic_mask), self.motion.velocity)
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)

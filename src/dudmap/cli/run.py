@@ -17,6 +17,10 @@ CameraOption = Annotated[
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
+CalibrationOption = Annotated[
+    Path | None,
+    typer.Option("--calibration", help="Calibration of the colour camera: calibration.toml of a run or of calibrate."),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
@@ -33,6 +37,7 @@ def run(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    calibration: CalibrationOption = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
     masks: Annotated[
@@ -55,6 +60,7 @@ def run(
     Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
     --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving object.
     """
+    from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
@@ -64,6 +70,7 @@ def run(
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
+        calibration=None if calibration is None else Calibration.load(calibration),
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

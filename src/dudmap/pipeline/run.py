@@ -14,6 +14,7 @@ from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask, write_run_folder
 
 if TYPE_CHECKING:
+    from dudmap.geometry.calibration import Calibration
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
@@ -33,6 +34,7 @@ def run(
     ahead: int = AHEAD,
     live: bool = False,
     passes: int = 1,
+    calibration: "Calibration | None" = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -63,6 +65,7 @@ def run(
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
+        calibration: Of the colour camera; None takes that of the recording.
         observe: Called after each processed frame with its number, what was read, and the result.
 
     Raises:
@@ -83,7 +86,8 @@ def run(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
         )
     given_masks = None if masks is None else _open_masks(masks, sequence)
-    slam = Slam(sequence.camera, config)
+    calibration = calibration or sequence.calibration
+    slam = Slam(sequence.camera, config, calibration=calibration)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -92,11 +96,11 @@ def run(
         try:
             if live:
                 display.working("loading kernels")
-                load_kernels(Slam(sequence.camera, config), sequence, count)
+                load_kernels(Slam(sequence.camera, config, calibration=calibration), sequence, count)
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
-                    slam = Slam(sequence.camera, config, first_pass=slam)
+                    slam = Slam(sequence.camera, config, first_pass=slam, calibration=calibration)
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl",
+    "residuals.npz", "movers.jsonl", "calibration.toml",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -107,6 +107,8 @@ def write_run_folder(
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
     metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
+    calibration = slam.calibration
+    metrics["calibration"] = calibration.tree()
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()
@@ -123,6 +125,7 @@ def write_run_folder(
     steps: list[Callable[[], None]] = [
         lambda: trajectory.save(out / "trajectory.txt"),
         lambda: config.save(out / "config.toml"),
+        lambda: calibration.save(out / "calibration.toml"),
         lambda: record.save_timings(out / "timings.csv"),
         lambda: record.save_residuals(out / "residuals.npz"),
         lambda: record.save_movers(out / "movers.jsonl"),

@@ -24,6 +24,11 @@ class MotionModel:
         self._velocity = np.zeros(6)  # twist per second, camera axes
         self._initialized = False
 
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
+        return self._velocity
+
     def predict(self, timestamp: float) -> NDArray[np.float64]:
         """Predicted pose (4, 4) at a time in seconds."""
         if not self.config.constant_velocity:
