@@ -61,15 +61,25 @@ def synth(
     exposure_change: Annotated[
         float, typer.Option("--exposure-change", help="Relative amplitude of a slow oscillation of the exposure.")
     ] = 0.0,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--fault",
+            metavar="NAME=VALUE",
+            help="A fault of the sensor, such as color_delay=0.025 or color_translation=0.025,0,0; repeatable. "
+            "The names are in docs/synthetic.md; an unknown one lists them.",
+        ),
+    ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
 ) -> None:
     """Render a synthetic recording with exact ground truth.
 
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
-    surface_observed.ply and scene.json.
+    surface_observed.ply, scene.json and sensor_truth.json.
     """
     from dudmap import synthetic
+    from dudmap.synthetic.faults import parse_faults
     from dudmap.synthetic.folder import write_folder
     from dudmap.synthetic.recording import DEFAULT_CAMERA
 
@@ -88,6 +98,7 @@ def synth(
         camera=DEFAULT_CAMERA.resized(*_size(size)),
         motion_blur=motion_blur,
         exposure_change=exposure_change,
+        faults=parse_faults(fault or []),
     )
     if quiet:
         write_folder(sequence, out, overwrite=overwrite)

@@ -1,23 +1,25 @@
 """Synthetic recordings of analytic scenes with moving objects and exact ground truth: poses, masks and surface.
 
-The renderer is imported when ``sequence`` is first used, so that importing this package is fast.
+The renderer is imported when it is first used, so that importing this package is fast.
 """
 
+from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from dudmap.synthetic.faults import SensorFaults
     from dudmap.synthetic.recording import sequence
 
-__all__ = ["names", "sequence"]
+__all__ = ["SensorFaults", "names", "sequence"]
+
+_MODULES = {"SensorFaults": "dudmap.synthetic.faults", "sequence": "dudmap.synthetic.recording"}
 
 
 def __getattr__(name: str) -> object:
-    """Import the renderer on the first access to ``sequence``."""
-    if name != "sequence":
+    """Import the module of a public name on the first access to it."""
+    if name not in _MODULES:
         raise AttributeError(f"module 'dudmap.synthetic' has no attribute {name!r}")
-    from dudmap.synthetic.recording import sequence
-
-    return sequence
+    return getattr(import_module(_MODULES[name]), name)
 
 
 def names() -> dict[str, list[str]]:

@@ -30,7 +30,8 @@ def write_folder(
 
     The folder receives rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = dynamic), their
     lists rgb.txt, depth.txt, mask.txt and associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (dynamic
-    share of the image), movers.jsonl, scene.json, surface.ply (the static surface) and surface_observed.ply (the part
+    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults
+    of the sensor), surface.ply (the static surface) and surface_observed.ply (the part
     of it that the camera saw). If writing is interrupted, the lists contain the complete frames.
 
     Args:
@@ -124,6 +125,8 @@ def _write_parameters(sequence: SyntheticSequence, out: Path) -> None:
         "sensor": asdict(sensor) if sensor else None,
     }
     (out / "scene.json").write_text(json.dumps(parameters, indent=2) + "\n", encoding="utf-8")
+    truth = sequence.faults.truth(camera)
+    (out / "sensor_truth.json").write_text(json.dumps(truth, indent=2) + "\n", encoding="utf-8")
 
 
 def _write_lists(sequence: SyntheticSequence, out: Path, shares: list[float]) -> None:

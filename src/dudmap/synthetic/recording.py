@@ -16,6 +16,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.synthetic.crowd import crowd_of
+from dudmap.synthetic.faults import SensorFaults
 from dudmap.synthetic.movers import MOVING_SPEED, Staging, SyntheticMover, build_movers
 from dudmap.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.synthetic.render import Renderer, Rendering
@@ -53,7 +54,8 @@ class SyntheticSequence:
 
     Attributes:
         name: Names of scene and movers.
-        camera: Intrinsics.
+        camera: Intrinsics of the depth camera, which are also those that the files state for colour.
+        faults: What the sensor does and its files do not say.
         timestamps: (N,) seconds.
         ground_truth: Exact camera poses.
         parameters: Arguments from which it was made.
@@ -74,9 +76,11 @@ class SyntheticSequence:
         fps: float,
         motion_blur: float = 0.0,
         exposure_change: float = 0.0,
+        faults: SensorFaults | None = None,
         parameters: dict[str, object] | None = None,
     ) -> None:
         self.scene, self.camera, self.ground_truth = scene, camera, ground_truth
+        self.faults = faults or SensorFaults()
         self.timestamps = ground_truth.timestamps
         self.parameters = dict(parameters or {})
         self.name = "-".join([scene.name, *dict.fromkeys(mover.name for mover in movers)])
@@ -112,12 +116,17 @@ class SyntheticSequence:
         return self._mask_of(self._render(index, with_color=False), index)
 
     def exact(self, index: int) -> Rendering:
-        """Ideal depth, colour and visible primitive of a frame, without sensor noise."""
+        """Ideal depth and visible primitive of a frame, and colour as the colour camera sees it, without noise."""
         return self._render(self._number(index), with_color=True)
 
     def exact_depth(self, index: int) -> NDArray[np.float32]:
         """Ideal depth (H, W) of a frame in metres, 0 where the ray hits nothing."""
         return self._render(self._number(index), with_color=False).depth
+
+    @property
+    def color_camera(self) -> Camera:
+        """True intrinsics of the colour camera."""
+        return self.faults.color_camera(self.camera)
 
     @property
     def sensor_model(self) -> SensorModel | None:
@@ -146,6 +155,7 @@ class SyntheticSequence:
             fps=self._fps,
             motion_blur=self._motion_blur,
             exposure_change=self._exposure_change,
+            faults=self.faults,
             parameters=self.parameters | {"movers": []},
         )
 
@@ -212,20 +222,53 @@ class SyntheticSequence:
 
     def _render(self, index: int, with_color: bool) -> Rendering:
         t = float(self.timestamps[index])
-        sharp = self._render_at(t, self.ground_truth.Ts_world_camera[index], with_color)
-        if not with_color or self._motion_blur <= 0 or sharp.color is None:
+        sharp = self._render_at(t, self.ground_truth.Ts_world_camera[index], self.camera, with_color)
+        if not with_color:
+            return sharp
+        if self.faults.color_is_separate:
+            return replace(sharp, color=self._separate_color(t))
+        if self._motion_blur <= 0 or sharp.color is None:
             return sharp
         color = np.zeros_like(sharp.color)
-        shares = (np.arange(5) - 2) / 5 * self._motion_blur  # of the time between two frames
+        shares = self._exposure_shares()
         for share in shares:
             moment = t + share / self._fps
             inside = min(max(moment, self.timestamps[0]), self.timestamps[-1])
-            blurred = self._render_at(moment, self.ground_truth.interpolate(inside), True)
+            blurred = self._render_at(moment, self.ground_truth.interpolate(inside), self.camera, True)
             assert blurred.color is not None
             color += blurred.color / len(shares)
         return replace(sharp, color=color)
 
-    def _render_at(self, t: float, T_world_camera: NDArray[np.float64], with_color: bool) -> Rendering:
+    def _exposure_shares(self) -> NDArray[np.float64]:
+        """Moments of a blurred exposure around its middle, as shares of the time between two frames."""
+        return (np.arange(5) - 2) / 5 * self._motion_blur if self._motion_blur > 0 else np.zeros(1)
+
+    def _separate_color(self, t: float) -> NDArray[np.float32]:
+        """Colour (H, W, 3) of the frame stamped ``t`` from the place of the colour camera, at the time of every row."""
+        camera, T_depth_color = self.color_camera, self.faults.T_depth_color
+        color = np.zeros((*camera.shape, 3), dtype=np.float32)
+        shares = self._exposure_shares()
+        for first, last, offset in self.faults.row_bands(camera.height):
+            low, high = max(first - 1, 0), min(last + 1, camera.height)  # pixels at a border look at their neighbours
+            band = replace(camera, cy=camera.cy - low, height=high - low)
+            for share in shares:
+                moment = t + offset + share / self._fps
+                seen = self._render_at(moment, self._pose_at(moment) @ T_depth_color, band, True).color
+                assert seen is not None
+                color[first:last] += seen[first - low : last - low] / np.float32(len(shares))
+        return color
+
+    def _pose_at(self, t: float) -> NDArray[np.float64]:
+        """Pose of the depth camera at any time; before the first and after the last frame with constant velocity."""
+        stamps, Ts = self.timestamps, self.ground_truth.Ts_world_camera
+        if stamps[0] <= t <= stamps[-1]:
+            return self.ground_truth.interpolate(t)
+        if len(stamps) == 1:
+            return Ts[0]
+        at = 0 if t < stamps[0] else len(stamps) - 2
+        return se3.interpolate(Ts[at], Ts[at + 1], (t - stamps[at]) / (stamps[at + 1] - stamps[at]))
+
+    def _render_at(self, t: float, T_world_camera: NDArray[np.float64], camera: Camera, with_color: bool) -> Rendering:
         Ts = np.empty((len(self._owner), 4, 4))
         present = np.zeros(len(self._owner), dtype=bool)
         start = 0
@@ -238,7 +281,7 @@ class SyntheticSequence:
                 Ts[start:end] = np.eye(4)
             start = end
         gain = 1.0 + self._exposure_change * np.sin(2 * np.pi * t / 2.7)
-        return self._renderer.render(self.camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
+        return self._renderer.render(camera, T_world_camera, Ts, present, with_color=with_color, gain=gain)
 
 
 def sequence(
@@ -256,6 +299,7 @@ def sequence(
     camera: Camera | None = None,
     motion_blur: float = 0.0,
     exposure_change: float = 0.0,
+    faults: SensorFaults | None = None,
 ) -> SyntheticSequence:
     """Set up a synthetic recording; its frames are rendered on access.
 
@@ -276,6 +320,7 @@ def sequence(
         camera: Intrinsics; None for 640x480 with 525 px focal length.
         motion_blur: Exposure time as a share of the frame interval.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
+        faults: What the sensor does and its files do not say; None for a sensor without faults.
 
     Raises:
         ConfigError: An argument is invalid; the message names the known values.
@@ -341,6 +386,7 @@ def sequence(
         fps=fps,
         motion_blur=motion_blur,
         exposure_change=exposure_change,
+        faults=faults,
         parameters=parameters,
     )
 
