@@ -65,14 +65,14 @@ class Slam:
             None if calibration is None or calibration.is_registered(replace(camera, distortion=())) else calibration
         )
         self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
-        self.color_motion = ColorMotion(config, given)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.tracker = Tracker(config.tracker, config.sensor)
         self.motion = MotionModel(config.tracker)
+        self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
-        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor)
+        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
         known_poses = {}
         keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
         if self.prior_map is None:
@@ -161,7 +161,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self.color_motion.registered(self.prepare(frame, dynamic_mask), self.motion.velocity)
+        view = self.color_motion.predicted(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
@@ -172,6 +172,7 @@ class Slam:
         reason = self.monitor.rejection_reason(view, estimate)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         with view.timer("similarity"):
             fuse = not (is_redundant(estimate.T_world_camera) or view.blind)
         if reason and not relocalized:

@@ -1,8 +1,11 @@
 """Colour image registered to the depth image of the same frame: seen from the depth camera, at the depth's time."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.observation import Observation
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.se3 import hat
@@ -10,6 +13,7 @@ from dudmap.kernels.backend import Backend
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import ColorProjection
 
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
 MEDIAN_STRIDE = 8
 """Every so many pixels, across and down, enter the median depth."""
 
@@ -27,33 +31,46 @@ def color_projection(calibration: Calibration, twist: NDArray[np.float64], offse
     """
     T, R, W = calibration.T_color_depth, calibration.T_color_depth[:3, :3], hat(twist[3:])
     speed = np.column_stack([W, twist[:3]])
-    coefficients = np.zeros(5, np.float32)
-    coefficients[: len(calibration.camera.distortion)] = calibration.camera.distortion
     return ColorProjection(
         T[:3].astype(np.float32),
         (R @ speed).astype(np.float32),
         (R @ W @ speed).astype(np.float32),
         calibration.camera.intrinsics,
-        coefficients,
+        calibration.lens.astype(np.float32),
         offset + calibration.delay,
         calibration.readout,
         calibration.camera.height,
     )
 
 
+def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.float32]:
+    """Intensity (h, w) in 0..1 of the colour image as it was recorded, after so many halvings by 2x2 blocks."""
+    import cv2
+
+    known = observation._recorded_halvings
+    if not known:
+        recorded = observation.rgb if observation.recorded_rgb is None else observation.recorded_rgb
+        known.append(observation.backend.intensity(recorded))
+    while len(known) <= halvings:
+        h, w = (size // 2 for size in known[-1].shape)
+        whole = known[-1][: 2 * h, : 2 * w]
+        known.append(np.asarray(cv2.resize(whole, (w, h), interpolation=cv2.INTER_AREA), np.float32))
+    return known[halvings]
+
+
 def register_color(
-    color: NDArray[np.uint8],
+    color: NDArray[Pixel],
     depth: NDArray[np.float32],
     camera: Camera,
     projection: ColorProjection,
     backend: Backend,
-) -> NDArray[np.uint8]:
-    """Colour (H, W, 3) of each depth pixel, interpolated; outside the colour image that of its nearest pixel.
+) -> NDArray[Pixel]:
+    """Colour (H, W[, 3]) of each depth pixel, interpolated; outside the colour image that of its nearest pixel.
 
     Occlusion is not resolved: a surface that only the depth camera sees has the colour of what hides it.
 
     Args:
-        color: (h, w, 3) uint8 as the colour camera recorded it.
+        color: (h, w[, 3]) uint8 or float32 as the colour camera recorded it.
         depth: (H, W) float32, metres, 0 = none.
         camera: Of the depth image, without distortion.
         projection: Of ``color_projection``.
@@ -65,4 +82,4 @@ def register_color(
     readings = readings[readings > 0]
     fallback = float(median(readings)) if len(readings) else 1.0
     us, vs = backend.color_pixels(depth, camera.intrinsics, projection, fallback)
-    return np.asarray(cv2.remap(color, us, vs, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), dtype=np.uint8)
+    return np.asarray(cv2.remap(color, us, vs, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), color.dtype)

@@ -32,6 +32,7 @@ class Observation:
     backend: Backend = field(repr=False)
     recorded_rgb: NDArray[np.uint8] | None = None
     color_offset: float = 0.0
+    _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
 

@@ -15,10 +15,10 @@ from dudmap.geometry.camera import Camera
 
 PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
-    "center_x", "center_y", "delay", "readout",
+    "center_x", "center_y", "k1", "k2", "delay", "readout",
 )  # fmt: skip
-"""Parameters that can be estimated, in the order of a step (11,): metres, radians, logarithm of the focal lengths,
-pixels of the colour image, seconds."""
+"""Parameters that can be estimated, in the order of a step (13,): metres, radians, logarithm of the focal lengths,
+pixels of the colour image, the first two coefficients of radial lens distortion (thesis eq. 3.88), seconds."""
 NUM_PARAMETERS = len(PARAMETERS)
 
 
@@ -35,7 +35,7 @@ class Calibration:
         T_color_depth: (4, 4) points of the depth camera into the colour camera.
         delay: Time of the middle row of the colour image minus that of the depth image, beyond the time stamps, s.
         readout: Time from the first to the last row of the colour image (rolling shutter), s.
-        sigma: (11,) standard deviations of ``PARAMETERS``, NaN where unknown.
+        sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
         estimated: Names of the parameters that were estimated; the others are as given.
     """
 
@@ -65,9 +65,17 @@ class Calibration:
         still = self.delay == 0 and self.readout == 0
         return same and still and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
+    @property
+    def lens(self) -> NDArray[np.float64]:
+        """Coefficients (5,) k1, k2, p1, p2, k3 of the lens distortion."""
+        out = np.zeros(5)
+        out[: len(self.camera.distortion)] = self.camera.distortion
+        return out
+
     def retract(self, step: NDArray[np.float64]) -> "Calibration":
-        """Calibration after a step (11,) of ``PARAMETERS``; rotation and translation are updated in colour axes."""
+        """Calibration after a step (13,) of ``PARAMETERS``; rotation and translation are updated in colour axes."""
         camera, factor = self.camera, float(np.exp(step[6]))
+        lens = self.lens + np.array([*step[9:11], 0.0, 0.0, 0.0])
         return replace(
             self,
             camera=replace(
@@ -76,14 +84,15 @@ class Calibration:
                 fy=camera.fy * factor,
                 cx=camera.cx + float(step[7]),
                 cy=camera.cy + float(step[8]),
+                distortion=tuple(lens.tolist()) if lens.any() else (),
             ),
             T_color_depth=se3.retract(self.T_color_depth, step[:6]),
-            delay=self.delay + float(step[9]),
-            readout=self.readout + float(step[10]),
+            delay=self.delay + float(step[11]),
+            readout=self.readout + float(step[12]),
         )
 
     def step_to(self, other: "Calibration") -> NDArray[np.float64]:
-        """Step (11,) with ``self.retract(step)`` equal to ``other``, for cameras of equal aspect ratio."""
+        """Step (13,) with ``self.retract(step)`` equal to ``other``, for cameras of equal aspect ratio."""
         R = other.T_color_depth[:3, :3] @ self.T_color_depth[:3, :3].T
         return np.array(
             [
@@ -92,6 +101,7 @@ class Calibration:
                 np.log(other.camera.fx / self.camera.fx),
                 other.camera.cx - self.camera.cx,
                 other.camera.cy - self.camera.cy,
+                *(other.lens - self.lens)[:2],
                 other.delay - self.delay,
                 other.readout - self.readout,
             ]

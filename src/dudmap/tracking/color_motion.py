@@ -6,57 +6,98 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import Config
 from dudmap.dynamics.segments import Segmentation, intensity_gradient
-from dudmap.frames.color_registration import color_projection, register_color
+from dudmap.frames.color_registration import color_projection, recorded_intensity, register_color
+from dudmap.frames.observation import Level, Observation
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.tracking.frame_view import FrameView
+from dudmap.tracking.motion_model import MotionModel
 
 
 class ColorMotion:
     """Registers colour to depth with the calibration in use, which may change while the camera moves.
 
+    A colour image taken at tau after the depth image of a camera at x with the velocity v shows what is seen from
+    y = x + tau v. Registered with the velocity v + d it asks for the pose x - tau d; if colour has the share k of the
+    registration, the velocity that follows from the found pose is v - k (tau / dt) d, where dt is the time since the
+    last frame. For tau > dt / 2 and k = 1, errors would grow from frame to frame if that velocity were used for the
+    next. Going the part a = 1 / (1 + tau / dt) of the way from the assumed velocity to the found one leaves
+    d (1 - a (1 + k tau / dt)): nothing where colour decides, and where it does not the pose is not concerned.
+
     Args:
-        config: All parameters.
+        motion: Velocity of the camera.
         given: Calibration with which frames are prepared; None for colour that is registered to depth.
 
     Attributes:
         calibration: In use; None for images that are taken as they are.
     """
 
-    def __init__(self, config: Config, given: Calibration | None) -> None:
-        self.config = config
+    def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
+        self.motion = motion
         self.given = given
         self.calibration = given
         self._backend = CpuBackend()  # of its own: frames are prepared in another thread
 
-    def registered(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
-        """The frame with its colours where the camera's motion has taken them.
+    def predicted(self, view: FrameView) -> FrameView:
+        """The frame with the intensities of its pyramid registered by the velocity so far."""
+        return self._with_levels(view, self.motion.velocity)
 
-        Args:
-            view: A prepared frame.
-            velocity: (6,) twist of the camera per second, its own axes.
-        """
+    def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
+        return self._with_levels(view, self._velocity(view, T_world_camera))
+
+    def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The frame with its colours registered, once its pose (4, 4) is known."""
         calibration, observation = self.calibration, view.observation
-        if calibration is None:
+        velocity = self._velocity(view, T_world_camera)
+        if calibration is None or self._is_prepared(observation, velocity):
             return view
-        moment = abs(calibration.delay + observation.color_offset) + abs(calibration.readout)
-        if calibration is self.given and (moment == 0 or not velocity.any()):
-            return view  # as prepared
         with view.timer("color"):
             projection = color_projection(calibration, velocity, observation.color_offset)
-            recorded = observation.rgb if observation.recorded_rgb is None else observation.recorded_rgb
+            recorded = observation.recorded_rgb if observation.recorded_rgb is not None else observation.rgb
             rgb = register_color(recorded, observation.depth, observation.camera, projection, self._backend)
-            intensity = self._backend.intensity(rgb)
-            registered = replace(
-                observation, rgb=rgb, intensity=intensity, backend=self._backend, recorded_rgb=recorded, _halvings=[]
-            )
-            pyramid = Pyramid.of(registered, observation.camera, self.config)
+            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded))
+
+    def _is_prepared(self, observation: Observation, velocity: NDArray[np.float64]) -> bool:
+        """Whether the frame was prepared with all that is known."""
+        calibration = self.calibration
+        if calibration is None:
+            return True
+        instant = calibration.delay + observation.color_offset == 0 and calibration.readout == 0
+        return calibration is self.given and (instant or not velocity.any())
+
+    def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,) after a frame was registered with that of the motion model."""
+        if self.calibration is None:
+            return view.color_velocity
+        assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
+        ratio = (self.calibration.delay + view.observation.color_offset) / self.motion.elapsed(view.timestamp)
+        return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)
+
+    def _with_levels(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        calibration, observation = self.calibration, view.observation
+        if calibration is None or self._is_prepared(observation, velocity):
+            return view
+        with view.timer("color"):
+            done: dict[int, Level] = {}
+
+            def registered(level: Level) -> Level:
+                halvings = round(np.log2(observation.camera.width / level.camera.width))
+                if halvings not in done:
+                    scaled = replace(calibration, camera=calibration.camera.scaled(halvings))
+                    projection = color_projection(scaled, velocity, observation.color_offset)
+                    recorded = recorded_intensity(observation, halvings)
+                    intensity = register_color(recorded, level.depth, level.camera, projection, self._backend)
+                    done[halvings] = Level(level.camera, level.depth, intensity)
+                return done[halvings]
+
+            tracked = [registered(level) for level in view.pyramid.tracked]
+            pyramid = Pyramid(tracked, registered(view.pyramid.labelled))
 
         @cache
         def segmentation() -> Segmentation:
             return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
 
-        return replace(view, observation=registered, pyramid=pyramid, segmentation=segmentation)
+        return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)
