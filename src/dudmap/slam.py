@@ -84,6 +84,7 @@ class Slam:
         self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.bootstrap = Bootstrap()
+        self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config.similarity)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
@@ -177,6 +178,7 @@ class Slam:
             fuse = not (is_redundant(estimate.T_world_camera) or view.blind)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
+        self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         mask = self._dynamic_mask(view, estimate)
         movers = self.objects.update(view, estimate)
@@ -203,6 +205,8 @@ class Slam:
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self._add_keyframe(view, estimate, mask)
         self._integrate(view, estimate, mask)
+        self._first_mask = mask
+        self.color_motion.start(view)
         if self.config.dynamics.method == "em":
             self.bootstrap.start(view, mask)
             self.predictor.start(view)
@@ -215,7 +219,15 @@ class Slam:
         first = self.bootstrap.revised(prediction.moving_before)
         if first is not None:
             self.atlas.clear_first_frame()
+            self._first_mask = first.dynamic_mask
             self._integrate(replace(first.view, timer=view.timer), PoseEstimate.at_origin(), first.dynamic_mask)
+
+    def _recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
+        first = self.color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        if first is not None:
+            self.atlas.clear_first_frame()
+            self._integrate(replace(first, timer=view.timer), PoseEstimate.at_origin(), self._first_mask)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.run import CalibrationOption, CameraOption, ConfigOption, PresetOption, SetOption, read_config
+from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, read_config
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -24,7 +24,9 @@ def calibrate(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
-    calibration: CalibrationOption = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
+    ] = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
 ) -> None:
@@ -37,8 +39,8 @@ def calibrate(
 
     from rich.console import Console
 
-    from dudmap.pipeline.calibration import calibrate_sequence
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.calibration import calibrate_sequence
     from dudmap.sequences import open_sequence
 
     recording = open_sequence(sequence, camera)

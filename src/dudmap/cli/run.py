@@ -18,8 +18,12 @@ CameraOption = Annotated[
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
 CalibrationOption = Annotated[
-    Path | None,
-    typer.Option("--calibration", help="Calibration of the colour camera: calibration.toml of a run or of calibrate."),
+    str | None,
+    typer.Option(
+        "--calibration",
+        help="Calibration of the colour camera: calibration.toml of a run or of calibrate, or auto to calibrate first.",
+        metavar="FILE|auto",
+    ),
 ]
 SetOption = Annotated[
     list[str] | None,
@@ -67,10 +71,17 @@ def run(
     parameters = read_config(config, preset, assignments or [])
     recording = open_sequence(sequence, camera)
     out = out or free_folder(Path("runs") / recording.name)
+    if calibration == "auto":
+        from dudmap.pipeline.calibration import calibrate_sequence
+
+        start = recording.calibration or Calibration.registered(recording.camera)
+        given = calibrate_sequence(recording, parameters, start, max_frames).calibration
+    else:
+        given = None if calibration is None else Calibration.load(calibration)
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-        calibration=None if calibration is None else Calibration.load(calibration),
+        calibration=given,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

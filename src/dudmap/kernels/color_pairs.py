@@ -9,6 +9,8 @@ f32 = np.float32
 UNKNOWNS = 21
 SHARED = 13
 """Parameters of the calibration (13), relative pose as a twist (6), gain and offset of the intensities (2)."""
+MARGIN = f32(8)
+"""Border of the colour images that is not used, pixels: twice the wider Gaussian of their filter."""
 NEAREST = f32(0.05)
 """Depth in the colour camera below which a point is not seen, metres."""
 
@@ -62,7 +64,7 @@ def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, 
         D: (2, 16) float32 out, derivatives of the pixel u, v by the parameters and by the point.
 
     Returns:
-        Intensity, NaN outside the image; its derivatives along u and v.
+        Intensity, NaN outside the image or at its border; its derivatives along u and v.
     """
     h, w = image.shape
     p = elements(place)
@@ -93,7 +95,7 @@ def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, 
     radial, growth = f32(1) + r2 * (k1 + r2 * (k2 + r2 * k3)), k1 + r2 * (f32(2) * k2 + f32(3) * r2 * k3)
     u = (a * radial + f32(2) * p1 * a * d + p2 * (r2 + f32(2) * a * a)) * fx + cx
     v = (d * radial + p1 * (r2 + f32(2) * d * d) + f32(2) * p2 * a * d) * fy + cy
-    if not ((u >= f32(1)) & (v >= f32(1)) & (u < f32(w - 2)) & (v < f32(h - 2))):
+    if not ((u >= MARGIN) & (v >= MARGIN) & (u < f32(w) - MARGIN) & (v < f32(h) - MARGIN)):
         return f32(np.nan), zero, zero
     across = f32(2) * (a * d * growth + p1 * a + p2 * d)
     along_x = radial + f32(2) * (a * a * growth + p1 * d) + f32(6) * p2 * a

@@ -13,7 +13,7 @@ from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.tracking.frame_view import FrameView
-from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 
 
 class ColorMotion:
@@ -25,6 +25,9 @@ class ColorMotion:
     last frame. For tau > dt / 2 and k = 1, errors would grow from frame to frame if that velocity were used for the
     next. Going the part a = 1 / (1 + tau / dt) of the way from the assumed velocity to the found one leaves
     d (1 - a (1 + k tau / dt)): nothing where colour decides, and where it does not the pose is not concerned.
+
+    The velocity of the first frame of a map is not known. Its colours are taken as they are, and so are those of the
+    second frame, whose motion since the first is then right; with it the first frame is fused anew.
 
     Args:
         motion: Velocity of the camera.
@@ -38,7 +41,22 @@ class ColorMotion:
         self.motion = motion
         self.given = given
         self.calibration = given
+        self._first: FrameView | None = None
         self._backend = CpuBackend()  # of its own: frames are prepared in another thread
+
+    def start(self, view: FrameView) -> None:
+        """Remember the frame that a map was made of, until its velocity is known."""
+        self._first = None if self._is_prepared(view.observation, np.ones(6)) else view
+
+    def first_frame(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> FrameView | None:
+        """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
+
+        None where the map is right as it is, or where too much time has passed for the velocity to be known.
+        """
+        first, self._first = self._first, None
+        if first is None or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
+            return None
+        return self._with_colors(first, self.motion.velocity_to(timestamp, T_world_camera))
 
     def predicted(self, view: FrameView) -> FrameView:
         """The frame with the intensities of its pyramid registered by the velocity so far."""
@@ -46,12 +64,16 @@ class ColorMotion:
 
     def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
         """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
+        if self._first is not None:
+            return view
         return self._with_levels(view, self._velocity(view, T_world_camera))
 
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
         """The frame with its colours registered, once its pose (4, 4) is known."""
+        return self._with_colors(view, self._velocity(view, T_world_camera))
+
+    def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
         calibration, observation = self.calibration, view.observation
-        velocity = self._velocity(view, T_world_camera)
         if calibration is None or self._is_prepared(observation, velocity):
             return view
         with view.timer("color"):
@@ -73,6 +95,8 @@ class ColorMotion:
         if self.calibration is None:
             return view.color_velocity
         assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
+        if self._first is not None:
+            return found
         ratio = (self.calibration.delay + view.observation.color_offset) / self.motion.elapsed(view.timestamp)
         return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)
 
