@@ -92,11 +92,11 @@ def test_a_step_and_its_inverse():
     end = start.retract(step)
     assert np.allclose(start.step_to(end), step, atol=1e-12)
     assert end.camera.fy / start.camera.fy == pytest.approx(np.exp(step[6]))
-    assert end.readout == pytest.approx(start.readout + step[10])
+    assert end.readout == pytest.approx(start.readout + step[12])
 
 
 def test_the_file_holds_everything(tmp_path):
-    before = calibration(sigma=np.array([*np.arange(10) / 7, np.nan]), estimated=("delay",))
+    before = calibration(sigma=np.array([*np.arange(12) / 7, np.nan]), estimated=("delay",))
     before.save(tmp_path / "calibration.toml")
     after = Calibration.load(tmp_path / "calibration.toml")
     assert after.camera == before.camera
