@@ -6,6 +6,7 @@ from typing import ClassVar
 
 import numpy as np
 
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.kernels.parameters import SensorNoise
@@ -60,7 +61,8 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None, depth_model=None):
+    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None):
+        self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))

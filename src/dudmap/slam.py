@@ -15,6 +15,7 @@ from dudmap.frames.exposure import exposed, exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
@@ -31,6 +32,7 @@ from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.color_motion import ColorMotion
 from dudmap.tracking.depth_distortion import DepthDistortion
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.estimate import PoseEstimate
@@ -53,6 +55,7 @@ class Slam:
             static before it moved or before it was seen through.
         depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
             as it is, and with ``sensor.distortion`` learnt further for the next run.
+        calibration: Of the colour camera; None for colour that is registered to depth.
     """
 
     def __init__(
@@ -61,16 +64,21 @@ class Slam:
         config: Config | None = None,
         first_pass: "Slam | None" = None,
         depth_model: DepthDistortion | None = None,
+        calibration: Calibration | None = None,
     ) -> None:
         self.config = config = config or Config()
-        self.preprocess = Preprocessor(camera, config.preprocess)
+        given = (
+            None if calibration is None or calibration.is_registered(replace(camera, distortion=())) else calibration
+        )
+        self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.tracker = Tracker(config.tracker, config.sensor)
         self.motion = MotionModel(config.tracker)
+        self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
-        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor)
+        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
         known_poses = {}
         keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
         if self.prior_map is None:
@@ -82,6 +90,7 @@ class Slam:
         self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.bootstrap = Bootstrap()
+        self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
         self.depth_distortion = depth_model or DepthDistortion()
@@ -109,6 +118,11 @@ class Slam:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the colour camera in use."""
+        return self.color_motion.calibration or Calibration.registered(self.camera)
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
@@ -157,7 +171,7 @@ class Slam:
         Raises:
             DatasetError: The images do not fit the camera or each other.
         """
-        view = self.prepare(frame, dynamic_mask)
+        view = self.color_motion.predicted(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
@@ -167,8 +181,10 @@ class Slam:
         reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
+        self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
@@ -199,6 +215,8 @@ class Slam:
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self._add_keyframe(view, estimate, mask)
         self._integrate(view, estimate, mask)
+        self._first_mask = mask
+        self.color_motion.start(view)
         if self.config.dynamics.method == "em":
             self.bootstrap.start(view, mask)
             self.predictor.start(view)
@@ -212,7 +230,15 @@ class Slam:
         first = self.bootstrap.revised(prediction.moving_before)
         if first is not None:
             self.atlas.clear_first_frame()
+            self._first_mask = first.dynamic_mask
             self._integrate(replace(first.view, timer=view.timer), PoseEstimate.at_origin(), first.dynamic_mask)
+
+    def _recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
+        first = self.color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        if first is not None:
+            self.atlas.clear_first_frame()
+            self._integrate(replace(first, timer=view.timer), PoseEstimate.at_origin(), self._first_mask)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""

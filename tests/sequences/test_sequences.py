@@ -330,3 +330,38 @@ def test_an_icl_nuim_folder_has_its_camera_and_its_own_name_of_the_true_trajecto
     assert len(sequence.ground_truth) == 2
     (folder / "second.gt.freiburg").write_text("100 0 0 0 0 0 0 1\n")
     assert open_sequence(folder).ground_truth is None
+
+
+SECOND = "fx 60\nfy 60\ncx 31.5\ncy 23.5\ncolor_fx 80\ncolor_fy 81\ncolor_cx 39.5\ncolor_cy 29.5\ncolor_width 80\n"
+SECOND += "color_height 60\ncolor_k1 0.1\nT_depth_color 1 0 0 0.025 0 1 0 0 0 0 1 -0.01\n"
+
+
+def test_a_second_camera_for_colour(tmp_path):
+    folder = write_recording(tmp_path / "two", rgb_shift=0.004, intrinsics=SECOND)
+    for file in (folder / "rgb").glob("*.png"):
+        cv2.imwrite(str(file), np.zeros((60, 80, 3), np.uint8))
+    sequence = open_sequence(folder)
+    calibration, frame = sequence.calibration, sequence[1]
+    assert calibration is not None
+    assert calibration.camera == Camera(80, 81, 39.5, 29.5, 80, 60, distortion=(0.1, 0, 0, 0, 0))
+    assert np.allclose(calibration.T_color_depth[:3, 3], [-0.025, 0, 0.01])
+    assert (frame.depth.shape, frame.color.shape) == ((HEIGHT, WIDTH), (60, 80, 3))
+    assert frame.color_timestamp == pytest.approx(frame.timestamp + 0.004)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        (SECOND.replace("color_cx 39.5\n", ""), "lacks color_cx"),
+        (SECOND.replace("1 -0.01", "1"), "not a rigid motion"),
+        (SECOND.replace("T_depth_color 1", "T_depth_color 2"), "not a rigid motion"),
+    ],
+)
+def test_a_second_camera_that_cannot_be_used(tmp_path, text, sentence):
+    with pytest.raises(DatasetError, match=sentence):
+        open_sequence(write_recording(tmp_path / "two", intrinsics=text))
+
+
+def test_colour_that_does_not_have_the_size_of_its_camera(tmp_path):
+    with pytest.raises(DatasetError, match="colour camera is 80x60"):
+        open_sequence(write_recording(tmp_path / "two", intrinsics=SECOND))

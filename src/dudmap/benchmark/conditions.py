@@ -66,6 +66,8 @@ class DepartingMovers:
         until: Number of the first frame without movers.
     """
 
+    calibration = None
+
     def __init__(self, recording: "SyntheticSequence", until: int) -> None:
         self._parts, self._until = (recording, recording.static_twin()), until
         self.name, self.camera, self.timestamps = f"{recording.name}-leaving", recording.camera, recording.timestamps
@@ -88,6 +90,8 @@ class DepartingMovers:
 
 class CachedRecording:
     """Recording rendered into memory once, for several systems."""
+
+    calibration = None
 
     def __init__(self, recording: "SyntheticSequence | DepartingMovers") -> None:
         self.name, self.camera, self.timestamps = recording.name, recording.camera, recording.timestamps

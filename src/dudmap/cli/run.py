@@ -17,6 +17,14 @@ CameraOption = Annotated[
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
+CalibrationOption = Annotated[
+    str | None,
+    typer.Option(
+        "--calibration",
+        help="Calibration of the colour camera: calibration.toml of a run or of calibrate, or auto to calibrate first.",
+        metavar="FILE|auto",
+    ),
+]
 SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
@@ -33,6 +41,7 @@ def run(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    calibration: CalibrationOption = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
     masks: Annotated[
@@ -59,16 +68,25 @@ def run(
     Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
     --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving object.
     """
+    from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
     parameters = read_config(config, preset, assignments or [])
     recording = open_sequence(sequence, camera)
     out = out or free_folder(Path("runs") / recording.name)
+    if calibration == "auto":
+        from dudmap.pipeline.calibration import calibrate_sequence
+
+        start = recording.calibration or Calibration.registered(recording.camera)
+        given = calibrate_sequence(recording, parameters, start, max_frames).calibration
+    else:
+        given = None if calibration is None else Calibration.load(calibration)
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
         depth_model=depth_model,
+        calibration=given,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 

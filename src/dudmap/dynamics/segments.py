@@ -92,17 +92,21 @@ def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
         level: The image.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
     """
-    import cv2
-
     edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
     labels, count = kernels.segment_surface(
         level.depth, level.camera.intrinsics, tolerance, edge_reach, normal_reach, CONCAVITY
     )
+    return Segmentation(labels, count, intensity_gradient(level), scaled_area(MIN_PIXELS, level), scaled_side(1, level))
+
+
+def intensity_gradient(level: Level) -> NDArray[np.float32]:
+    """Local mean (h, w) of the magnitude of the intensity gradient, per pixel at REFERENCE_WIDTH."""
+    import cv2
+
     scale, window = pixel_scale(level), scaled_side(1, level)
     du = cv2.Sobel(level.intensity, cv2.CV_32F, 1, 0, scale=scale / 8)
     dv = cv2.Sobel(level.intensity, cv2.CV_32F, 0, 1, scale=scale / 8)
-    gradient = np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
-    return Segmentation(labels, count, gradient, scaled_area(MIN_PIXELS, level), window)
+    return np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
 
 
 def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.bool_]) -> Segmentation:

@@ -18,8 +18,10 @@ class Observation:
         camera: Camera of all images here; without lens distortion.
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
         intensity: (H, W) float32, 0..1.
-        rgb: (H, W, 3) uint8.
+        rgb: (H, W, 3) uint8, registered to the depth.
         backend: Compute device of the preprocessor, which also makes the image pyramid.
+        recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
+        color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
     """
 
     timestamp: float
@@ -28,6 +30,9 @@ class Observation:
     intensity: NDArray[np.float32]
     rgb: NDArray[np.uint8]
     backend: Backend = field(repr=False)
+    recorded_rgb: NDArray[np.uint8] | None = None
+    color_offset: float = 0.0
+    _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
 
 

@@ -7,8 +7,10 @@ from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig
 from dudmap.errors import DatasetError
+from dudmap.frames.color_registration import color_projection, register_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.observation import Observation
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
@@ -31,13 +33,22 @@ class Preprocessor:
     1.52 against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
 
     Args:
-        camera: Camera of the frames.
+        camera: Camera of the depth images, and of the colour images without ``calibration``.
         config: Limits and filter parameters.
         backend: Compute device, of this preprocessor alone; None takes the CPU.
+        calibration: Of the colour camera; None for colour that is registered to depth. The motion during the delay is
+            left to those who know it.
     """
 
-    def __init__(self, camera: Camera, config: PreprocessConfig | None = None, backend: Backend | None = None) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        config: PreprocessConfig | None = None,
+        backend: Backend | None = None,
+        calibration: Calibration | None = None,
+    ) -> None:
         self.config = config or PreprocessConfig()
+        self.calibration = calibration
         self.camera = replace(camera, distortion=())
         self._maps = _undistortion(camera) if any(camera.distortion) else None
         self._inverse_map = _distortion(camera) if any(camera.distortion) else None
@@ -66,8 +77,14 @@ class Preprocessor:
         rgb = np.ascontiguousarray(frame.color)
         if self._maps is not None:
             depth, rgb = self._undistorted(depth, rgb)
-        smooth, intensity = self._backend.filter(depth, rgb, self._parameters)
-        return Observation(frame.timestamp, self.camera, smooth, intensity, rgb, self._backend)
+        depth = self._backend.filter(depth, self._parameters)
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        recorded = None
+        if self.calibration is not None:
+            recorded, projection = rgb, color_projection(self.calibration, np.zeros(6), offset)
+            rgb = register_color(recorded, depth, self.camera, projection, self._backend)
+        intensity = self._backend.intensity(rgb)
+        return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Undistorted mask (H, W) bool of a frame.
@@ -103,7 +120,13 @@ class Preprocessor:
 
     def _check(self, frame: Frame) -> None:
         h, w = self.camera.shape
-        if frame.depth.shape != (h, w) or frame.color.shape != (h, w, 3):
+        if self.calibration is not None and frame.color.shape != (*self.calibration.camera.shape, 3):
+            color_h, color_w = self.calibration.camera.shape
+            raise DatasetError(
+                f"the colour camera is {color_w}x{color_h}, but the colour image has the shape {frame.color.shape}"
+            )
+        unregistered = self.calibration is not None
+        if frame.depth.shape != (h, w) or not (unregistered or frame.color.shape == (h, w, 3)):
             raise DatasetError(
                 f"the camera is {w}x{h}, but the depth image has the shape {frame.depth.shape} and the colour image "
                 f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand"
@@ -117,12 +140,17 @@ class Preprocessor:
     def _undistorted(
         self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]
     ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-        """Both images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel."""
+        """Both images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel.
+
+        Colour of a camera with a calibration stays as it is: its registration includes the distortion.
+        """
         import cv2
 
         assert self._maps is not None
         nearest, between = self._maps
         straight = cv2.remap(depth, *nearest, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        if self.calibration is not None:
+            return np.asarray(straight, dtype=np.float32), rgb
         color = cv2.remap(rgb, *between, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
 

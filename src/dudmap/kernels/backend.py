@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.parameters import (
+    ColorProjection,
     DepthView,
     FilterParameters,
     FusedBlocks,
@@ -31,15 +32,33 @@ class Backend(Protocol):
 
     # -- filter ------------------------------------------------------------------------------------------------------
 
-    def filter(
-        self, depth: NDArray[np.float32], rgb: NDArray[np.uint8], parameters: FilterParameters
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Depth (H, W) in metres, limited, with small holes filled and smoothed, and intensities (H, W) in [0, 1].
+    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
+        """Depth (H, W) in metres, limited, with small holes filled and smoothed.
 
         Args:
             depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
-            rgb: (H, W, 3) uint8.
             parameters: Limits and filter (thesis section 4.3).
+        """
+        ...
+
+    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Intensities (H, W) in [0, 1] of colours (H, W, 3)."""
+        ...
+
+    def color_pixels(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        projection: ColorProjection,
+        fallback: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Coordinates u, v (H, W) in the colour image of each pixel of a depth image.
+
+        Args:
+            depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
+            intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
+            projection: Of the colour camera.
+            fallback: Depth of rows without a reading, metres.
         """
         ...
 

@@ -6,9 +6,20 @@ Bands do not depend on the number of threads, and sums are added in their order 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels import filtering, integration, labeling, meshing, raycasting, registration, sampling, visibility
+from dudmap.kernels import (
+    color_registration,
+    filtering,
+    integration,
+    labeling,
+    meshing,
+    raycasting,
+    registration,
+    sampling,
+    visibility,
+)
 from dudmap.kernels.parameters import (
     BLOCK,
+    ColorProjection,
     DepthTiles,
     DepthView,
     FilterParameters,
@@ -50,17 +61,15 @@ class CpuBackend:
 
     def __init__(self) -> None:
         self._padded = np.empty((0, 0), dtype=np.float32)
+        self._limited = np.empty((0, 0), dtype=np.float32)
         self._pixels = np.empty((0, 2), dtype=np.int32)
 
     # -- filter ------------------------------------------------------------------------------------------------------
 
-    def filter(
-        self, depth: NDArray[np.float32], rgb: NDArray[np.uint8], parameters: FilterParameters
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
         """See ``Backend.filter``."""
         p = parameters
-        # One allocation: above 4 MB NumPy asks for huge pages, and the page faults of single images cost 2 ms.
-        smooth, limited, intensity = np.empty((3, *depth.shape), dtype=np.float32)
+        smooth, limited = np.empty(depth.shape, dtype=np.float32), self._limited_buffer(depth.shape)
         filtering.limit_depth(depth, np.float32(p.depth_min), np.float32(p.depth_max), limited)
         alpha, hole_noise = np.float32(p.alpha), np.float32(p.hole_noise)
         ranges = bands(depth.shape[0], FILTER_ROWS)
@@ -80,8 +89,37 @@ class CpuBackend:
             spatial = np.exp(-(np.arange(p.radius + 1) ** 2) / (2 * p.sigma_px**2)).astype(np.float32)
             filtering.pad(0, depth.shape[0], smooth, p.radius, padded)
             run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, spatial, smooth), ranges)
-        filtering.intensities(0, depth.shape[0], rgb, intensity)
-        return smooth, intensity
+        return smooth
+
+    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See ``Backend.intensity``."""
+        intensity = np.empty(rgb.shape[:2], dtype=np.float32)
+        filtering.intensities(0, rgb.shape[0], rgb, intensity)
+        return intensity
+
+    def color_pixels(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        projection: ColorProjection,
+        fallback: float,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See ``Backend.color_pixels``."""
+        us, vs = np.empty((2, *depth.shape), dtype=np.float32)
+        arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
+        run_bands(
+            lambda start, stop: color_registration.color_pixels_rows(
+                start, stop, depth, intrinsics, *arrays, *numbers, us, vs
+            ),
+            bands(depth.shape[0], PIXEL_ROWS),
+        )
+        return us, vs
+
+    def _limited_buffer(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
+        """Image for depths between two steps of the filter."""
+        if self._limited.shape != shape:
+            self._limited = np.empty(shape, dtype=np.float32)
+        return self._limited
 
     def _padded_buffer(self, shape: tuple[int, ...], margin: int) -> NDArray[np.float32]:
         """Image with a margin, ABSENT all around."""

@@ -98,6 +98,28 @@ class RegistrationParameters(NamedTuple):
     noise_weighting: float
 
 
+class ColorProjection(NamedTuple):
+    """How points of the depth camera reach the image of the colour camera (``kernels/color_registration.py``).
+
+    Attributes:
+        place, speed, bend: (3, 4) float32; a point X lies at place X - tau speed X + tau^2 / 2 bend X at the time tau.
+        intrinsics: (4,) float32 of the colour camera.
+        distortion: (5,) float32 k1, k2, p1, p2, k3 of the colour camera.
+        offset: Time of the middle row of the colour image minus that of the depth image, s.
+        readout: Time from the first to the last row of the colour image, s.
+        height: Rows of the colour image.
+    """
+
+    place: NDArray[np.float32]
+    speed: NDArray[np.float32]
+    bend: NDArray[np.float32]
+    intrinsics: NDArray[np.float32]
+    distortion: NDArray[np.float32]
+    offset: float
+    readout: float
+    height: int
+
+
 class RaycastParameters(NamedTuple):
     """Limits of a view of the map: depths in metres, and the smallest weight of a trusted voxel (at least 1)."""
 

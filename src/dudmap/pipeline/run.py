@@ -14,6 +14,7 @@ from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask, write_run_folder
 
 if TYPE_CHECKING:
+    from dudmap.geometry.calibration import Calibration
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
@@ -34,6 +35,7 @@ def run(
     live: bool = False,
     passes: int = 1,
     depth_model: str | Path | None = None,
+    calibration: "Calibration | None" = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
@@ -65,6 +67,7 @@ def run(
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
         depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
+        calibration: Of the colour camera; None takes that of the recording.
         observe: Called after each processed frame with its number, what was read, and the result.
 
     Raises:
@@ -87,7 +90,8 @@ def run(
         )
     given_masks = None if masks is None else _open_masks(masks, sequence)
     models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
-    slam = Slam(sequence.camera, config, depth_model=models[0])
+    calibration = calibration or sequence.calibration
+    slam = Slam(sequence.camera, config, depth_model=models[0], calibration=calibration)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -96,11 +100,13 @@ def run(
         try:
             if live:
                 display.working("loading kernels")
-                load_kernels(Slam(sequence.camera, config), sequence, count)
+                load_kernels(Slam(sequence.camera, config, calibration=calibration), sequence, count)
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
-                    slam = Slam(sequence.camera, config, first_pass=slam, depth_model=models[number])
+                    slam = Slam(
+                        sequence.camera, config, first_pass=slam, depth_model=models[number], calibration=calibration
+                    )
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl", "depth_model.npz",
+    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -109,6 +109,8 @@ def write_run_folder(
     metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
     noise = slam.depth_noise.fitted()
     metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
+    calibration = slam.calibration
+    metrics["calibration"] = calibration.tree()
 
     def save_mesh() -> None:
         mesh = volume.extract_mesh()
@@ -125,6 +127,7 @@ def write_run_folder(
     steps: list[Callable[[], None]] = [
         lambda: trajectory.save(out / "trajectory.txt"),
         lambda: config.save(out / "config.toml"),
+        lambda: calibration.save(out / "calibration.toml"),
         lambda: record.save_timings(out / "timings.csv"),
         lambda: record.save_residuals(out / "residuals.npz"),
         lambda: record.save_movers(out / "movers.jsonl"),

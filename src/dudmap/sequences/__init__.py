@@ -10,6 +10,7 @@ from dudmap.errors import DatasetError
 
 if TYPE_CHECKING:
     from dudmap.frames.frame import Frame
+    from dudmap.geometry.calibration import Calibration
     from dudmap.geometry.camera import Camera
     from dudmap.geometry.trajectory import Trajectory
 
@@ -22,7 +23,8 @@ class Sequence(Protocol):
 
     Attributes:
         name: Short name, usable as a folder name.
-        camera: Intrinsics shared by colour and depth of all frames.
+        camera: Intrinsics of the depth images, and of the colour images where these are registered to them.
+        calibration: Of the colour camera; None for colour that is registered to depth.
         timestamps: (N,) float64 strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses if known; used for evaluation only.
     """
@@ -31,6 +33,8 @@ class Sequence(Protocol):
     def name(self) -> str: ...  # noqa: D102
     @property
     def camera(self) -> "Camera": ...  # noqa: D102
+    @property
+    def calibration(self) -> "Calibration | None": ...  # noqa: D102
     @property
     def timestamps(self) -> NDArray[np.float64]: ...  # noqa: D102
     @property

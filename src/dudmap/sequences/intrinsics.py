@@ -1,16 +1,27 @@
 """Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from dudmap.errors import DatasetError
+from dudmap.geometry import se3
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 DEPTH_SCALE = 5000.0
 """Depth units per metre in the TUM layout, where nothing else is given."""
 KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
+COLOR_PREFIX = "color_"
+"""Prefix of the keys of a second camera for the colour images, with fx, fy, cx, cy, width and height, which are
+required, and the coefficients of its distortion."""
+COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
+MOTION_KEY = "T_depth_color"
+"""Key of the 12 or 16 numbers, row by row, of the motion that takes points of the colour camera to the depth camera."""
 
 
 @dataclass(frozen=True)
@@ -20,15 +31,29 @@ class Intrinsics:
     Attributes:
         values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present.
         source: Origin of the numbers, for error messages.
+        color: Numbers by key of the camera of the colour images, empty if it is the same.
+        T_depth_color: (4, 4) points of the colour camera to the depth camera.
     """
 
     values: dict[str, float]
     source: str
+    color: dict[str, float] = field(default_factory=dict)
+    T_depth_color: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     @property
     def depth_scale(self) -> float:
         """Depth units per metre."""
         return self.values.get("depth_scale", DEPTH_SCALE)
+
+    def calibration(self) -> Calibration | None:
+        """Calibration of the colour camera; None if it is the same as the depth camera.
+
+        Raises:
+            DatasetError: The numbers are invalid.
+        """
+        if not self.color:
+            return None
+        return Calibration(_camera(self.color, 1000.0), se3.inverse(self.T_depth_color))
 
     def camera(self, width: int, height: int) -> Camera:
         """Camera for images of the given size.
@@ -42,17 +67,21 @@ class Intrinsics:
                 f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's are "
                 f"{width}x{height}; give the right intrinsics with --camera fx,fy,cx,cy,w,h,depth_scale"
             )
-        distortion = tuple(self.values.get(key, 0.0) for key in DISTORTION_KEYS)
-        return Camera(
-            fx=self.values["fx"],
-            fy=self.values["fy"],
-            cx=self.values["cx"],
-            cy=self.values["cy"],
-            width=width,
-            height=height,
-            depth_scale=self.depth_scale,
-            distortion=distortion if any(distortion) else (),
-        )
+        return _camera(self.values | {"width": width, "height": height}, self.depth_scale)
+
+
+def _camera(values: dict[str, float], depth_scale: float) -> Camera:
+    distortion = tuple(values.get(key, 0.0) for key in DISTORTION_KEYS)
+    return Camera(
+        fx=values["fx"],
+        fy=values["fy"],
+        cx=values["cx"],
+        cy=values["cy"],
+        width=int(values["width"]),
+        height=int(values["height"]),
+        depth_scale=depth_scale,
+        distortion=distortion if any(distortion) else (),
+    )
 
 
 def _by_key(*numbers: float) -> dict[str, float]:
@@ -120,7 +149,7 @@ def from_file(path: Path) -> Intrinsics:
         raise DatasetError(f"cannot read {path}: {error}") from error
     rows = [row for line in lines if (row := re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split())]
     if rows and not _is_number(rows[0][0]):
-        return Intrinsics(_keyed(path, rows), str(path))
+        return _keyed(path, rows)
     if rows and all(_is_number(field) for row in rows for field in row):
         table = [[float(field) for field in row] for row in rows]
         if [len(row) for row in table] == [3, 3, 3] and table[2] == [0, 0, 1]:
@@ -133,9 +162,16 @@ def from_file(path: Path) -> Intrinsics:
     )
 
 
-def _keyed(path: Path, rows: list[list[str]]) -> dict[str, float]:
-    values = {}
+def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:
+    values, color, T_depth_color = {}, {}, None
+    color_keys = [COLOR_PREFIX + key for key in (*COLOR_REQUIRED, *DISTORTION_KEYS)]
     for row in rows:
+        if row[0] == MOTION_KEY:
+            T_depth_color = _motion(path, row[1:])
+            continue
+        if row[0] in color_keys and len(row) == 2 and _is_number(row[1]):
+            color[row[0].removeprefix(COLOR_PREFIX)] = float(row[1])
+            continue
         if row[0] not in KEYS or len(row) != 2 or not _is_number(row[1]):
             raise DatasetError(
                 f"{path}: cannot understand the line {' '.join(row)!r}; expected one of {', '.join(KEYS)} and a number"
@@ -144,7 +180,25 @@ def _keyed(path: Path, rows: list[list[str]]) -> dict[str, float]:
     missing = [key for key in KEYS[:4] if key not in values]
     if missing:
         raise DatasetError(f"{path} lacks {', '.join(missing)}")
-    return values
+    missing = [COLOR_PREFIX + key for key in COLOR_REQUIRED if key not in color]
+    if missing and (color or T_depth_color is not None):
+        raise DatasetError(f"{path} lacks {', '.join(missing)}, which the second camera of the colour images needs")
+    return Intrinsics(values, str(path), color, np.eye(4) if T_depth_color is None else T_depth_color)
+
+
+def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
+    """Rigid motion of 12 or 16 numbers, row by row.
+
+    Raises:
+        DatasetError: They are not a rigid motion.
+    """
+    T = np.eye(4)
+    if len(fields) in (12, 16) and all(_is_number(field) for field in fields):
+        T[:3] = np.array(fields[:12], dtype=np.float64).reshape(3, 4)
+        if np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(T[:3, :3]) > 0:
+            T[:3, :3] = se3.nearest_rotation(T[:3, :3])
+            return T
+    raise DatasetError(f"{path}: {MOTION_KEY} is not a rigid motion of 12 or 16 numbers, row by row")
 
 
 def _is_number(text: str) -> bool:

@@ -35,6 +35,7 @@ class TumSequence:
     Attributes:
         name: Name of the folder.
         camera: Intrinsics.
+        calibration: Of the colour camera, where intrinsics.txt gives it; None for colour that is registered to depth.
         timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses, None without groundtruth.txt.
 
@@ -52,6 +53,7 @@ class TumSequence:
             known = intrinsics.from_text(camera)
         else:
             known = intrinsics.from_camera(camera) if camera else intrinsics.of_folder(self.path)
+        self.calibration = known.calibration()
         self.camera = self._probe(known)
         truth = self._find_ground_truth()
         self.ground_truth = None if truth is None else Trajectory.load(truth)
@@ -100,12 +102,19 @@ class TumSequence:
             color = images.read_color(color_file.path)
         except FrameError as error:
             raise FrameError(f"frame {index}: {error}") from error
-        if color.shape[:2] != depth.shape:
+        if self.calibration is not None and color.shape[:2] != self.calibration.camera.shape:
+            expected = self.calibration.camera
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {_size(color)} pixels, but the recording's "
+                f"colour camera is {expected.width}x{expected.height}"
+            )
+        if self.calibration is None and color.shape[:2] != depth.shape:
             raise FrameError(
                 f"frame {index}: the colour image {color_file.path} is {_size(color)} pixels but the depth image "
-                f"{depth_file.path} is {_size(depth)}; both must have one size, with depth registered to colour"
+                f"{depth_file.path} is {_size(depth)}; both must have one size, with depth registered to "
+                "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
             )
-        return Frame(depth_file.timestamp, depth, color)
+        return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         associations = self.path / "associations.txt"

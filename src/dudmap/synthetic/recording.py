@@ -66,6 +66,8 @@ class SyntheticSequence:
         scene: The static scene.
     """
 
+    calibration = None
+
     def __init__(
         self,
         scene: Scene,

@@ -1,7 +1,7 @@
 """A frame on its way through the algorithm."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ class FrameView:
         known_dynamic: (H, W) bool, pixels that the caller declares dynamic; None for none.
         blind: The image is textureless although the first image of the map was not: the pose rests on the distances
             alone, and the frame is not fused.
+        color_velocity: (6,) twist of the camera per second with which the colours were registered.
     """
 
     observation: Observation
@@ -35,6 +36,7 @@ class FrameView:
     timer: StageTimer
     known_dynamic: NDArray[np.bool_] | None = None
     blind: bool = False
+    color_velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
 
     @property
     def timestamp(self) -> float:

@@ -11,6 +11,7 @@ from dudmap.dynamics.masks import Labels
 from dudmap.frames.pyramid import reduced
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import SURFACE, TsdfVolume
+from dudmap.tracking.color_motion import ColorMotion
 from dudmap.tracking.color_noise import motion_discount
 from dudmap.tracking.estimate import PoseEstimate, initial_weights, static_weights
 from dudmap.tracking.frame_view import FrameView
@@ -36,6 +37,7 @@ class FrontEnd:
         detector: Labels the pixels of a registered image.
         motion: Velocity of the camera.
         monitor: Knows the residuals of the previous frames.
+        color_motion: Registers the colours of a frame with the camera's motion.
 
     Attributes:
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
@@ -49,6 +51,7 @@ class FrontEnd:
         detector: DynamicDetector,
         motion: MotionModel,
         monitor: QualityMonitor,
+        color_motion: ColorMotion,
     ) -> None:
         self.config = config
         self.tracker = tracker
@@ -57,6 +60,7 @@ class FrontEnd:
         self.detector = detector
         self.motion = motion
         self.monitor = monitor
+        self.color_motion = color_motion
         self.time_offset = DepthTimeOffset()
         self.last_dynamic: NDArray[np.bool_] | None = None
 
@@ -101,6 +105,8 @@ class FrontEnd:
         with view.timer("track"):
             coarse = levels[:split]
             tracking = tracker.align(volume, coarse, T_init, initial_weights(coarse, self.last_dynamic, excluded))
+        view = self.color_motion.refined(view, tracking.T_world_camera)
+        levels = view.pyramid.tracked
         labels = self._label(volume, view, prediction, tracking)
         with view.timer("track_again"):
             finest_suffices = split < len(levels) and tracking.settled and self._labels_unchanged(labels)

@@ -24,11 +24,16 @@ class MotionModel:
         self._velocity = np.zeros(6)  # twist per second, camera axes
         self._initialized = False
 
+    @property
+    def velocity(self) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, between the last two poses; 0 where it is not known."""
+        return self._velocity
+
     def predict(self, timestamp: float) -> NDArray[np.float64]:
         """Predicted pose (4, 4) at a time in seconds."""
         if not self.config.constant_velocity:
             return self.T_world_camera
-        return self.T_world_camera @ se3.exp(self._velocity * self._elapsed(timestamp))
+        return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
     def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Accept the pose of a tracked frame; returns ``velocity_to`` it."""
@@ -42,7 +47,7 @@ class MotionModel:
         """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""
         if not self._initialized:
             return np.zeros(6)
-        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self._elapsed(timestamp)
+        return se3.log(se3.inverse(self.T_world_camera) @ T_world_camera) / self.elapsed(timestamp)
 
     def lost(self, timestamp: float) -> bool:
         """Register a frame without a pose; once the velocity's lifetime is over, the last pose is the prediction.
@@ -67,12 +72,13 @@ class MotionModel:
     def rejection_reason(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
         """Sentence on a velocity beyond ``max_speed`` or ``max_turn_deg``; empty if there is none."""
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
-        elapsed = self._elapsed(timestamp)
+        elapsed = self.elapsed(timestamp)
         speed = float(np.linalg.norm(motion[:3, 3])) / elapsed
         turn = float(np.degrees(se3.rotation_angle(motion))) / elapsed
         if speed > self.config.max_speed or turn > self.config.max_turn_deg:
             return f"the camera would have jumped at {speed:.1f} m/s and {turn:.0f} deg/s"
         return ""
 
-    def _elapsed(self, timestamp: float) -> float:
+    def elapsed(self, timestamp: float) -> float:
+        """Seconds since the last accepted pose, at most 1."""
         return min(max(timestamp - self._timestamp, 1e-3), 1.0)

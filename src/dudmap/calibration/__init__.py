@@ -1,0 +1,1 @@
+"""Self-calibration of the colour camera against the depth camera."""

@@ -1,0 +1,114 @@
+"""``dudmap calibrate``: find where and when the colour camera of a recording looks, relative to the depth camera."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, read_config
+
+if TYPE_CHECKING:
+    from rich.table import Table
+
+    from dudmap.calibration.estimator import Estimate
+    from dudmap.geometry.calibration import Calibration
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def calibrate(
+    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder in TUM layout.")],
+    out: Annotated[Path | None, typer.Option("--out", help="Write the calibration to this TOML file.")] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    preset: PresetOption = None,
+    camera: CameraOption = None,
+    calibration: Annotated[
+        Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
+    ] = None,
+    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+) -> None:
+    """Estimate geometry, lens and timing of the colour camera relative to the depth camera.
+
+    Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
+    the images do not prove stays as the files give it.
+    """
+    import json
+
+    from rich.console import Console
+
+    from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.calibration import calibrate_sequence
+    from dudmap.sequences import open_sequence
+
+    recording = open_sequence(sequence, camera)
+    given = recording.calibration if calibration is None else Calibration.load(calibration)
+    given = given or Calibration.registered(recording.camera)
+    estimate = calibrate_sequence(recording, read_config(config, preset, assignments or []), given, max_frames)
+    if out is not None:
+        estimate.calibration.save(out)
+    if as_json:
+        evidence = {name: value for name, value in estimate.evidence.items() if value == value}
+        typer.echo(json.dumps(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}))
+        return
+    console = Console()
+    console.print(table(given, estimate))
+    for line in remarks(estimate):
+        console.print(line, highlight=False, soft_wrap=True)
+    if out is not None:
+        console.print(f"written to {out}", highlight=False, soft_wrap=True)
+
+
+def table(given: "Calibration", estimate: "Estimate") -> "Table":
+    """One row per parameter: what was given, what was found, and the standard deviation."""
+    import numpy as np
+    from rich.table import Table
+
+    from dudmap.geometry.calibration import PARAMETERS
+
+    out = Table("parameter", "change", "sigma", "unit", "")
+    change = given.step_to(estimate.calibration)
+    for name, value, sigma in zip(PARAMETERS, change, estimate.calibration.sigma, strict=True):
+        unit, factor = UNITS[name.split("_")[0] if name.startswith(("translation", "rotation", "center")) else name]
+        found = name in estimate.calibration.estimated
+        out.add_row(
+            name,
+            f"{factor * value:+.3f}" if found else "",
+            f"{factor * sigma:.3f}" if np.isfinite(sigma) else "",
+            unit,
+            "estimated" if found else "as given",
+        )
+    return out
+
+
+UNITS = {
+    "translation": ("mm", 1000.0),
+    "rotation": ("deg", 57.29578),
+    "log_focal": ("%", 100.0),
+    "center": ("px", 1.0),
+    "k1": ("", 1.0),
+    "k2": ("", 1.0),
+    "delay": ("ms", 1000.0),
+    "readout": ("ms", 1000.0),
+}
+"""Unit of each kind of parameter in the table, and how many there are in a metre, radian, pixel or second."""
+
+
+def remarks(estimate: "Estimate") -> list[str]:
+    """Sentences on what was decided and why."""
+    from dudmap.calibration.estimator import EVIDENCE, GROUPS, MIN_PAIRS
+
+    out = []
+    for name, members in GROUPS.items():
+        value = estimate.evidence[name]
+        if value != value:
+            out.append(f"{name}: not observable, fewer than {MIN_PAIRS} pairs of overlapping views in half of the time")
+        elif members[0] not in estimate.calibration.estimated:
+            out.append(f"{name}: stays as given; other images are explained {value:+.1f} standard errors better by it")
+        else:
+            out.append(f"{name}: other images are explained {value:.1f} standard errors better (at least {EVIDENCE:g})")
+    out.append(f"{estimate.pairs} pairs of images; cost of images that were not used: {-100 * estimate.gain:+.1f} %")
+    out.append("the scale of the depth is not observable: it scales all motions and the offset alike")
+    return out

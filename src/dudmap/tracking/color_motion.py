@@ -1,0 +1,127 @@
+"""Registration of the colour image with the camera's motion between depth and colour."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.dynamics.segments import Segmentation, intensity_gradient
+from dudmap.frames.color_registration import color_projection, recorded_intensity, register_color
+from dudmap.frames.observation import Level, Observation
+from dudmap.frames.pyramid import Pyramid
+from dudmap.geometry.calibration import Calibration
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.tracking.frame_view import FrameView
+from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
+
+
+class ColorMotion:
+    """Registers colour to depth with the calibration in use, which may change while the camera moves.
+
+    A colour image taken at tau after the depth image of a camera at x with the velocity v shows what is seen from
+    y = x + tau v. Registered with the velocity v + d it asks for the pose x - tau d; if colour has the share k of the
+    registration, the velocity that follows from the found pose is v - k (tau / dt) d, where dt is the time since the
+    last frame. For tau > dt / 2 and k = 1, errors would grow from frame to frame if that velocity were used for the
+    next. Going the part a = 1 / (1 + tau / dt) of the way from the assumed velocity to the found one leaves
+    d (1 - a (1 + k tau / dt)): nothing where colour decides, and where it does not the pose is not concerned.
+
+    The velocity of the first frame of a map is not known. Its colours are taken as they are, and so are those of the
+    second frame, whose motion since the first is then right; with it the first frame is fused anew.
+
+    Args:
+        motion: Velocity of the camera.
+        given: Calibration with which frames are prepared; None for colour that is registered to depth.
+
+    Attributes:
+        calibration: In use; None for images that are taken as they are.
+    """
+
+    def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
+        self.motion = motion
+        self.given = given
+        self.calibration = given
+        self._first: FrameView | None = None
+        self._backend = CpuBackend()  # of its own: frames are prepared in another thread
+
+    def start(self, view: FrameView) -> None:
+        """Remember the frame that a map was made of, until its velocity is known."""
+        self._first = None if self._is_prepared(view.observation, np.ones(6)) else view
+
+    def first_frame(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> FrameView | None:
+        """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
+
+        None where the map is right as it is, or where too much time has passed for the velocity to be known.
+        """
+        first, self._first = self._first, None
+        if first is None or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
+            return None
+        return self._with_colors(first, self.motion.velocity_to(timestamp, T_world_camera))
+
+    def predicted(self, view: FrameView) -> FrameView:
+        """The frame with the intensities of its pyramid registered by the velocity so far."""
+        return self._with_levels(view, self.motion.velocity)
+
+    def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
+        if self._first is not None:
+            return view
+        return self._with_levels(view, self._velocity(view, T_world_camera))
+
+    def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The frame with its colours registered, once its pose (4, 4) is known."""
+        return self._with_colors(view, self._velocity(view, T_world_camera))
+
+    def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        calibration, observation = self.calibration, view.observation
+        if calibration is None or self._is_prepared(observation, velocity):
+            return view
+        with view.timer("color"):
+            projection = color_projection(calibration, velocity, observation.color_offset)
+            recorded = observation.recorded_rgb if observation.recorded_rgb is not None else observation.rgb
+            rgb = register_color(recorded, observation.depth, observation.camera, projection, self._backend)
+            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded))
+
+    def _is_prepared(self, observation: Observation, velocity: NDArray[np.float64]) -> bool:
+        """Whether the frame was prepared with all that is known."""
+        calibration = self.calibration
+        if calibration is None:
+            return True
+        instant = calibration.delay + observation.color_offset == 0 and calibration.readout == 0
+        return calibration is self.given and (instant or not velocity.any())
+
+    def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,) after a frame was registered with that of the motion model."""
+        if self.calibration is None:
+            return view.color_velocity
+        assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
+        if self._first is not None:
+            return found
+        ratio = (self.calibration.delay + view.observation.color_offset) / self.motion.elapsed(view.timestamp)
+        return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)
+
+    def _with_levels(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        calibration, observation = self.calibration, view.observation
+        if calibration is None or self._is_prepared(observation, velocity):
+            return view
+        with view.timer("color"):
+            done: dict[int, Level] = {}
+
+            def registered(level: Level) -> Level:
+                halvings = round(np.log2(observation.camera.width / level.camera.width))
+                if halvings not in done:
+                    scaled = replace(calibration, camera=calibration.camera.scaled(halvings))
+                    projection = color_projection(scaled, velocity, observation.color_offset)
+                    recorded = recorded_intensity(observation, halvings)
+                    intensity = register_color(recorded, level.depth, level.camera, projection, self._backend)
+                    done[halvings] = Level(level.camera, level.depth, intensity)
+                return done[halvings]
+
+            tracked = [registered(level) for level in view.pyramid.tracked]
+            pyramid = Pyramid(tracked, registered(view.pyramid.labelled))
+
+        @cache
+        def segmentation() -> Segmentation:
+            return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
+
+        return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)

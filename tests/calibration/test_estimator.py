@@ -1,0 +1,121 @@
+"""Recovery of the calibration from analytic images of three textured walls, taken by a moving camera."""
+
+import numpy as np
+import pytest
+
+from dudmap.calibration.collector import KeyframeCollector
+from dudmap.calibration.estimator import CalibrationEstimator
+from dudmap.config import PreprocessConfig, SensorConfig
+from dudmap.frames.color_registration import color_projection
+from dudmap.frames.frame import Frame
+from dudmap.frames.preprocess import Preprocessor
+from dudmap.geometry import se3
+from dudmap.geometry.calibration import PARAMETERS, Calibration
+from dudmap.geometry.camera import Camera
+from dudmap.kernels.cpu import CpuBackend
+
+CAMERA = Camera(130.0, 130.0, 79.5, 59.5, 160, 120)
+FPS, FRAMES = 30.0, 80
+NORMALS = np.array([[0.75, 0.1, 0.65], [-0.65, 0.15, 0.75], [0.05, 0.8, 0.6]])
+NORMALS /= np.linalg.norm(NORMALS, axis=1, keepdims=True)
+REACH = np.array([1.6, 1.65, 1.55])
+
+
+def pose(t: float) -> np.ndarray:
+    """A hand-held camera that looks around a corner, speeding up and slowing down about all axes."""
+    angles = [0.20 * np.sin(2.1 * t), 0.22 * np.sin(2.7 * t + 1), 0.18 * np.sin(3.3 * t + 2)]
+    shift = [0.10 * np.sin(2.4 * t + 0.5), 0.08 * np.sin(3.1 * t), 0.08 * np.sin(1.9 * t + 1.5)]
+    T = se3.exp(np.array([0, 0, 0, *angles]))
+    T[:3, 3] = shift
+    return T
+
+
+def hits(rays: np.ndarray, origins: np.ndarray) -> np.ndarray:
+    """Points where rays (..., 3) meet the nearest wall."""
+    t = (REACH - origins @ NORMALS.T) / (rays @ NORMALS.T)
+    t = np.where(t > 0, t, np.inf).min(axis=-1)
+    return origins + rays * t[..., None]
+
+
+def shade(X: np.ndarray) -> np.ndarray:
+    """Texture of the walls: waves of several lengths and directions."""
+    total = np.zeros(X.shape[:-1])
+    for n, k in enumerate([(9, 4, 2), (-5, 11, 6), (13, -7, 9), (4, 15, -12), (-17, 6, 14), (21, 17, 3)]):
+        total += np.sin(X @ np.array(k, float) + n)
+    return np.clip(0.5 + 0.08 * total, 0, 1)
+
+
+def record(truth: Calibration, index: int) -> Frame:
+    """Depth at the stamp; colour with the true lens and place, every row at its own time."""
+    t = index / FPS
+    v, u = np.mgrid[: CAMERA.height, : CAMERA.width]
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(u.shape)], -1)
+    T = pose(t)
+    X = hits(rays @ T[:3, :3].T, np.broadcast_to(T[:3, 3], rays.shape))
+    depth = ((X - T[:3, 3]) @ T[:3, 2]).astype(np.float32)
+    of, k1, k2 = truth.camera, *truth.lens[:2]
+    v, u = np.mgrid[: of.height, : of.width]
+    distorted = np.stack([(u - of.cx) / of.fx, (v - of.cy) / of.fy], -1)
+    straight = distorted
+    for _ in range(20):
+        r2 = (straight**2).sum(-1, keepdims=True)
+        straight = distorted / (1 + k1 * r2 + k2 * r2**2)
+    rays = np.concatenate([straight, np.ones((*u.shape, 1))], -1)
+    origins = np.empty_like(rays)
+    for row in range(of.height):
+        tau = truth.delay + truth.readout * ((row + 0.5) / of.height - 0.5)
+        T = pose(t + tau) @ se3.inverse(truth.T_color_depth)
+        rays[row], origins[row] = rays[row] @ T[:3, :3].T, T[:3, 3]
+    gray = 255 * shade(hits(rays, origins)) + np.random.default_rng(index).normal(0, 1.5, u.shape)
+    color = np.clip(np.round(gray), 0, 255).astype(np.uint8)
+    return Frame(t, depth, np.repeat(color[..., None], 3, axis=2))
+
+
+def estimate(truth: Calibration):
+    given = Calibration.registered(CAMERA)
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    for index in range(FRAMES):
+        frame = record(truth, index)
+        wrong = se3.exp(np.random.default_rng(1000 + index).normal(0, 5e-4, 6))  # tracking is not perfect
+        collector.add(preprocess(frame), pose(frame.timestamp) @ wrong, np.zeros(CAMERA.shape, bool))
+    return CalibrationEstimator(given, SensorConfig()).estimate(collector.keyframes)
+
+
+def displacement(one: Calibration, other: Calibration) -> float:
+    """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
+    depth, backend = record(Calibration.registered(CAMERA), 0).depth, CpuBackend()
+    (u, v), (p, q) = (
+        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0) for c in (one, other)
+    )
+    return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))
+
+
+STEPS = {
+    "as given": {},
+    "place": {"translation_x": -0.025, "rotation_y": 0.01, "log_focal": np.log(0.95)},
+    "lens and timing": {"k1": 0.1, "delay": -0.015, "readout": 0.02},
+}
+TOLERANCE = {"translation_x": 3e-3, "translation_y": 3e-3, "rotation": np.radians(0.1), "delay": 2e-3, "readout": 3e-3}
+"""Largest errors. How near the colour camera stands is hardly told from its focal length in so shallow a scene; what
+both do together is measured by the displacement of the colours."""
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_what_is_wrong_is_found_and_what_is_right_stays(name):
+    step = np.array([STEPS[name].get(key, 0.0) for key in PARAMETERS])
+    truth = Calibration.registered(CAMERA).retract(step)
+    result = estimate(truth)
+    error = result.calibration.step_to(truth)
+    for key, value in zip(PARAMETERS, error, strict=True):
+        assert abs(value) < TOLERANCE.get(key, TOLERANCE.get(key.split("_")[0], np.inf)), (key, value)
+    assert displacement(result.calibration, truth) < 0.3
+    moved = {"timing", "lens", "geometry"} & {
+        group for group, key in (("timing", "delay"), ("lens", "k1"), ("geometry", "log_focal"))
+        if key in result.calibration.estimated
+    }  # fmt: skip
+    expected = {"as given": set(), "place": {"geometry"}, "lens and timing": {"timing", "lens"}}
+    assert moved >= expected[name]
+    if not step.any():
+        assert not result.calibration.estimated
+        assert result.calibration.is_registered(CAMERA)
+    assert np.all(np.isfinite(result.calibration.sigma))
