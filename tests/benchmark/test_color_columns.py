@@ -40,22 +40,25 @@ def test_failed_column_is_named_and_passes_nothing():
     assert "- a, without colour: no frame was tracked" in text
 
 
-def test_equal_configurations_are_measured_once_on_the_same_frames(monkeypatch):
+def test_columns_are_measured_on_the_same_frames_and_only_the_default_calibrates(monkeypatch):
     measured = []
 
-    def measure(sequence, config, surfaces, max_frames=None):
-        measured.append((id(sequence), config.tracker.color_weight))
+    def measure(sequence, config, surfaces, max_frames=None, calibrate=False):
+        measured.append((id(sequence), calibrate))
         if config.tracker.color_weight == 0:
             raise DatasetError("no frame was tracked")
-        return {"ate_rmse_m": config.tracker.color_weight}
+        return {"ate_rmse_m": config.sensor.color_time_sigma}
 
     monkeypatch.setattr(color_columns, "measure_sequence", measure)
     configs = {name: Config().override(settings) for name, settings in color_columns.SETTINGS.items()}
     answer = color_columns._measure(Measurement(Entry("tiny", parameters=TINY), configs))["rows"]
     assert len({sequence for sequence, _ in measured}) == 1
-    assert len(measured) == len({config.to_toml() for config in configs.values()})
+    assert dict(zip(configs, (calibrate for _, calibrate in measured), strict=True)) == {
+        "with colour": False, "without colour": False, "default": True,
+    }  # fmt: skip
     assert answer[list(configs).index("without colour")] == {"error": "no frame was tracked"}
-    assert answer[list(configs).index("default")]["ate_rmse_m"] == Config().tracker.color_weight
+    assert answer[list(configs).index("with colour")]["ate_rmse_m"] == 0
+    assert answer[list(configs).index("default")]["ate_rmse_m"] == Config().sensor.color_time_sigma
 
 
 def test_suite_takes_one_room_with_every_sensor():

@@ -55,23 +55,21 @@ def filtered_exactly(depth, alpha, sigma, radius):
 
 
 def filtered_separably(depth, alpha, sigma, radius):
-    """One pass down the columns and one along the rows, the range weight (1 - t/16)^8, pairs of taps, in float64."""
-
-    def range_weight(image, y, u, z):
-        q = image[y, u] if 0 <= y < image.shape[0] else 0
-        t = ((q - z) / (alpha * z * z)) ** 2
-        return (1 - t / 16) ** 8 if q > 0 and t < 16 else 0.0
+    """One pass down the columns and one along the rows, the range weight (1 - t/16)^8, only taps whose opposite lies in
+    the image, in float64."""
 
     def one_pass(image):
         out = np.zeros_like(image)
         for v, u in zip(*np.nonzero(image), strict=True):
             z = image[v, u]
-            total, norm = z, 1.0
-            for k in range(1, radius + 1):
-                weight = min(range_weight(image, v - k, u, z), range_weight(image, v + k, u, z))
-                weight *= math.exp(-(k**2) / (2 * sigma**2))
-                if weight > 0:
-                    total, norm = total + weight * (image[v - k, u] + image[v + k, u]), norm + 2 * weight
+            total = norm = 0.0
+            reach = min(radius, v, image.shape[0] - 1 - v)
+            for y in range(v - reach, v + reach + 1):
+                q = image[y, u]
+                t = ((q - z) / (alpha * z * z)) ** 2
+                if q > 0 and t < 16:
+                    weight = math.exp(-((y - v) ** 2) / (2 * sigma**2)) * (1 - t / 16) ** 8
+                    total, norm = total + weight * q, norm + weight
             out[v, u] = total / norm
         return out
 
@@ -122,8 +120,8 @@ def test_bilateral_is_close_to_the_equations_and_removes_noise():
     exact = filtered_exactly(depth, 0.012, 4.0, 6)
     valid = depth > 0
     v, u = np.mgrid[0:48, 0:64]
-    whole = valid & (np.minimum(v, 47 - v) >= 6) & (np.minimum(u, 63 - u) >= 6) & (np.abs(u - 29.5) > 6)
-    assert np.sqrt(np.mean((found - exact)[whole] ** 2)) < 1.5e-3  # elsewhere the window lacks a side
+    whole = valid & (np.minimum(v, 47 - v) >= 6) & (np.minimum(u, 63 - u) >= 6)
+    assert np.sqrt(np.mean((found - exact)[whole] ** 2)) < 1.5e-3  # elsewhere the window is smaller
     truth = np.where(u < 30, 1.2 + 0.004 * v, 2.0 + 0.003 * u)
     before = np.std((depth - truth)[valid])
     after = np.std((found - truth)[valid])
@@ -133,9 +131,8 @@ def test_bilateral_is_close_to_the_equations_and_removes_noise():
 
 
 def test_a_slanted_plane_stays_where_it_is():
-    """A window that lacks a side, at the border of the image or of a hole, does not pull a slope to the other."""
+    """A window that lacks a side, at the border of the image, does not pull a slope to the other."""
     depth = np.repeat(1.0 + 0.004 * np.arange(48, dtype=np.float32)[:, None], 64, axis=1)
-    depth[20:28, 30:40] = 0
     found = observe(depth, filter="bilateral", fill_holes=False).depth
     assert np.abs(found - depth).max() < 1e-5
 

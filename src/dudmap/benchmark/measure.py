@@ -51,7 +51,7 @@ def measure(job: Job) -> Row:
     sequence = job.entry.open()
     row = measure_sequence(
         sequence, job.config, job.entry.surfaces(sequence), job.out, job.entry.max_frames,
-        passes=PASSES.get(job.system, 1),
+        passes=PASSES.get(job.system, 1), calibrate=True,
     )  # fmt: skip
     return {"sequence": job.entry.name, "system": job.system} | row
 
@@ -64,6 +64,7 @@ def measure_sequence(
     max_frames: int | None = None,
     samples: int = SAMPLES,
     passes: int = 1,
+    calibrate: bool = False,
 ) -> Row:
     """Run a system on a recording: figures of its metrics.json and errors of trajectory and mesh.
 
@@ -75,11 +76,13 @@ def measure_sequence(
         max_frames: Use only the first frames.
         samples: Number of points sampled on each surface.
         passes: See ``dudmap.pipeline.run.run``.
+        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does.
 
     Raises:
         DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.geometry.mesh import Mesh
+    from dudmap.pipeline.calibration import calibrate_start
     from dudmap.pipeline.frame_source import AHEAD
     from dudmap.pipeline.run import run
     from dudmap.synthetic.recording import SyntheticSequence
@@ -90,6 +93,7 @@ def measure_sequence(
         report = run(
             sequence, config, folder,
             max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None, passes=passes,
+            calibration=calibrate_start(sequence, config, max_frames) if calibrate else None,
         )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)

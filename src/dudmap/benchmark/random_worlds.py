@@ -157,7 +157,7 @@ def measure_worlds(
 
 def _measure(job: tuple[Entry, Config]) -> Row:
     entry, config = job
-    return measure_sequence(entry.open(), config, None)
+    return measure_sequence(entry.open(), config, None, calibrate=True)
 
 
 def is_silent_failure(row: Row) -> bool:

@@ -18,11 +18,12 @@ CameraOption = Annotated[
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
 CalibrationOption = Annotated[
-    str | None,
+    str,
     typer.Option(
         "--calibration",
-        help="Calibration of the colour camera: calibration.toml of a run or of calibrate, or auto to calibrate first.",
-        metavar="FILE|auto",
+        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay takes it "
+        "as given); given takes what the recording says; or calibration.toml of another run or of calibrate.",
+        metavar="auto|given|FILE",
     ),
 ]
 SetOption = Annotated[
@@ -41,7 +42,7 @@ def run(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
-    calibration: CalibrationOption = None,
+    calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
     masks: Annotated[
@@ -75,20 +76,22 @@ def run(
     parameters = read_config(config, preset, assignments or [])
     recording = open_sequence(sequence, camera)
     out = out or free_folder(Path("runs") / recording.name)
-    if calibration == "auto":
-        from dudmap.pipeline.calibration import calibrate_sequence
+    if calibration == "auto" and not live:
+        from dudmap.pipeline.calibration import calibrate_start
 
-        start = recording.calibration or Calibration.registered(recording.camera)
-        given = calibrate_sequence(recording, parameters, start, max_frames).calibration
+        given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
     else:
-        given = None if calibration is None else Calibration.load(calibration)
+        given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-        depth_model=depth_model,
-        calibration=given,
+        depth_model=depth_model, calibration=given,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
+
+
+def _print_notice(text: str) -> None:
+    typer.echo(text, err=True)
 
 
 def read_config(file: Path | None, preset: str | None, assignments: list[str]) -> "Config":

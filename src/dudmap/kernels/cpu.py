@@ -122,10 +122,10 @@ class CpuBackend:
         return self._limited
 
     def _padded_buffer(self, shape: tuple[int, ...], margin: int) -> NDArray[np.float32]:
-        """Image with a margin, ABSENT all around."""
+        """Image with a margin, OUTSIDE all around."""
         padded = (shape[0] + 2 * margin, shape[1] + 2 * margin)
         if self._padded.shape != padded:
-            self._padded = np.full(padded, filtering.ABSENT, dtype=np.float32)
+            self._padded = np.full(padded, filtering.OUTSIDE, dtype=np.float32)
         return self._padded
 
     def halve(

@@ -10,6 +10,8 @@ from dudmap.kernels.threads import kernel, scalar
 
 ABSENT = np.float32(-1e9)
 """Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
+OUTSIDE = np.float32(-2e9)
+"""Depth of a pixel outside the image inside the filter."""
 LONGEST_RUN = 3
 """Longest run of missing pixels, in the row or the column, of a small hole."""
 MIN_NEIGHBOURS = 8
@@ -146,17 +148,18 @@ def range_weight(difference, inverse):
 
 @kernel
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
-    """Add one tap on each side of every pixel of a line to the sums of the filter, both with the smaller weight.
+    """Add one tap on each side of every pixel of a line to the sums of the filter, none where one lies outside.
 
-    The sum over a pair of opposite taps is free of the slope of the surface; a single tap at the border of the image or
-    of a surface would pull every slanted surface towards the side that remains.
+    The sum over a pair of opposite taps is free of the slope of the surface; a single tap at the border of the image,
+    where new surface enters the map, would pull every slanted surface towards the side that remains.
     """
     for u in range(middle.size):
         z, scale = middle[u], inverse[u]
         d, e = before[u] - z, after[u] - z
-        pair = min(range_weight(d, scale), range_weight(e, scale)) * spatial
-        numerator[u] += pair * (d + e)
-        denominator[u] += pair + pair
+        inside = spatial if min(before[u], after[u]) > OUTSIDE else np.float32(0)
+        s, t = range_weight(d, scale) * inside, range_weight(e, scale) * inside
+        numerator[u] += s * d + t * e
+        denominator[u] += s + t
 
 
 @kernel
@@ -174,11 +177,11 @@ def _start(middle, alpha, inverse, numerator, denominator):
 def bilateral(row_start, row_stop, padded, alpha, spatial, out):
     """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
 
-    Unlike in the thesis, opposite taps have one weight (``_accumulate``).
+    Unlike in the thesis, taps whose opposite lies outside the image are left out (``_accumulate``).
 
     Args:
         row_start, row_stop: Rows of the band.
-        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading and in the border of r pixels.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading, OUTSIDE in the border of r pixels.
         alpha: sigma_c over squared depth, 1/m.
         spatial: (r + 1,) float32 weights by pixel distance.
         out: (H, W) float32 out; 0 where there is no reading.

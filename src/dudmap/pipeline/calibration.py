@@ -9,7 +9,43 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.calibration import Calibration
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from dudmap.sequences import Sequence
+
+
+START_FRAMES, MIN_FRAMES = 300, 90
+"""Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
+estimator compares pairs of keyframes from both halves of the time."""
+
+
+def calibrate_start(
+    sequence: "Sequence", config: Config, max_frames: int | None = None, notice: "Callable[[str], None] | None" = None
+) -> Calibration | None:
+    """Calibration estimated from the start of a recording; None takes what the recording says.
+
+    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated.
+
+    Args:
+        sequence: The recording.
+        config: All parameters.
+        max_frames: Number of frames that will be processed; None for all.
+        notice: Receives one sentence before and one after the estimation.
+    """
+    notice = notice or (lambda text: None)
+    count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
+    if config.preset == "thesis" or count < MIN_FRAMES:
+        return None
+    notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
+    given = sequence.calibration or Calibration.registered(sequence.camera)
+    try:
+        found = calibrate_sequence(sequence, config, given, count).calibration
+    except DatasetError as error:
+        notice(f"the colour camera is taken as given: {error}")
+        return None
+    names = ", ".join(found.estimated)
+    notice(f"colour camera: estimated {names}" if names else "colour camera: as given, the images show no fault")
+    return found if found.estimated else None
 
 
 def calibrate_sequence(
