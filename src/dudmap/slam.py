@@ -41,6 +41,7 @@ from dudmap.tracking.front_end import FrontEnd
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
 from dudmap.tracking.tracker import Tracker
 
 
@@ -96,6 +97,7 @@ class Slam:
         self.depth_distortion = depth_model or DepthDistortion()
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
+        self.balance = BalanceEstimator(config.sensor, config.preprocess)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
 
@@ -190,7 +192,7 @@ class Slam:
         with view.timer("similarity"):
             fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
         mask = self._dynamic_mask(view, estimate)
-        self._learn_noise(view, estimate, mask)
+        balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
         self._add_keyframe(view, estimate, mask)
         if fuse:
@@ -198,7 +200,7 @@ class Slam:
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain,
+            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -284,10 +286,13 @@ class Slam:
             T_world_camera, known = estimate.T_world_camera, self._known_distortion
             self.depth_distortion.update(self.tracker, self.reference, level, T_world_camera, weights, known)
 
-    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Compare the static readings with the map for the noise of the sensor."""
+    def _learn_noise(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
+    ) -> TermBalance | None:
+        """Compare the static readings with the map for the noise of the sensor and for what the pose rests on."""
         with view.timer("noise"):
             self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
+            return self.balance.update(self.tracker, self.reference, view.pyramid, estimate, self.motion.velocity)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
@@ -346,6 +351,7 @@ class Slam:
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
         uncertain: str = "",
+        balance: TermBalance | None = None,
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
@@ -369,6 +375,7 @@ class Slam:
             corrected=corrected,
             blind=view.blind,
             uncertain=uncertain,
+            balance=balance,
         )
 
     def _make_volume(self) -> TsdfVolume:
