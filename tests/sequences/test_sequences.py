@@ -174,15 +174,21 @@ def test_association_agrees_with_all_pairs():
 
 
 def test_missing_empty_or_other_folders(tmp_path):
-    with pytest.raises(DatasetError, match="there is no folder"):
+    with pytest.raises(DatasetError, match="there is no folder or file"):
         open_sequence(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match="is empty"):
         open_sequence(tmp_path)
     (tmp_path / "rgb.txt").write_text("0 a.png\n")
     with pytest.raises(DatasetError, match=r"not a recording in TUM layout: depth\.txt not found"):
         open_sequence(tmp_path)
-    with pytest.raises(DatasetError, match="is a file"):
+    with pytest.raises(DatasetError, match="is a file in no known format; dudmap reads TUM RGB-D"):
         open_sequence(tmp_path / "rgb.txt")
+
+
+def test_an_option_of_another_format(recording):
+    with pytest.raises(DatasetError, match="in the format TUM RGB-D, which has no --topics"):
+        open_sequence(recording, topics=["/camera"])
+    assert len(open_sequence(recording, topics=None)) == 5
 
 
 def test_unknown_camera(tmp_path):

@@ -43,6 +43,9 @@ class TumSequence:
         DatasetError: A list is missing or malformed, no images can be paired, or no frame is valid.
     """
 
+    format = "TUM RGB-D"
+    options: tuple[str, ...] = ()
+
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)
         self.name = self.path.resolve().name
@@ -53,6 +56,7 @@ class TumSequence:
             known = intrinsics.from_text(camera)
         else:
             known = intrinsics.from_camera(camera) if camera else intrinsics.of_folder(self.path)
+        self.intrinsics_source = known.source
         self.calibration = known.calibration()
         self.camera = self._probe(known)
         truth = self._find_ground_truth()
