@@ -209,7 +209,7 @@ def spoil_all_truncated(folder):
     ("spoil", "sentence"),
     [
         (spoil_missing, "there is no folder"),
-        (spoil_empty, "is empty; expected a recording with rgb.txt and depth.txt"),
+        (spoil_empty, "is empty; expected a recording"),
         (spoil_times, "no colour image lies within 20 ms of a depth image"),
         (spoil_nan, "depth.txt, line 1: the timestamp 'nan' is not a finite number of seconds"),
         (spoil_order, "depth.txt, line 2: the timestamp 1.000000 comes after 2.000000"),

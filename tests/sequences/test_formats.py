@@ -8,11 +8,24 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
-from layouts import LAYOUTS, color, icl_nuim, millimetres, nerfstudio, pose, scannet, tum, write, zed
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.camera import Camera
 from dudmap.sequences import Recording, open_sequence, readers
+from layouts import (
+    LAYOUTS,
+    color,
+    corbs,
+    icl_nuim,
+    millimetres,
+    nerfstudio,
+    pose,
+    scannet,
+    seven_scenes,
+    tum,
+    write,
+    zed,
+)
 
 SUFFIXES = (".zip", ".tar", ".tgz")
 
@@ -113,8 +126,6 @@ def test_a_given_camera_replaces_that_of_the_depth_images(written):
 
 
 def test_the_truth_of_corbs_is_a_download_of_its_own(written, tmp_path, cache):
-    from layouts import corbs
-
     folder, expected = write(corbs, tmp_path / "D1")
     truth = tmp_path / "D1" / "D1_Trajectory"
     truth.mkdir()
@@ -127,6 +138,16 @@ def test_the_truth_of_corbs_is_a_download_of_its_own(written, tmp_path, cache):
     assert open_sequence(archive).ground_truth is None
     pack(truth, downloads / "D1_Trajectory.zip")
     check(open_sequence(archive), expected)
+
+
+def test_the_camera_beside_7_scenes_is_that_of_the_depth(written, tmp_path):
+    folder, expected = write(seven_scenes, tmp_path / "a")
+    (folder / "camera-intrinsics.txt").write_text("580 0 321\n0 581 241\n0 0 1\n")
+    sequence = open_sequence(folder)
+    assert sequence.camera == Camera(580, 581, 321, 241, 640, 480, 1000.0)
+    check_color_camera(sequence, expected)
+    (folder / "intrinsics.txt").write_text("585 585 320 240\n")  # our own file: registered images
+    assert open_sequence(folder).calibration is None
 
 
 def test_a_sequence_of_icl_nuim_with_times_of_its_own_is_not_taken_for_numbers(tmp_path):

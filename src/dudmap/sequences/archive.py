@@ -67,8 +67,8 @@ def unpack(path: Path) -> Path:
     """
     status = path.stat()
     key = f"{path.resolve()} {status.st_size} {status.st_mtime_ns}"
-    place = cache_folder() / f"{_stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
-    folder = place / _stem(path)
+    place = cache_folder() / f"{stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+    folder = place / stem(path)
     if folder.is_dir():
         return folder
     try:
@@ -94,7 +94,8 @@ def origin(path: Path) -> Path | None:
     return None
 
 
-def _stem(path: Path) -> str:
+def stem(path: Path) -> str:
+    """Name of an archive without its suffix."""
     suffix = max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len)
     return path.name[: -len(suffix)]
 
