@@ -36,6 +36,8 @@ class IclNuimSequence(ImageFolder):
         """Whether a folder has this layout: the images, and the name of the data set on it or on its truth."""
         if not all((path / kind).is_dir() for kind in ("rgb", "depth")):
             return False
+        if not any(re.fullmatch(r"\d+\.png", file.name) for file in (path / "depth").iterdir()):
+            return False
         named = re.search(r"(living|office)_?room|traj\d+n?_(frei|loop)", path.resolve().name, re.IGNORECASE)
         return named is not None or any(path.glob("*.gt.freiburg"))
 
