@@ -233,3 +233,37 @@ def test_a_missing_pose_file_of_scannet_is_a_frame_without_truth(tmp_path):
     folder, _ = write(scannet, tmp_path / "a")
     (folder / "pose/0.txt").unlink()
     np.testing.assert_allclose(open_sequence(folder).ground_truth.Ts_world_camera, [pose(2)], atol=1e-6)
+
+
+GARBAGE = (
+    b"",
+    b"\xff\xfe\x00\x01",
+    b"[]",
+    b"{}",
+    b"1 2 3\n",
+    b"a b c d e f g h i\n",
+    b'{"frames": [{}], "K": [[1], 2]}',
+    b"-5\n",
+)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.__name__)
+def test_a_spoilt_text_file_is_one_sentence(layout, tmp_path):
+    """Whatever stands in lists, poses and calibrations: the folder opens, or says what is wrong with it."""
+    folder, _ = write(layout, tmp_path)
+    texts = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.suffix not in (".png", ".jpg", ".ply"):
+            texts.setdefault(re.sub(r"\d+", "", str(path)), path)
+    said = []
+    for path in texts.values():
+        whole = path.read_bytes()
+        for text in (*GARBAGE, whole[: len(whole) // 2], whole.replace(b"0", b"nan"), whole.replace(b"[", b"")):
+            path.write_bytes(text)
+            try:
+                open_sequence(folder)[0]
+            except DatasetError as error:
+                said.append(str(error))
+        path.write_bytes(whole)
+    assert all(len(sentence) < 700 and "\n" not in sentence for sentence in said)
+    assert open_sequence(folder)[0].depth.any()
