@@ -234,6 +234,13 @@ def test_a_truncated_image_in_the_middle_is_skipped_and_counted(slam, recording)
     assert (metrics["frames"], metrics["tracked"], metrics["unreadable"]) == (6, 5, 1)
 
 
+def test_what_looks_wrong_is_said_before_the_run(slam, recording):
+    result = call("run", recording, "--camera", "60,90,31.5,23.5", "--json")
+    assert result.exit_code == 0
+    assert "warning: the intrinsics of the depth camera look wrong: focal lengths of 60 and 90" in result.stderr
+    assert json.loads(result.stdout)["frames"] == 6
+
+
 def test_ctrl_c_saves_and_says_so(slam, recording):
     slam.script = {3: KeyboardInterrupt()}
     said = sentence_of("run", recording, "--out", "out", code=130)
