@@ -95,7 +95,14 @@ class Reader(Protocol):
         ...
 
 
-READERS = ("tum:TumSequence",)
+READERS = (
+    "tum:TumSequence",
+    "sens:SensRecording",
+    "klg:KlgRecording",
+    "record3d:Record3DRecording",
+    "realsense:RealSenseRecording",
+    "bag:RosBag",
+)
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
 
 

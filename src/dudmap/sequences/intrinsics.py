@@ -131,6 +131,17 @@ def from_text(text: str) -> Intrinsics:
     return Intrinsics(_by_key(*numbers), f"the camera {text!r}")
 
 
+def chosen(camera: Camera | str | None) -> Intrinsics | None:
+    """Intrinsics that the caller gives in place of those of a recording, None if it gives none.
+
+    Raises:
+        DatasetError: The text cannot be understood.
+    """
+    if isinstance(camera, str):
+        return from_text(camera)
+    return from_camera(camera) if camera else None
+
+
 def from_camera(camera: Camera) -> Intrinsics:
     """Intrinsics of a camera."""
     values = {key: getattr(camera, key) for key in KEYS[:7]}
