@@ -96,7 +96,20 @@ class Reader(Protocol):
 
 
 READERS = (
+    "bonn:BonnSequence",
+    "corbs:CorbsSequence",
+    "openloris:OpenLorisSequence",
+    "icl_nuim:IclNuimSequence",
+    "icl_nuim:IclNuimLoopSequence",
     "tum:TumSequence",
+    "nerfstudio:NerfstudioSequence",
+    "frame_files:VolumeDeformSequence",
+    "frame_files:SevenScenesSequence",
+    "scannet:ScanNetSequence",
+    "replica:ReplicaSequence",
+    "redwood:RedwoodSequence",
+    "epfl:EpflSequence",
+    "numbered:NumberedSequence",
     "sens:SensRecording",
     "klg:KlgRecording",
     "record3d:Record3DRecording",
@@ -104,6 +117,8 @@ READERS = (
     "bag:RosBag",
 )
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
+DEPTH_OF_SEARCH = 3
+"""Levels of folders below the given one in which a recording is looked for."""
 
 
 def readers() -> tuple[Reader, ...]:
@@ -118,37 +133,82 @@ def reader_of(path: Path) -> Reader | None:
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder or file is a recording of a known format."""
-    return path.exists() and reader_of(path) is not None
+    """Whether a folder or file is a recording of a known format, or an archive."""
+    from dudmap.sequences.archive import is_archive
+
+    return path.exists() and (reader_of(path) is not None or is_archive(path))
 
 
 def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
     """Open a recording with the first reader of ``readers()`` that recognises it.
 
+    A folder that is no recording itself may contain one. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is
+    unpacked into a cache first; ``archive.zip/folder`` names one of several recordings in it.
+
     Args:
-        path: Folder or file.
+        path: Folder, file or archive.
         camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
             (default: the size of the images, and the depth scale that is usual in the format).
         options: Of one format, e.g. ``topics`` of bags; None stands for an option that is not given.
 
     Raises:
-        DatasetError: There is nothing at the path, no known format, a defect, or an option that the format lacks.
+        DatasetError: There is nothing at the path, no known format, several recordings, a defect, or an option that the
+            format lacks.
     """
     path = Path(path)
-    if not path.exists():
-        raise DatasetError(f"there is no folder or file {path}; expected a recording")
-    if path.is_dir() and not any(path.iterdir()):
-        raise DatasetError(f"the folder {path} is empty; expected a recording")
-    reader = reader_of(path)
-    if reader is None:
-        raise DatasetError(_unknown(path))
+    place, reader = _find(path)
     given = {name: value for name, value in options.items() if value is not None}
     foreign = [f"--{name}" for name in given if name not in reader.options]
     if foreign:
         raise DatasetError(
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
         )
-    return reader(path, camera, **given)
+    return reader(place, camera, **given)
+
+
+def _find(path: Path) -> tuple[Path, Reader]:
+    """The recording at a path, in it, or in the archive at it, and its reader.
+
+    Raises:
+        DatasetError: There is none, or more than one.
+    """
+    from dudmap.sequences.archive import split, unpack
+
+    reader = reader_of(path) if path.exists() else None
+    if reader is not None:
+        return path, reader
+    packed = split(path)
+    if packed is not None:
+        return _find(unpack(packed[0]) / packed[1])
+    if not path.exists():
+        raise DatasetError(f"there is no folder or file {path}; expected a recording")
+    if path.is_dir() and not any(path.iterdir()):
+        raise DatasetError(f"the folder {path} is empty; expected a recording")
+    found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
+    if len(found) > 1:
+        names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
+        more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+        raise DatasetError(f"{path} contains {len(found)} recordings; name one of {names}{more}")
+    if not found:
+        raise DatasetError(_unknown(path))
+    place, reader = found[0]
+    return (place, reader) if reader is not None else _find(place)
+
+
+def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, Reader | None]]":
+    """Recordings below a folder with their readers, and archives with None; not those inside of other recordings."""
+    from dudmap.sequences.archive import is_archive
+
+    found: list[tuple[Path, Reader | None]] = []
+    for place in sorted(path.iterdir()):
+        reader = reader_of(place)
+        if reader is not None:
+            found.append((place, reader))
+        elif is_archive(place):
+            found.append((place, None))
+        elif place.is_dir() and levels > 1:
+            found += _recordings_in(place, levels - 1)
+    return found
 
 
 def _unknown(path: Path) -> str:

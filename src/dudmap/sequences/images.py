@@ -76,6 +76,23 @@ def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.flo
     raise FrameError(f"the depth image {name} holds {image.dtype} values; expected 16 bit or float")
 
 
+def read_depth_array(path: Path) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too.
+
+    Raises:
+        FrameError: The file is missing, damaged, or holds something else.
+    """
+    try:
+        metres = np.squeeze(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"cannot read the array {path}: {error}") from error
+    if metres.ndim != 2 or metres.dtype.kind != "f":
+        raise FrameError(f"the array {path} holds {metres.dtype} of shape {metres.shape}; expected floats (H, W)")
+    metres = metres.astype(np.float32)
+    metres[~(np.isfinite(metres) & (metres > 0))] = 0
+    return metres
+
+
 def read_mask(path: Path) -> NDArray[np.bool_]:
     """Mask (H, W) of an 8-bit image; values above 127 are true.
 
