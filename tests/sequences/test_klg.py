@@ -54,7 +54,7 @@ def test_intrinsics_are_asked_for(tmp_path):
 
 
 def test_defects_are_one_sentence(tmp_path):
-    with pytest.raises(DatasetError, match="is cut off: it says 4 frames and holds [123]"):
+    with pytest.raises(DatasetError, match=r"is cut off: it says 4 frames and holds [123]"):
         open_sequence(cut(write_klg(tmp_path / "a.klg")), NUMBERS)
     with pytest.raises(DatasetError, match="is cut off: it says 9 frames and holds 4"):
         open_sequence(write_klg(tmp_path / "b.klg", count=9), NUMBERS)

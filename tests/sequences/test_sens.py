@@ -93,7 +93,7 @@ def test_given_intrinsics_replace_those_of_depth(tmp_path):
 
 
 def test_defects_are_one_sentence(tmp_path):
-    with pytest.raises(DatasetError, match="version 3 of the .sens format; expected 4"):
+    with pytest.raises(DatasetError, match=r"version 3 of the .sens format; expected 4"):
         open_sequence(write_sens(tmp_path / "a.sens", version=3))
     with pytest.raises(DatasetError, match="holds no frames"):
         open_sequence(write_sens(tmp_path / "b.sens", frames=0))
@@ -112,5 +112,5 @@ def test_one_damaged_depth_image_is_an_error_of_its_frame(tmp_path):
     path.write_bytes(data)
     sequence = open_sequence(path)
     assert sequence[2].depth.any()
-    with pytest.raises(FrameError, match="frame 3 of .*: the depth image is damaged"):
+    with pytest.raises(FrameError, match=r"frame 3 of .*: the depth image is damaged"):
         sequence[3]

@@ -76,7 +76,7 @@ class RosBag:
         self.timestamps = depth.stamps[[k for _, k in self._pairs]]
         self._color_stamps = color.stamps[[k for k, _ in self._pairs]]
         self._recorded = [(int(color.recorded[i]), int(depth.recorded[j])) for i, j in self._pairs]
-        self._find_cameras(intrinsics.chosen(camera))
+        self._find_cameras(camera)
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -155,16 +155,16 @@ class RosBag:
         except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
             raise FrameError(f"frame {index} of {self.path} cannot be read: {error}") from error
 
-    def _find_cameras(self, known: intrinsics.Intrinsics | None) -> None:
+    def _find_cameras(self, given: Camera | str | None) -> None:
         """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
         topics = self._topics
         depth, depth_size, color, color_size = self._probe()
         self._depth_frame = depth.header.frame_id
         color_lens = self._lens(topics.color_info, topics.color, color_size)
         one_size = depth_size == color_size
-        if known is not None:
-            values = {"depth_scale": self._units()} | known.values
-            depth_lens = Lens(intrinsics.Intrinsics(values, known.source).camera(*depth_size))
+        if given is not None:
+            known = intrinsics.given(given, self._units())
+            depth_lens = Lens(known.camera(*depth_size))
             self.intrinsics_source = known.source
         else:
             info, image = topics.depth_info, topics.depth
@@ -183,7 +183,7 @@ class RosBag:
                 f"pixels, and there is no camera_info beside {topics.color.topic}; choose it with --topics "
                 "color_info=/..."
             )
-        if color_lens is None or (known is not None and one_size):
+        if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
         self.camera, self._depth_lens, self._color_lens = depth_lens.camera, depth_lens, color_lens
         together = color_lens is depth_lens
@@ -214,8 +214,8 @@ class RosBag:
         if T is None:
             raise DatasetError(
                 f"{self.path}: depth is seen from {self._depth_frame!r} and colour from {color_frame!r}, and "
-                "/tf_static holds no transform between them; choose registered depth with --topics depth=/..., or, if it "
-                "is registered, give its intrinsics with --camera"
+                "/tf_static holds no transform between them; choose registered depth with --topics depth=/..., or, if "
+                "it is registered, give its intrinsics with --camera"
             )
         if same_frame and _equal(depth, color):
             return None

@@ -162,17 +162,6 @@ def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
     return Intrinsics({"depth_scale": depth_scale} | _by_key(*numbers), f"the camera {camera!r}")
 
 
-def chosen(camera: Camera | str | None) -> Intrinsics | None:
-    """Intrinsics that the caller gives in place of those of a recording, None if it gives none.
-
-    Raises:
-        DatasetError: The text cannot be understood.
-    """
-    if isinstance(camera, str):
-        return from_text(camera)
-    return from_camera(camera) if camera else None
-
-
 def from_camera(camera: Camera) -> Intrinsics:
     """Intrinsics of a camera."""
     values = {key: getattr(camera, key) for key in KEYS[:7]}

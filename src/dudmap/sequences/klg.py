@@ -15,6 +15,8 @@ from dudmap.sequences.sens import decode_values
 
 FRAME_HEADER = struct.Struct("<qii")
 """Time in microseconds, bytes of the depth image and bytes of the colour image."""
+DEPTH_SCALE = 1000.0
+"""Depth units per metre: the logger writes the millimetres of OpenNI."""
 
 
 class _Entry(NamedTuple):
@@ -46,20 +48,19 @@ class KlgRecording:
         self.name = self.path.stem
         self.calibration = None
         self.ground_truth = None
-        known = intrinsics.chosen(camera)
-        if known is None:
+        if camera is None:
             raise DatasetError(
                 f"{self.path} is a .klg file, which holds no intrinsics; give --camera "
                 "fx,fy,cx,cy[,w,h[,depth_scale]], "
                 "for the Xtion of ElasticFusion's own recordings --camera 528,528,320,240"
             )
+        known = intrinsics.given(camera, DEPTH_SCALE)
         self._entries = _read_index(self.path)
         times = 1e-6 * np.array([entry.time for entry in self._entries], dtype=np.float64)
         self._order = np.unique(times, return_index=True)[1]
         self.timestamps: NDArray[np.float64] = times[self._order]
         self.intrinsics_source = known.source
-        values = {"depth_scale": 1000.0} | known.values
-        self.camera = intrinsics.Intrinsics(values, known.source).camera(*self._size(known))
+        self.camera = known.camera(*self._size(known))
 
     @staticmethod
     def recognises(path: Path) -> bool:

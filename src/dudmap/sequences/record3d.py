@@ -50,7 +50,7 @@ class Record3DRecording:
             raise DatasetError(f"{self.path} holds no depth images rgbd/N.depth")
         color, size, times = self._metadata()
         self.timestamps = times
-        known = intrinsics.chosen(camera)
+        known = intrinsics.given(camera) if camera else None
         self.intrinsics_source = known.source if known else "the metadata of the file"
         self.camera = known.camera(*size) if known else color.resized(*size)
         calibration = Calibration(color)

@@ -62,13 +62,10 @@ class SensRecording:
             except struct.error:
                 raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
         self._deflated = header.depth_codec == 1
-        known = intrinsics.chosen(camera)
+        known = intrinsics.given(camera, header.depth_scale) if camera else None
         self.intrinsics_source = known.source if known else "the header of the file"
-        if known is None:
-            self.camera = header.camera(header.depth_intrinsic, header.depth_size)
-        else:
-            values = {"depth_scale": header.depth_scale} | known.values
-            self.camera = intrinsics.Intrinsics(values, known.source).camera(*header.depth_size)
+        own = header.camera(header.depth_intrinsic, header.depth_size)
+        self.camera = known.camera(*header.depth_size) if known else own
         T_color_depth = se3.inverse(header.color_extrinsic) @ header.depth_extrinsic
         calibration = Calibration(header.camera(header.color_intrinsic, header.color_size), T_color_depth)
         self.calibration = None if calibration.is_registered(self.camera) else calibration
