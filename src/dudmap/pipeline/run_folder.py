@@ -18,6 +18,7 @@ from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
 
 if TYPE_CHECKING:
+    from dudmap.cameras import LiveCamera
     from dudmap.objects.object_map import RigidObject
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
@@ -89,7 +90,7 @@ def write_run_folder(
     out: Path,
     slam: "Slam",
     record: RunRecord,
-    sequence: "Sequence",
+    sequence: "Sequence | LiveCamera",
     config: Config,
     stopped: str,
     *,

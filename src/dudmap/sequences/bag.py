@@ -18,7 +18,7 @@ from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import bag_images, bag_topics, intrinsics
-from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times
+from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
 from dudmap.sequences.lens import Lens
 
@@ -241,7 +241,10 @@ class RosBag:
         width, height = (info.width, info.height) if info.width and info.height else size
         units = self._units()
         camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*size)
-        return Lens(camera) if rectified else Lens.of(camera, info.distortion_model, tuple(map(float, D)))
+        return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
+
+    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
+        return Lens.of(camera, model, coefficients)
 
     @cached_property
     def _transforms(self) -> TransformTree:
@@ -288,6 +291,8 @@ def _open(path: Path) -> "AnyReader":
             f"{path} is a ROS bag, for which the package rosbags is needed; install it with pip install "
             "'dudmap[ros-bags]'"
         ) from None
+    if path.suffix == ".bag":
+        warm_index(path)
     try:
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()

@@ -4,10 +4,13 @@ import os
 import sqlite3
 import struct
 from collections.abc import Generator, Iterable
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from io import BytesIO
 from itertools import islice
+from pathlib import Path
 from threading import Lock
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +30,15 @@ ROS1_STAMP = struct.Struct("<4xII")
 """Sequence number, seconds and nanoseconds at the start of a ROS 1 message with a header."""
 HEAD = 12
 """Bytes of either."""
-MCAP_RECORD, MCAP_MESSAGE, MCAP_CHUNK = 9, 31, 49
-"""Bytes before the content of an MCAP record, before the data of a message, and before those of an uncompressed chunk
-(MCAP specification, sections Records, Message and Chunk)."""
+MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
+"""Bytes before the content of an MCAP record, before the entries in that of a message index, before the data of a
+message, and before those of an uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
+ROS1_RECORD = 128
+"""Bytes that hold the header of a ROS 1 message record, of about 50 bytes, and the start of the message."""
+INDEX_RECORDS = 4096
+"""Bytes that hold the index of most chunks: a page."""
+REQUESTS = 16
+"""Requests to the disk at a time. SSDs reach a multiple of their speed of single requests with that many."""
 
 
 class MessageTimes(NamedTuple):
@@ -149,18 +158,68 @@ def _entries(reader: "AnyReader", connection: "Connection") -> "Iterable[tuple[i
 
 
 def _ros1_entries(bag: Any, connection: "Connection") -> Generator[tuple[int, bytes | None]]:  # noqa: ANN401
-    from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_uint32
+    from rosbags.rosbag1.reader import decompressors
 
-    for entry in bag.indexes[connection.id]:
-        chunk = bag.chunks[entry.chunk_pos]
-        if chunk.decompressor is not decompressors["none"]:
-            yield entry.time, None
-            continue
-        bag.bio.seek(chunk.datapos + entry.offset)
-        while Header.read(bag.bio).get_uint8("op") == RecordType.CONNECTION:
-            bag.bio.seek(read_uint32(bag.bio), os.SEEK_CUR)
-        bag.bio.seek(4, os.SEEK_CUR)
-        yield entry.time, bag.bio.read(HEAD)
+    plain = decompressors["none"]
+    entries = bag.indexes[connection.id]
+    chunks = [bag.chunks[entry.chunk_pos] for entry in entries]
+    if not all(chunk.decompressor is plain for chunk in chunks):
+        yield from ((entry.time, None) for entry in entries)
+        return
+    places = [chunk.datapos + entry.offset for chunk, entry in zip(chunks, entries, strict=True)]
+    for entry, place, start in zip(entries, places, read_many(bag.path, places, ROS1_RECORD), strict=True):
+        yield entry.time, _ros1_head(bag.bio, place, start)
+
+
+def _ros1_head(file: BinaryIO, place: int, start: bytes) -> bytes:
+    """First bytes of the data of a message record, which a connection record may precede."""
+    from rosbags.rosbag1.reader import Header, RecordType, read_uint32
+
+    (header_size,) = struct.unpack_from("<I", start)
+    if header_size + 8 + HEAD <= len(start) and Header.read(BytesIO(start)).get_uint8("op") == RecordType.MSGDATA:
+        return start[header_size + 8 :][:HEAD]
+    file.seek(place)
+    while Header.read(file).get_uint8("op") == RecordType.CONNECTION:
+        file.seek(read_uint32(file), os.SEEK_CUR)
+    file.seek(4, os.SEEK_CUR)
+    return file.read(HEAD)
+
+
+def warm_index(path: Path) -> None:
+    """Read the parts of a ROS 1 bag that rosbags reads one after the other when it opens it, many at a time.
+
+    The index of a bag is spread over the file: a record after each chunk. A disk answers many requests at a time faster
+    than one by one, and keeps what was read in memory. Damaged bags are left to rosbags to report.
+    """
+    from rosbags.rosbag1.reader import Header, ReaderError, read_uint32
+
+    try:
+        with path.open("rb") as file:
+            file.readline()
+            header = Header.read(file)
+            file.seek(header.get_uint64("index_pos"))
+            places = []
+            for _ in range(header.get_uint32("conn_count") + header.get_uint32("chunk_count")):
+                record = Header.read(file)
+                file.seek(read_uint32(file), os.SEEK_CUR)
+                if "chunk_pos" in record:
+                    places.append(max(0, record.get_uint64("chunk_pos") - INDEX_RECORDS))
+    except (ReaderError, OSError):
+        return
+    read_many(path, places, 2 * INDEX_RECORDS)
+
+
+def read_many(path: Path, places: list[int], size: int) -> list[bytes]:
+    """``size`` bytes at each of many places of a file, fewer at its end; some requests at a time."""
+
+    def read(part: list[int]) -> list[bytes]:
+        with path.open("rb", buffering=0) as file:
+            return [file.read(size) for place in part if file.seek(place) >= 0]
+
+    part = -(-len(places) // REQUESTS) or 1
+    with ThreadPoolExecutor(REQUESTS, thread_name_prefix="dudmap-index") as pool:
+        found = pool.map(read, [places[k : k + part] for k in range(0, len(places), part)])
+        return [data for each in found for data in each]
 
 
 def _sqlite_entries(part: Any, connection: "Connection") -> list[tuple[int, bytes | None]]:  # noqa: ANN401
@@ -178,16 +237,18 @@ def _mcap_entries(part: Any, connection: "Connection") -> Generator[tuple[int, b
         for _, time, data in part.messages([connection]):
             yield time, bytes(data[:HEAD])
         return
-    bio = part.bio
-    for chunk in part.chunks:
-        offset = chunk.message_index_offsets.get(connection.id)
-        if offset is None:
-            continue
-        bio.seek(offset + MCAP_RECORD)
-        _, size = struct.unpack("<HI", bio.read(6))
-        for time, place in struct.iter_unpack("<QQ", bio.read(size)):
-            if chunk.compression:
-                yield time, None
-                continue
-            bio.seek(chunk.chunk_start_offset + MCAP_CHUNK + place + MCAP_MESSAGE)
-            yield time, bio.read(HEAD)
+    chunks = [chunk for chunk in part.chunks if connection.id in chunk.message_index_offsets]
+    places = [chunk.message_index_offsets[connection.id] for chunk in chunks]
+    times, heads = [], []
+    for chunk, place, start in zip(chunks, places, read_many(part.path, places, INDEX_RECORDS), strict=True):
+        size = MCAP_RECORD + struct.unpack_from("<Q", start, 1)[0]
+        if size > len(start):
+            (start,) = read_many(part.path, [place], size)
+        first = chunk.chunk_start_offset + MCAP_CHUNK + MCAP_MESSAGE
+        for time, offset in struct.iter_unpack("<QQ", start[MCAP_RECORD + MCAP_INDEX : size]):
+            times.append(time)
+            heads.append(None if chunk.compression else first + offset)
+    if None in heads:
+        yield from ((time, None) for time in times)
+    else:
+        yield from zip(times, read_many(part.path, heads, HEAD), strict=True)

@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.sequences.bag import MAGIC, MILLIMETRES, RosBag
 from dudmap.sequences.bag_index import MessageTimes
+from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -71,6 +73,16 @@ class RealSenseRecording(RosBag):
         if motions[0] is None or motions[1] is None:
             return None
         return motions[0] @ se3.inverse(motions[1])
+
+    def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
+        """Lens of a stream; the camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
+        text = self._beside(image, "camera_info", "std_msgs/msg/String")
+        model = re.search(r"model=([^;]*)", self._first(text).data) if text else None
+        self._model = model[1] if model else ""
+        return super()._lens(connection, image, size)
+
+    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
+        return Lens.of(camera, self._model or model, coefficients)
 
     def _units(self) -> float:
         sensor = re.match(r"/device_\d+/sensor_\d+", self._topics.depth.topic)
