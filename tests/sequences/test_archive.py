@@ -6,10 +6,10 @@ import tarfile
 import zipfile
 
 import pytest
-from layouts import tum, write
 
 from dudmap.errors import DatasetError
 from dudmap.sequences import archive, open_sequence
+from layouts import tum, write
 
 
 @pytest.fixture(autouse=True)
@@ -116,6 +116,20 @@ def test_an_archive_is_unpacked_once_and_again_when_it_changed(tmp_path, cache):
     (folder / "intrinsics.txt").write_text("fx 90\nfy 61\ncx 31\ncy 23\n")
     pack()
     assert open_sequence(tmp_path / "desk.tar.gz").camera.fx == 90
+
+
+def test_two_processes_unpack_one_archive(tmp_path, cache, monkeypatch):
+    path = zipped(tmp_path / "desk.zip", **{"rgb.txt": "of the second"})
+    unpack_into = archive._unpack_into
+
+    def overtaken(path, folder, packed):
+        monkeypatch.setattr(archive, "_unpack_into", unpack_into)
+        archive.unpack(path)  # the other process is done first
+        unpack_into(path, folder, packed)
+
+    monkeypatch.setattr(archive, "_unpack_into", overtaken)
+    assert (archive.unpack(path) / "rgb.txt").read_text() == "of the second"
+    assert [place.name for place in cache.iterdir()] == [archive.unpack(path).parent.name]  # nothing unfinished is left
 
 
 def test_an_archive_of_something_else(tmp_path):

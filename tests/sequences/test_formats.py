@@ -8,11 +8,24 @@ import zipfile
 import cv2
 import numpy as np
 import pytest
-from layouts import LAYOUTS, color, icl_nuim, millimetres, nerfstudio, pose, scannet, tum, write, zed
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.camera import Camera
 from dudmap.sequences import Recording, open_sequence, readers
+from layouts import (
+    LAYOUTS,
+    color,
+    corbs,
+    icl_nuim,
+    millimetres,
+    nerfstudio,
+    pose,
+    scannet,
+    seven_scenes,
+    tum,
+    write,
+    zed,
+)
 
 SUFFIXES = (".zip", ".tar", ".tgz")
 
@@ -113,8 +126,6 @@ def test_a_given_camera_replaces_that_of_the_depth_images(written):
 
 
 def test_the_truth_of_corbs_is_a_download_of_its_own(written, tmp_path, cache):
-    from layouts import corbs
-
     folder, expected = write(corbs, tmp_path / "D1")
     truth = tmp_path / "D1" / "D1_Trajectory"
     truth.mkdir()
@@ -127,6 +138,16 @@ def test_the_truth_of_corbs_is_a_download_of_its_own(written, tmp_path, cache):
     assert open_sequence(archive).ground_truth is None
     pack(truth, downloads / "D1_Trajectory.zip")
     check(open_sequence(archive), expected)
+
+
+def test_the_camera_beside_7_scenes_is_that_of_the_depth(written, tmp_path):
+    folder, expected = write(seven_scenes, tmp_path / "a")
+    (folder / "camera-intrinsics.txt").write_text("580 0 321\n0 581 241\n0 0 1\n")
+    sequence = open_sequence(folder)
+    assert sequence.camera == Camera(580, 581, 321, 241, 640, 480, 1000.0)
+    check_color_camera(sequence, expected)
+    (folder / "intrinsics.txt").write_text("585 585 320 240\n")  # our own file: registered images
+    assert open_sequence(folder).calibration is None
 
 
 def test_a_sequence_of_icl_nuim_with_times_of_its_own_is_not_taken_for_numbers(tmp_path):
@@ -212,3 +233,37 @@ def test_a_missing_pose_file_of_scannet_is_a_frame_without_truth(tmp_path):
     folder, _ = write(scannet, tmp_path / "a")
     (folder / "pose/0.txt").unlink()
     np.testing.assert_allclose(open_sequence(folder).ground_truth.Ts_world_camera, [pose(2)], atol=1e-6)
+
+
+GARBAGE = (
+    b"",
+    b"\xff\xfe\x00\x01",
+    b"[]",
+    b"{}",
+    b"1 2 3\n",
+    b"a b c d e f g h i\n",
+    b'{"frames": [{}], "K": [[1], 2]}',
+    b"-5\n",
+)
+
+
+@pytest.mark.parametrize("layout", LAYOUTS, ids=lambda layout: layout.__name__)
+def test_a_spoilt_text_file_is_one_sentence(layout, tmp_path):
+    """Whatever stands in lists, poses and calibrations: the folder opens, or says what is wrong with it."""
+    folder, _ = write(layout, tmp_path)
+    texts = {}
+    for path in sorted(folder.rglob("*")):
+        if path.is_file() and path.suffix not in (".png", ".jpg", ".ply"):
+            texts.setdefault(re.sub(r"\d+", "", str(path)), path)
+    said = []
+    for path in texts.values():
+        whole = path.read_bytes()
+        for text in (*GARBAGE, whole[: len(whole) // 2], whole.replace(b"0", b"nan"), whole.replace(b"[", b"")):
+            path.write_bytes(text)
+            try:
+                open_sequence(folder)[0]
+            except DatasetError as error:
+                said.append(str(error))
+        path.write_bytes(whole)
+    assert all(len(sentence) < 700 and "\n" not in sentence for sentence in said)
+    assert open_sequence(folder)[0].depth.any()

@@ -18,7 +18,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def calibrate(
-    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder in TUM layout.")],
+    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder, file or archive.")],
     out: Annotated[Path | None, typer.Option("--out", help="Write the calibration to this TOML file.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,

@@ -36,7 +36,9 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as o
 
 @app.command()
 def run(
-    sequence: Annotated[Path, typer.Argument(help="Recording: folder in TUM layout (rgb.txt, depth.txt).")],
+    sequence: Annotated[
+        Path, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
@@ -70,11 +72,14 @@ def run(
     --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving object.
     """
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
     parameters = read_config(config, preset, assignments or [])
     recording = open_sequence(sequence, camera)
+    for warning in inspect(recording).warnings:
+        _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
     if calibration == "auto" and not live:
         from dudmap.pipeline.calibration import calibrate_start

@@ -16,6 +16,7 @@ from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.sequences import is_recording
 
 if TYPE_CHECKING:
     from dudmap.cameras import LiveCamera
@@ -62,7 +63,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
     Raises:
         DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
     """
-    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or (out.is_dir() and is_recording(out)):
         raise DudmapError(
             f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
         )

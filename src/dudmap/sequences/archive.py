@@ -7,6 +7,7 @@ import stat
 import tarfile
 import tempfile
 import zipfile
+import zlib
 from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
@@ -67,23 +68,29 @@ def unpack(path: Path) -> Path:
     """
     status = path.stat()
     key = f"{path.resolve()} {status.st_size} {status.st_mtime_ns}"
-    place = cache_folder() / f"{_stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
-    folder = place / _stem(path)
+    place = cache_folder() / f"{stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+    folder = place / stem(path)
     if folder.is_dir():
         return folder
+    cache_folder().mkdir(parents=True, exist_ok=True)
     try:
-        place.mkdir(parents=True, exist_ok=True)
-        (place / ORIGIN).write_text(str(path.resolve()), encoding="utf-8")
-        with tempfile.TemporaryDirectory(dir=place) as unfinished:
-            _unpack_into(path, Path(unfinished) / "content", status.st_size)
-            (Path(unfinished) / "content").replace(folder)
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError, RuntimeError, NotImplementedError) as error:
-        shutil.rmtree(place, ignore_errors=True)
+        with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="unfinished-") as unfinished:
+            content = Path(unfinished) / "place" / stem(path)
+            _unpack_into(path, content, status.st_size)
+            (content.parent / ORIGIN).write_text(str(path.resolve()), encoding="utf-8")
+            _publish(content.parent, place)
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, RuntimeError, NotImplementedError, zlib.error) as error:
         raise DatasetError(f"cannot unpack {path}: {error}") from error
-    except BaseException:
-        shutil.rmtree(place, ignore_errors=True)
-        raise
     return folder
+
+
+def _publish(finished: Path, place: Path) -> None:
+    """Give an unpacked archive its place, unless another process did so in the meantime."""
+    try:
+        finished.rename(place)
+    except OSError:
+        if not place.is_dir():
+            raise
 
 
 def origin(path: Path) -> Path | None:
@@ -94,14 +101,15 @@ def origin(path: Path) -> Path | None:
     return None
 
 
-def _stem(path: Path) -> str:
+def stem(path: Path) -> str:
+    """Name of an archive without its suffix."""
     suffix = max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len)
     return path.name[: -len(suffix)]
 
 
 def _unpack_into(path: Path, folder: Path, packed: int) -> None:
     """Write all files of an archive below a new folder, counting what really comes out of it."""
-    folder.mkdir()
+    folder.mkdir(parents=True)
     limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
     written = 0
     with closing(_members(path)) as members:

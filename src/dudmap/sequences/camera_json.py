@@ -85,20 +85,18 @@ def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  #
 def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     """Numbers by our keys of one JSON object; None if it is no camera.
 
-    ``intrinsic_matrix`` has 9 numbers column by column (Open3D) or 3 rows of 3.
+    ``intrinsic_matrix`` has 9 numbers column by column (Open3D) or 3 rows of 3; its last row is 0 0 1.
     """
     values = {}
     for key, names in NAMES.items():
         found = next((tree[name] for name in names if isinstance(tree.get(name), int | float)), None)
         if found is not None and key != "depth_scale":
             values[key] = float(found)
-    matrix = tree.get("intrinsic_matrix", tree.get("K"))
-    if isinstance(matrix, list):
-        K = np.array(matrix, dtype=np.float64)
-        K = K.reshape(3, 3).T if K.size == 9 and K.ndim == 1 else K
-        if K.shape == (3, 3):
-            K = K.T if K[2, 0] or K[2, 1] else K
-            values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    K = _numbers(tree.get("intrinsic_matrix", tree.get("K")), 9)
+    if K is not None:
+        K = K.reshape(3, 3)
+        K = K.T if K[2, 0] or K[2, 1] else K
+        values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     lens = tree.get("coeffs", tree.get("disto", tree.get("distortion")))
     if isinstance(lens, list) and all(isinstance(number, int | float) for number in lens[:5]):
         values |= dict(zip(KEYS[7:], map(float, lens[:5]), strict=False))
@@ -121,7 +119,17 @@ def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
 def _motion(tree: Any, default: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ANN401
     """T_color_depth of one of the names ``MOTIONS`` at the top of a JSON object."""
     for name in MOTIONS:
-        value = tree.get(name) if isinstance(tree, dict) else None
-        if isinstance(value, list) and np.array(value, dtype=np.float64).size == 16:
-            return np.array(value, dtype=np.float64).reshape(4, 4)
+        numbers = _numbers(tree.get(name), 16) if isinstance(tree, dict) else None
+        if numbers is not None:
+            return numbers.reshape(4, 4)
     return default
+
+
+def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
+    """Numbers (count,) of a list or of a list of rows; None if it is something else."""
+    if not isinstance(value, list):
+        return None
+    flat = [number for row in value for number in (row if isinstance(row, list) else [row])]
+    if len(flat) != count or not all(isinstance(number, int | float) for number in flat):
+        return None
+    return np.array(flat, dtype=np.float64)

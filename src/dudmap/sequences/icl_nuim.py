@@ -17,6 +17,7 @@ CAMERA = {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5, "width": 640, "hei
 """The published camera. Its fy is -480 because the renderer's y axis points up; the images are not upside down."""
 MIRROR_Y = np.diag([1.0, -1.0, 1.0, 1.0])
 """Between the renderer's left-handed axes (y up) and ours (y down), for the world and the camera alike."""
+NUMBER = r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?"
 SCENE_FILE = r"scene_\d+_(\d+)"
 
 
@@ -35,6 +36,8 @@ class IclNuimSequence(ImageFolder):
     def recognises(path: Path) -> bool:
         """Whether a folder has this layout: the images, and the name of the data set on it or on its truth."""
         if not all((path / kind).is_dir() for kind in ("rgb", "depth")):
+            return False
+        if not any(re.fullmatch(r"\d+\.png", file.name) for file in (path / "depth").iterdir()):
             return False
         named = re.search(r"(living|office)_?room|traj\d+n?_(frei|loop)", path.resolve().name, re.IGNORECASE)
         return named is not None or any(path.glob("*.gt.freiburg"))
@@ -128,8 +131,9 @@ def _pov_pose(path: Path) -> NDArray[np.float64]:
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
     vectors = {}
-    for key, body in re.findall(r"(cam_\w+)\s*=\s*\[([^\]]*)\]", text):
-        vectors[key] = np.array([float(field) for field in body.replace(",", " ").split()])
+    for key, body in re.findall(r"(cam_\w+)\s*=\s*\[([-+.,eE\d\s]*)\]", text):
+        fields = body.replace(",", " ").split()
+        vectors[key] = np.array([float(field) for field in fields if re.fullmatch(NUMBER, field)])
     missing = [key for key in ("cam_pos", "cam_dir", "cam_up") if len(vectors.get(key, ())) != 3]
     if missing:
         raise DatasetError(f'{path} lacks {", ".join(missing)}; expected lines such as "cam_pos = [x, y, z]\'"')

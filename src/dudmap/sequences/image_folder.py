@@ -59,6 +59,11 @@ class ImageFolder:
         self.camera = self._probe(known)
         self.ground_truth = self._find_ground_truth()
 
+    @property
+    def color_timestamps(self) -> NDArray[np.float64]:
+        """(N,) timestamps of the colour images of all frames, seconds."""
+        return np.array([color.timestamp for color, _ in self._pairs], dtype=np.float64)
+
     def __len__(self) -> int:
         return len(self._pairs)
 

@@ -116,7 +116,7 @@ def of_folder(path: Path) -> Intrinsics:
 
 
 def own(path: Path, depth_scale: float) -> Intrinsics | None:
-    """Intrinsics of a folder's intrinsics.txt (or camera-intrinsics.txt), None if there is no such file.
+    """Intrinsics of a folder's intrinsics.txt, None if there is no such file.
 
     Args:
         path: The folder.
@@ -125,11 +125,11 @@ def own(path: Path, depth_scale: float) -> Intrinsics | None:
     Raises:
         DatasetError: The file cannot be parsed.
     """
-    for name in ("intrinsics.txt", "camera-intrinsics.txt"):
-        if (path / name).is_file():
-            found = from_file(path / name)
-            return replace(found, values={"depth_scale": depth_scale} | found.values)
-    return None
+    file = path / "intrinsics.txt"
+    if not file.is_file():
+        return None
+    found = from_file(file)
+    return replace(found, values={"depth_scale": depth_scale} | found.values)
 
 
 def own_or(path: Path, values: dict[str, float], source: str) -> Intrinsics:

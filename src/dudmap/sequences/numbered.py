@@ -11,7 +11,7 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import camera_json, intrinsics
 from dudmap.sequences.image_folder import ImageFolder, pair_numbered
 
-IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm", ".exr")
+IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 DEPTH_WORDS = ("depth",)
 COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img")
 NEITHER_WORDS = ("confidence", "right", "mask", "normal", "vis", "infra", "ir")

@@ -44,13 +44,13 @@ class OpenLorisSequence(ImageFolder):
         path = self.path / "sensors.yaml"
         storage = _open(path)  # kept: its nodes do not own what they point to
         node = storage.getNode(CAMERA_FRAME)
-        numbers = None if node.empty() else node.getNode("intrinsics").mat()
+        numbers = _matrix(node, "intrinsics")
         if numbers is None or numbers.size != 4:
             raise DatasetError(f"{path} lacks the intrinsics (4 numbers) of {CAMERA_FRAME}")
         fx, cx, fy, cy = numbers.ravel().tolist()
         values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy, "depth_scale": self.depth_scale}
         for key in ("width", "height"):
-            if not node.getNode(key).empty():
+            if node.getNode(key).isInt():
                 values[key] = node.getNode(key).real()
         return intrinsics.Intrinsics(values, "sensors.yaml")
 
@@ -67,9 +67,27 @@ def _open(path: Path) -> "cv2.FileStorage":
     import cv2
 
     try:
-        return cv2.FileStorage(path.read_text(encoding="utf-8"), cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
-    except (OSError, UnicodeDecodeError, cv2.error, SystemError) as error:
+        text = path.read_text(encoding="utf-8")
+        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+    except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
+    except (cv2.error, SystemError):
+        raise DatasetError(f"cannot read {path}; expected OpenCV's form of YAML, which starts with %YAML:1.0") from None
+    if not storage.isOpened() or not storage.root().isMap():
+        raise DatasetError(f"{path} holds no keys; expected those of OpenLORIS-Scene")
+    return storage
+
+
+def _matrix(node: "cv2.FileNode", key: str) -> NDArray[np.float64] | None:
+    """Matrix under a key of a node; None if there is none."""
+    import cv2
+
+    if not node.isMap() or not node.getNode(key).isMap():
+        return None
+    try:
+        return np.asarray(node.getNode(key).mat(), dtype=np.float64)
+    except cv2.error:  # the count of numbers is not that of rows and columns
+        return None
 
 
 def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
@@ -81,10 +99,12 @@ def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
     storage = _open(path)
     list_node = storage.getNode("trans_matrix")
     edges: dict[str, dict[str, NDArray[np.float64]]] = {}
-    for index in range(list_node.size()):
+    for index in range(list_node.size() if list_node.isSeq() else 0):
         node = list_node.at(index)
+        T_a_b = _matrix(node, "matrix")
+        if T_a_b is None or T_a_b.shape != (4, 4):
+            raise DatasetError(f"{path}: entry {index + 1} of trans_matrix has no 4x4 matrix")
         a, b = node.getNode("parent_frame").string(), node.getNode("child_frame").string()
-        T_a_b = node.getNode("matrix").mat().astype(np.float64)
         edges.setdefault(a, {})[b] = T_a_b
         edges.setdefault(b, {})[a] = se3.inverse(T_a_b)
     reached = {parent: np.eye(4)}

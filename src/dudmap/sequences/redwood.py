@@ -67,6 +67,7 @@ def _color_folder(path: Path) -> Path | None:
 
 
 def _logs(path: Path) -> list[Path]:
-    """Trajectories in a folder, or beside it with its name: ``copyroom_trajectory.log`` for ``copyroom_png``."""
+    """Trajectories in a folder, by name or else any, or beside it: ``copyroom_trajectory.log`` for ``copyroom_png``."""
     name = path.resolve().name.removesuffix("_png")
-    return sorted(path.glob("*.log")) or sorted(path.resolve().parent.glob(f"{name}[_-]traj*.log"))
+    inside = sorted(path.glob("*traj*.log")) or sorted(path.glob("*.log"))
+    return inside or sorted(path.resolve().parent.glob(f"{name}[_-]traj*.log"))

@@ -19,8 +19,8 @@ class TumSequence(ImageFolder):
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
-    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder name (TUM freiburg1-3, Bonn,
-    ICL-NUIM). The published distortion of TUM freiburg1 and 2 is deliberately left out: it describes the colour lens,
+    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder name (TUM freiburg1-3, Bonn).
+    The published distortion of TUM freiburg1 and 2 is deliberately left out: it describes the colour lens,
     but the driver reprojected the depth as if that lens had no distortion, and undistorting both images would distort
     correct depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
     intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
