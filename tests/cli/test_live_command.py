@@ -51,7 +51,9 @@ def test_ctrl_c_writes_the_results_of_a_real_run(tmp_path):
     subprocess.run([*dudmap, "synth", room, "--frames", "150", "--size", "160x120"], check=True, capture_output=True)
     out, file = tmp_path / "out", tmp_path / "walk.mcap"
     run = subprocess.Popen(
-        [*dudmap, "live", "--camera", f"replay:{room}", "--out", out, "--record", file], stderr=subprocess.PIPE, text=True
+        [*dudmap, "live", "--camera", f"replay:{room}", "--out", out, "--record", file],
+        stderr=subprocess.PIPE,
+        text=True,
     )
     deadline = time.monotonic() + 300
     while not _grown(tmp_path / "walk.recording/walk.recording.mcap") and time.monotonic() < deadline:

@@ -110,6 +110,13 @@ def test_frames_that_the_driver_lost_are_counted(slam, sequence, tmp_path):
     assert camera.closed
 
 
+def test_a_depth_image_that_comes_twice_is_taken_once(slam, sequence, tmp_path):
+    camera = FragileCamera(sequence, [100, 101, 101, 103])
+    metrics = run_live(camera, Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False).metrics
+    assert (metrics["frames"], metrics["dropped"]) == (3, 1)
+    assert len(open_sequence(tmp_path / "walk.mcap")) == 3
+
+
 def test_a_frame_that_cannot_be_read_is_skipped(slam, sequence, tmp_path, capsys):
     camera = FragileCamera(sequence, [100, 101, 102, 103])
     metrics = run_live(camera, Config(), tmp_path / "out", progress=False).metrics

@@ -58,5 +58,5 @@ def test_a_folder_with_one_file_is_that_recording(tmp_path):
 
 def test_videos_of_an_azure_kinect_are_not_read(tmp_path):
     (tmp_path / "a.mkv").write_bytes(b"\x1a\x45\xdf\xa3")
-    with pytest.raises(DatasetError, match="Azure Kinect are not read, .* azure_kinect_mkv_reader"):
+    with pytest.raises(DatasetError, match=r"Azure Kinect are not read, .* azure_kinect_mkv_reader"):
         open_sequence(tmp_path / "a.mkv")

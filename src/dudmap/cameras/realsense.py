@@ -37,7 +37,8 @@ class RealSenseCamera(LiveCamera):
     def __init__(self, file: str | None = None) -> None:
         rs = self._rs = driver("pyrealsense2", "pyrealsense2", "realsense")
         self.name, self._file = "realsense", file
-        self._closed, self._reading = Event(), Lock()
+        self._closed, self._reading, self._paused = Event(), Lock(), False
+        self._last = -1
         config = rs.config()
         if file is not None:
             config.enable_device_from_file(file, repeat_playback=False)
@@ -51,7 +52,10 @@ class RealSenseCamera(LiveCamera):
             profile = self._pipeline.start(config)
         except RuntimeError as error:
             raise CameraError(f"the RealSense camera cannot be started: {error}") from error
-        self._playback = profile.get_device().as_playback() if file is not None else None
+        self._playback: Any = profile.get_device().as_playback() if file is not None else None
+        if self._playback is not None:
+            self._playback.pause()
+            self._paused = True
         depth, color = profile.get_stream(rs.stream.depth), profile.get_stream(rs.stream.color)
         self._lenses = _lens(rs, depth), _lens(rs, color)
         self._swapped = color.format() == rs.format.bgr8
@@ -61,18 +65,32 @@ class RealSenseCamera(LiveCamera):
 
     def read(self) -> CameraFrame | None:
         """Next pair of depth and colour images."""
+        if self._paused:
+            self._paused = False
+            self._playback.resume()
         silent_since = time.perf_counter()
         while not self._closed.is_set():
             with self._reading:
                 found, frames = self._pipeline.try_wait_for_frames(PATIENCE_MS)
             now = time.perf_counter()
             if found and frames.get_depth_frame() and frames.get_color_frame():
-                return CameraFrame(int(frames.get_depth_frame().get_frame_number()), self._frame(frames), now)
+                number = int(frames.get_depth_frame().get_frame_number())
+                if number > self._last:  # the driver also pairs one depth image with two colour images
+                    self._last = number
+                    return CameraFrame(number, self._frame(frames), now)
             if self._playback is not None and self._playback.current_status() == self._rs.playback_status.stopped:
                 return None
             if now - silent_since > LONGEST_SILENCE:
                 raise CameraError(f"the RealSense camera sent no frame for {LONGEST_SILENCE:.0f} s; was it unplugged?")
         return None
+
+    def preview(self, count: int) -> list[Frame]:
+        """Some frames; a recording goes on when the next is read, not while the kernels are loaded."""
+        frames = super().preview(count)
+        if self._playback is not None:
+            self._playback.pause()
+            self._paused = True
+        return frames
 
     def close(self) -> None:
         """Stop the camera."""

@@ -5,6 +5,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from dudmap.cameras import CameraFrame, LiveCamera
 from dudmap.cameras.recorder import Recorder
 from dudmap.config import Config
@@ -101,11 +103,15 @@ def _newest_frames(camera: LiveCamera, recorder: Recorder | None) -> Generator[S
     """Newest frame of the camera at each step; all that arrive are recorded."""
 
     def deliver(put: Callable[[Arrival[CameraFrame]], None], wait: Callable[[float], bool]) -> None:
-        start = None
+        start, latest = None, -np.inf
         while not wait(0) and (arrived := camera.read()) is not None:
             start = arrived.number if start is None else start
-            if recorder is not None and not isinstance(arrived.frame, FrameError):
-                recorder.put(arrived.frame)
+            if not isinstance(arrived.frame, FrameError):
+                if arrived.frame.timestamp <= latest:  # a driver may deliver a depth image twice
+                    continue
+                latest = arrived.frame.timestamp
+                if recorder is not None:
+                    recorder.put(arrived.frame)
             put(Arrival(arrived.number - start, arrived, arrived.time))
 
     last = -1
