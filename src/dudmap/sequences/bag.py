@@ -71,7 +71,7 @@ class RosBag:
         weakref.finalize(self, _close, self._reader, self._stream)
         self._topics = bag_topics.find(self._reader.connections, chosen, str(self.path))
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
-        self._exact = depth.exact
+        self._exact = depth.exact and color.exact
         self._pairs = self._associated(depth, color)
         self.timestamps = depth.stamps[[k for _, k in self._pairs]]
         self._color_stamps = color.stamps[[k for k, _ in self._pairs]]
@@ -260,7 +260,8 @@ class RosBag:
                 if connection.topic == topic and connection.msgcount > 0
             ]  # fmt: skip
             if found:
-                tree.add(islice(self._decoded(found), limit), static=topic == STATIC_TOPIC)
+                with self._stream.lock:
+                    tree.add(islice(self._decoded(found), limit), static=topic == STATIC_TOPIC)
         return tree
 
     def _decoded(self, connections: "list[Connection]") -> Generator[Any]:

@@ -89,6 +89,9 @@ class MessageStream:
 
     Args:
         reader: The open bag.
+
+    Attributes:
+        lock: Held while the bag is read, which may be by a thread of its own.
     """
 
     def __init__(self, reader: "AnyReader") -> None:
@@ -96,7 +99,7 @@ class MessageStream:
         self._passing: Generator[tuple[Connection, int, bytes]] | None = None
         self._kept: dict[tuple[str, int], bytes] = {}
         self._position = -1
-        self._lock = Lock()
+        self.lock = Lock()
 
     def read(self, wanted: "list[tuple[Connection, int]]") -> list[bytes]:
         """Serialised messages of these connections, which are the same in every call, and times of recording.
@@ -105,7 +108,7 @@ class MessageStream:
             KeyError: There is no such message.
         """
         keys = [(connection.topic, time) for connection, time in wanted]
-        with self._lock:
+        with self.lock:
             missing = {key for key in keys if key not in self._kept}
             first = min((time for _, time in missing), default=self._position)
             if missing and (self._passing is None or not 0 <= first - self._position <= JUMP):
