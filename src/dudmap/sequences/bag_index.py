@@ -37,6 +37,8 @@ ROS1_RECORD = 128
 """Bytes that hold the header of a ROS 1 message record, of about 50 bytes, and the start of the message."""
 INDEX_RECORDS = 4096
 """Bytes that hold the index of most chunks: a page."""
+AT_ONCE = 1024
+"""Places of the index that are read before the bytes are dropped."""
 REQUESTS = 16
 """Requests to the disk at a time. SSDs reach a multiple of their speed of single requests with that many."""
 
@@ -209,7 +211,8 @@ def warm_index(path: Path) -> None:
                     places.append(max(0, record.get_uint64("chunk_pos") - INDEX_RECORDS))
     except (ReaderError, OSError):
         return
-    read_many(path, places, 2 * INDEX_RECORDS)
+    for k in range(0, len(places), AT_ONCE):  # what is read is kept by the operating system, not here
+        read_many(path, places[k : k + AT_ONCE], 2 * INDEX_RECORDS)
 
 
 def read_many(path: Path, places: list[int], size: int) -> list[bytes]:

@@ -1,4 +1,4 @@
-"""Recordings of RealSense cameras: ``.db3`` files of librealsense 2.58 and later, ``.bag`` files of earlier ones.
+"""Recordings of RealSense cameras: ``.db3`` files of librealsense since March 2026, ``.bag`` files of earlier ones.
 
 Both are ROS bags with topics of their own; the package rosbags reads them without the driver, with random access,
 which the driver's playback does not offer.
