@@ -15,6 +15,12 @@ app = typer.Typer(add_completion=False)
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Intrinsics: fx,fy,cx,cy[,w,h[,depth_scale]].", metavar="NUMBERS")
 ]
+TopicsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--topics", help="Of a bag: color=/a,depth=/b,color_info=/c,depth_info=/d,world=frame.", metavar="KEY=TOPIC,..."
+    ),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
 CalibrationOption = Annotated[
@@ -44,6 +50,7 @@ def run(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    topics: TopicsOption = None,
     calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
@@ -77,7 +84,7 @@ def run(
     from dudmap.sequences import open_sequence
 
     parameters = read_config(config, preset, assignments or [])
-    recording = open_sequence(sequence, camera)
+    recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:
         _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)

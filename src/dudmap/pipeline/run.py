@@ -115,7 +115,7 @@ def run(
                     else in_order(sequence, count, ahead, given_masks, slam)
                 ) as frames:
                     for frame in frames:
-                        _process(
+                        process_source(
                             frame,
                             slam,
                             record,
@@ -170,7 +170,7 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
     return MaskFolder(folder, sequence.timestamps, sequence.camera)
 
 
-def _process(
+def process_source(
     source: SourceFrame,
     slam: "Slam",
     record: RunRecord,

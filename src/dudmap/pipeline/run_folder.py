@@ -19,6 +19,7 @@ from dudmap.pipeline.metrics import RunRecord
 from dudmap.sequences import is_recording
 
 if TYPE_CHECKING:
+    from dudmap.cameras import LiveCamera
     from dudmap.objects.object_map import RigidObject
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
@@ -90,7 +91,7 @@ def write_run_folder(
     out: Path,
     slam: "Slam",
     record: RunRecord,
-    sequence: "Sequence",
+    sequence: "Sequence | LiveCamera",
     config: Config,
     stopped: str,
     *,
