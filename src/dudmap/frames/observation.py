@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.backend import Backend
 
@@ -34,6 +35,12 @@ class Observation:
     color_offset: float = 0.0
     _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
     _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
+
+    @property
+    def as_recorded(self) -> Frame:
+        """Depth of the observation and colour as it was recorded."""
+        color = self.rgb if self.recorded_rgb is None else self.recorded_rgb
+        return Frame(self.timestamp, self.depth, color, self.timestamp + self.color_offset)
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,9 +8,11 @@ from numpy.typing import NDArray
 
 from dudmap.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.frames.color_registration import color_projection, recorded_intensity, register_color
+from dudmap.frames.frame import Frame
 from dudmap.frames.observation import Level, Observation
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
+from dudmap.geometry.camera import Camera
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
@@ -71,6 +73,20 @@ class ColorMotion:
     def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
         """The frame with its colours registered, once its pose (4, 4) is known."""
         return self._with_colors(view, self._velocity(view, T_world_camera))
+
+    def frame_with_colors(self, frame: Frame, camera: Camera, velocity: NDArray[np.float64]) -> Frame:
+        """A frame with its recorded colour registered to the depth.
+
+        Args:
+            frame: Preprocessed depth, and colour as it was recorded.
+            camera: Of the depth image, without distortion.
+            velocity: (6,) twist of the camera per second, its own axes.
+        """
+        if self.calibration is None:
+            return frame
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        projection = color_projection(self.calibration, velocity, offset)
+        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection, self._backend))
 
     def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
         calibration, observation = self.calibration, view.observation
