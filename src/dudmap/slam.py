@@ -155,7 +155,7 @@ class Slam:
             start = time.perf_counter()
             observation = self._known_distortion.observation(self.preprocess(frame))
             pyramid = Pyramid.of(observation, self.camera, self.config)
-            if self.predictor.ego_motion.active:
+            if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
@@ -185,9 +185,9 @@ class Slam:
         reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
-        view = self.color_motion.registered(view, estimate.T_world_camera)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
@@ -215,6 +215,7 @@ class Slam:
             return self._result(view, None, mask, reason=reason)
         estimate = PoseEstimate.at_origin()
         self.motion.restart(view.timestamp, estimate.T_world_camera)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self._extend_map(view, estimate, mask, fuse=True)
         self._first_mask = mask
@@ -245,6 +246,7 @@ class Slam:
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
         self.monitor.lose()
+        view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),

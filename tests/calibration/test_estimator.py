@@ -85,7 +85,8 @@ def displacement(one: Calibration, other: Calibration) -> float:
     """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
     depth, backend = record(Calibration.registered(CAMERA), 0).depth, CpuBackend()
     (u, v), (p, q) = (
-        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0) for c in (one, other)
+        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
+        for c in (one, other)
     )
     return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))
 

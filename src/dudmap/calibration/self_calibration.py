@@ -1,6 +1,8 @@
 """Calibration of the colour camera while it moves."""
 
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable
+from concurrent.futures import Future
+from threading import Thread
 
 import numpy as np
 from numpy.typing import NDArray
@@ -76,10 +78,8 @@ class SelfCalibration:
         if self._frames >= self._attempts[0] and self._running is None:
             self._attempts.pop(0)
             self._due = self._frames + DELAY
-            thread = ThreadPoolExecutor(1, thread_name_prefix="dudmap-calibration")
-            keyframes = list(self._collector.keyframes)
-            self._running = thread.submit(CalibrationEstimator(self.given, self.sensor).estimate, keyframes)
-            thread.shutdown(wait=False)
+            estimator, keyframes = CalibrationEstimator(self.given, self.sensor), list(self._collector.keyframes)
+            self._running = _in_background(lambda: estimator.estimate(keyframes))
             if not self._attempts:
                 self._collector.clear()
 
@@ -95,3 +95,17 @@ class SelfCalibration:
             return None
         self.estimate, self._running = self._running.result(), None
         return self.estimate.calibration if self.estimate.calibration.estimated else None
+
+
+def _in_background(function: Callable[[], Estimate]) -> "Future[Estimate]":
+    """Result of a function that runs in a thread which does not keep the process alive."""
+    future: Future[Estimate] = Future()
+
+    def work() -> None:
+        try:
+            future.set_result(function())
+        except BaseException as error:  # raised where the result is asked for
+            future.set_exception(error)
+
+    Thread(target=work, name="dudmap-calibration", daemon=True).start()
+    return future

@@ -19,7 +19,8 @@ class Observation:
         camera: Camera of all images here; without lens distortion.
         depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
         intensity: (H, W) float32, 0..1.
-        rgb: (H, W, 3) uint8, registered to the depth.
+        rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Those of a colour camera that is not
+            synchronous are so only once the camera's motion is known (``tracking/color_motion.py``).
         backend: Compute device of the preprocessor, which also makes the image pyramid.
         recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
         color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
