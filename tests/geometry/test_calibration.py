@@ -51,7 +51,7 @@ def test_each_depth_pixel_is_found_where_the_colour_camera_saw_it():
         found = seen_by_color(points, COLOR, tau)
         tau = offset + 0.02 + 0.025 * ((np.clip(found[:, 1], 0, COLOR.height) + 0.5) / COLOR.height - 0.5)
     error = np.hypot(us.ravel() - found[:, 0], vs.ravel() - found[:, 1])
-    # the kernel stops after two such steps, leaves the lens out of the row's time, and expands to the second order
+    # the kernel stops after one such step, leaves the lens out of the row's time, and expands to the second order
     assert error.max() < 0.06
 
 
