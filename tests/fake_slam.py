@@ -61,10 +61,9 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None):
+    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None, live=False):
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
-        self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
 
     @property

@@ -273,7 +273,7 @@ class Slam:
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
-        self.front_end.update(self.reference, view, estimate)
+        self.front_end.update(view, estimate)
         self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
