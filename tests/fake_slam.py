@@ -32,6 +32,7 @@ class FakeResult:
     corrected: bool = False
     blind: bool = False
     uncertain: str = ""
+    calibrated: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None
