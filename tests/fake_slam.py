@@ -33,6 +33,7 @@ class FakeResult:
     blind: bool = False
     uncertain: str = ""
     balance: None = None
+    calibrated: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None
@@ -62,10 +63,9 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None):
+    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None, live=False):
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
-        self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
 
     @property

@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.bootstrap import Bootstrap
+from dudmap.color_calibration import ColorCalibration
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.exposure import exposed, exposed_color
+from dudmap.frames.exposure import exposed
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
@@ -56,7 +57,9 @@ class Slam:
             static before it moved or before it was seen through.
         depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
             as it is, and with ``sensor.distortion`` learnt further for the next run.
-        calibration: Of the colour camera; None for colour that is registered to depth.
+        calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
+            as it is; another is where the estimation begins, with ``sensor.self_calibration``.
+        live: A calibration is used as soon as it is found, and not at a fixed frame.
     """
 
     def __init__(
@@ -66,11 +69,11 @@ class Slam:
         first_pass: "Slam | None" = None,
         depth_model: DepthDistortion | None = None,
         calibration: Calibration | None = None,
+        live: bool = False,
     ) -> None:
         self.config = config = config or Config()
-        given = (
-            None if calibration is None or calibration.is_registered(replace(camera, distortion=())) else calibration
-        )
+        start = calibration if first_pass is None else first_pass.calibration
+        given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
@@ -90,6 +93,7 @@ class Slam:
             self.detector.import_from(self.prior_map.detector, known_poses)
         self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
+        self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         self.bootstrap = Bootstrap()
         self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
@@ -124,7 +128,7 @@ class Slam:
     @property
     def calibration(self) -> Calibration:
         """Calibration of the colour camera in use."""
-        return self.color_motion.calibration or Calibration.registered(self.camera)
+        return self.color_calibration.current
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
@@ -153,7 +157,7 @@ class Slam:
             start = time.perf_counter()
             observation = self._known_distortion.observation(self.preprocess(frame))
             pyramid = Pyramid.of(observation, self.camera, self.config)
-            if self.predictor.ego_motion.active:
+            if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
@@ -183,9 +187,9 @@ class Slam:
         reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
-        view = self.color_motion.registered(view, estimate.T_world_camera)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
@@ -194,13 +198,12 @@ class Slam:
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
-        self._add_keyframe(view, estimate, mask)
-        if fuse:
-            self._integrate(view, estimate, mask)
+        self._extend_map(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
+        calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance,
+            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -214,9 +217,9 @@ class Slam:
             return self._result(view, None, mask, reason=reason)
         estimate = PoseEstimate.at_origin()
         self.motion.restart(view.timestamp, estimate.T_world_camera)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
-        self._add_keyframe(view, estimate, mask)
-        self._integrate(view, estimate, mask)
+        self._extend_map(view, estimate, mask, fuse=True)
         self._first_mask = mask
         self.color_motion.start(view)
         if self.config.dynamics.method == "em":
@@ -245,6 +248,7 @@ class Slam:
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
         self.monitor.lose()
+        view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
@@ -260,6 +264,7 @@ class Slam:
         """Report a lost frame, or start a new submap with it after a while."""
         self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
         self.front_end.lose(view.timestamp)
+        self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
@@ -270,7 +275,7 @@ class Slam:
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
-        self.front_end.update(self.reference, view, estimate)
+        self.front_end.update(view, estimate)
         self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
@@ -303,21 +308,25 @@ class Slam:
                 mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
             return mask if view.known_dynamic is None else mask | view.known_dynamic
 
-    def _add_keyframe(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Keep a frame for relocalization if the camera has been nowhere near."""
+    def _extend_map(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool
+    ) -> None:
+        """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
         if self.config.relocalization.enabled and not view.blind:
             with view.timer("keyframe"):
                 T_world_camera = estimate.T_world_camera
                 self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
+        if fuse:
+            self._integrate(view, estimate, dynamic_mask)
 
     def _integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
         observation = view.observation
         with view.timer("integrate"):
             static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
-            color = exposed_color(observation.rgb, estimate.exposure)
-            frame = Frame(observation.timestamp, observation.depth, color)
-            self.atlas.integrate(frame, static, estimate.T_world_camera)
+            frame = Frame(observation.timestamp, observation.depth, observation.rgb)
+            recorded = observation.as_recorded
+            self.atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
             self.redundancy.update(self.volume, view, estimate)
 
     def _close_loop(
@@ -352,6 +361,7 @@ class Slam:
         movers: tuple[Mover, ...] = (),
         uncertain: str = "",
         balance: TermBalance | None = None,
+        calibrated: bool = False,
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
@@ -376,6 +386,7 @@ class Slam:
             blind=view.blind,
             uncertain=uncertain,
             balance=balance,
+            calibrated=calibrated,
         )
 
     def _make_volume(self) -> TsdfVolume:

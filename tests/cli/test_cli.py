@@ -150,6 +150,15 @@ def test_parameters_come_from_file_preset_and_single_assignments(slam, recording
     assert "are mutually exclusive" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
 
 
+def test_a_calibration_that_is_given_is_not_estimated(slam, recording):
+    call("run", recording, "--out", "a")
+    assert Config.load("a/config.toml").sensor.self_calibration
+    call("run", recording, "--out", "b", "--calibration", "given")
+    assert not Config.load("b/config.toml").sensor.self_calibration
+    call("run", recording, "--out", "c", "--calibration", "a/calibration.toml")
+    assert not Config.load("c/config.toml").sensor.self_calibration
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [

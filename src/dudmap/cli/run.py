@@ -27,8 +27,8 @@ CalibrationOption = Annotated[
     str,
     typer.Option(
         "--calibration",
-        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay takes it "
-        "as given); given takes what the recording says; or calibration.toml of another run or of calibrate.",
+        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while it "
+        "runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
         metavar="auto|given|FILE",
     ),
 ]
@@ -94,6 +94,8 @@ def run(
         given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
     else:
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
+    if calibration != "auto":
+        parameters = parameters.override(["sensor.self_calibration=false"])
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,

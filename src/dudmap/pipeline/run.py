@@ -91,7 +91,7 @@ def run(
     given_masks = None if masks is None else _open_masks(masks, sequence)
     models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
     calibration = calibration or sequence.calibration
-    slam = Slam(sequence.camera, config, depth_model=models[0], calibration=calibration)
+    slam = Slam(sequence.camera, config, depth_model=models[0], calibration=calibration, live=live)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -206,4 +206,6 @@ def process_source(
         save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, read, result)
+    if result.calibrated:
+        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)
