@@ -110,6 +110,8 @@ class VolumeConfig(ConfigSection):
     max_readings: int = Field(default=48, ge=1, le=255)
     """Largest weight to which a reading can raise a voxel, in multiples of its own weight, so that the influence of
     readings of low weight fades once there are better ones."""
+    antialias: bool = True
+    """Average the colours of the pixels that a voxel covers, instead of taking that of the pixel at its centre."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
@@ -401,6 +403,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
+            "antialias": False,
             "weighting": "constant",
             "take_turns": False,
         },
