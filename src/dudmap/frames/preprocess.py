@@ -38,6 +38,8 @@ class Preprocessor:
         backend: Compute device, of this preprocessor alone; None takes the CPU.
         calibration: Of the colour camera; None for colour that is registered to depth. The motion during the delay is
             left to those who know it.
+        voxel_size: Of the map, if its voxels hold mean colours (``volume.antialias``): the intensities are then
+            averaged in the same way, since an image with more detail than the map does not fit it. 0 leaves them.
     """
 
     def __init__(
@@ -46,7 +48,9 @@ class Preprocessor:
         config: PreprocessConfig | None = None,
         backend: Backend | None = None,
         calibration: Calibration | None = None,
+        voxel_size: float = 0.0,
     ) -> None:
+        self.voxel_size = voxel_size
         self.config = config or PreprocessConfig()
         self.calibration = calibration
         self.camera = replace(camera, distortion=())
@@ -83,7 +87,10 @@ class Preprocessor:
         if self.calibration is not None:
             recorded, projection = rgb, color_projection(self.calibration, np.zeros(6), offset)
             rgb = register_color(recorded, depth, self.camera, projection, self._backend)
-        intensity = self._backend.intensity(rgb)
+        smooth = rgb
+        if self.voxel_size > 0:
+            smooth = self._backend.footprint_colors(rgb, depth, self.camera.fx, self.voxel_size)
+        intensity = self._backend.intensity(smooth)
         return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:

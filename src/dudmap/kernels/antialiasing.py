@@ -6,6 +6,8 @@ from dudmap.kernels.threads import kernel
 
 LARGEST_RADIUS = 8
 """Largest radius of a window, pixels. The sum of a channel over it must not exceed 21 bits."""
+SAME_SURFACE = 4.0
+"""Depth differences in a window of up to this many voxels belong to one surface, up to an incidence of 76 degrees."""
 GREEN, BLUE = 21, 42
 """Bits by which the sums of these channels are shifted in a word."""
 CHANNEL = (1 << 21) - 1
@@ -33,7 +35,7 @@ def sum_table(rgb, sums):
 
 @kernel
 def footprint_means(row_start, row_stop, depth, rgb, sums, by_depth, tolerance, out):
-    """Mean colour of each pixel's window of two voxels' width, the support of the trilinear interpolation.
+    """Mean colour of each pixel's window, about as wide as a voxel and at most two.
 
     Voxels sample the image. Where pixels are smaller than voxels, a voxel that takes the colour of one pixel aliases:
     an edge is displaced by up to half a voxel, the same way along all of its length. The window shrinks until its
@@ -49,14 +51,14 @@ def footprint_means(row_start, row_stop, depth, rgb, sums, by_depth, tolerance, 
         out: (H, W, 3) uint8 out.
     """
     h, w = depth.shape
-    half, one = np.float32(0.5), np.float32(1)
+    quarter, half, one = np.float32(0.25), np.float32(0.5), np.float32(1)
     for v in range(row_start, row_stop):
         middle, source, target = depth[v], rgb[v].reshape(-1), out[v].reshape(-1)
         widest = min(LARGEST_RADIUS, min(v, h - 1 - v))
         for u in range(w):
             k = np.uintp(3 * u)
             z = middle[u]
-            radius = np.int64(by_depth / max(z, np.float32(1e-3)))
+            radius = np.int64(half * by_depth / max(z, np.float32(1e-3)) + quarter)
             radius = min(min(radius, widest), min(u, w - 1 - u)) if z > 0 else 0
             while radius > 0:
                 top, bottom = depth[np.uintp(v - radius)], depth[np.uintp(v + radius)]

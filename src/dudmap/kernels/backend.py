@@ -110,15 +110,15 @@ class Backend(Protocol):
         ...
 
     def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], by_depth: float, tolerance: float
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
     ) -> NDArray[np.uint8]:
         """Mean colour (H, W, 3) uint8 of the surface within a voxel of each reading.
 
         Args:
             color: (H, W, 3) uint8.
             depth: (H, W) float32, metres, 0 = none; pixels without a reading keep their colour.
-            by_depth: Focal length times voxel size.
-            tolerance: Depth differences up to this belong to one surface, metres.
+            focal: Focal length, pixels.
+            voxel_size: Metres.
         """
         ...
 

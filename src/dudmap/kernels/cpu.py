@@ -171,13 +171,13 @@ class CpuBackend:
         return weights
 
     def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], by_depth: float, tolerance: float
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
     ) -> NDArray[np.uint8]:
         """See ``Backend.footprint_colors``."""
         rgb, (h, w) = np.ascontiguousarray(color), depth.shape
         sums, out = np.empty((h + 1, w + 1), dtype=np.int64), np.empty_like(rgb)
         antialiasing.sum_table(rgb, sums)
-        by_depth, tolerance = np.float32(by_depth), np.float32(tolerance)
+        by_depth, tolerance = np.float32(focal * voxel_size), np.float32(antialiasing.SAME_SURFACE * voxel_size)
         run_bands(
             lambda start, stop: antialiasing.footprint_means(start, stop, depth, rgb, sums, by_depth, tolerance, out),
             bands(h, PIXEL_ROWS),

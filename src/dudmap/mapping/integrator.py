@@ -17,8 +17,6 @@ DEPTH_MIN = 0.05
 """Blocks nearer to the camera than this are not updated, metres."""
 MIN_LIMIT = 0.3
 """Smallest limit of the distances that voxels can store, metres."""
-SAME_SURFACE = 4.0
-"""Depth differences within a voxel up to this many voxels belong to one surface, seen at an incidence of 76 degrees."""
 FRONTAL_WEIGHT = 4.0
 """Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
 
@@ -150,9 +148,7 @@ class Integrator:
             return
         turn = frame_number if self.config.take_turns else -1
         if self.config.antialias:
-            voxel = self.scale.voxel_size
-            by_depth = float(view.intrinsics[0]) * voxel
-            color = self.backend.footprint_colors(color, view.depth, by_depth, SAME_SURFACE * voxel)
+            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
         slots, occupied = self.backend.fuse(
             self.grid(blocks, window), view, color, weights, window.near, blocks.fused, turn, count, self.parameters
         )
