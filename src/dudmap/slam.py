@@ -7,12 +7,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.bootstrap import Bootstrap
+from dudmap.calibration.depth_model import DepthModel
 from dudmap.color_calibration import ColorCalibration
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
+from dudmap.errors import ConfigError
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.exposure import exposed
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
@@ -34,7 +35,6 @@ from dudmap.places.relocalizer import Relocalizer
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.color_motion import ColorMotion
-from dudmap.tracking.depth_distortion import DepthDistortion
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
@@ -55,8 +55,8 @@ class Slam:
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
-        depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
-            as it is, and with ``sensor.distortion`` learnt further for the next run.
+        depth_model: What is known of the distortion of the depth from an earlier run with the same camera; it is
+            removed from every frame.
         calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
             as it is; another is where the estimation begins, with ``sensor.self_calibration``.
         live: A calibration is used as soon as it is found, and not at a fixed frame.
@@ -67,14 +67,15 @@ class Slam:
         camera: Camera,
         config: Config | None = None,
         first_pass: "Slam | None" = None,
-        depth_model: DepthDistortion | None = None,
+        depth_model: DepthModel | None = None,
         calibration: Calibration | None = None,
         live: bool = False,
     ) -> None:
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
-        self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
+        voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
+        self.preprocess = Preprocessor(camera, config.preprocess, calibration=given, voxel_size=voxel_size)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.tracker = Tracker(config.tracker, config.sensor)
@@ -98,7 +99,6 @@ class Slam:
         self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
-        self.depth_distortion = depth_model or DepthDistortion()
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.balance = BalanceEstimator(config.sensor, config.preprocess)
@@ -134,6 +134,24 @@ class Slam:
     def rigid_objects(self) -> list[RigidObject]:
         """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
+
+    def learnt_depth_model(self) -> DepthModel:
+        """Distortion of the depth, beyond the given model, that the frames kept for the rebuilding of the map show.
+
+        Raises:
+            ConfigError: No frames are kept, since ``relocalization``, or both ``loops`` and ``submaps`` are off.
+        """
+        from dudmap.calibration.depth_estimator import DepthView, estimate_distortion
+
+        store = self.atlas.history
+        if store is None:
+            raise ConfigError("the depth model is learnt from kept frames; enable relocalization, and loops or submaps")
+        main = self.atlas.by_size()[0]
+        views = [
+            DepthView.of(np.where(kept.static, kept.frame.depth, np.float32(0)), self.camera, kept.T_world_camera)
+            for kept, submap in zip(store, store.submaps, strict=True) if submap == main
+        ]  # fmt: skip
+        return estimate_distortion(views, self.camera, self.config.sensor)
 
     def as_prior_map(self) -> PriorMap:
         """The largest submap and what else a second pass over the same recording needs."""
@@ -276,20 +294,9 @@ class Slam:
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
         self.front_end.update(view, estimate)
-        self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
-
-    def _learn_sensor(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Compare the readings of a static view with the map for the distortion of the sensor."""
-        if view.blind or not self.config.sensor.distortion:
-            return
-        with view.timer("correct"):
-            level = exposed(view.pyramid.coarse, estimate.exposure)
-            weights = (estimate.static_weights([level]) or [np.ones_like(level.depth)])[0]
-            T_world_camera, known = estimate.T_world_camera, self._known_distortion
-            self.depth_distortion.update(self.tracker, self.reference, level, T_world_camera, weights, known)
 
     def _learn_noise(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]

@@ -75,8 +75,8 @@ def run(
         DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
+    from dudmap.calibration.depth_model import DepthModel
     from dudmap.slam import Slam
-    from dudmap.tracking.depth_distortion import DepthDistortion
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -89,9 +89,9 @@ def run(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
         )
     given_masks = None if masks is None else _open_masks(masks, sequence)
-    models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
+    model = None if depth_model is None else DepthModel.load(Path(depth_model))
     calibration = calibration or sequence.calibration
-    slam = Slam(sequence.camera, config, depth_model=models[0], calibration=calibration, live=live)
+    slam = Slam(sequence.camera, config, depth_model=model, calibration=calibration, live=live)
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -104,9 +104,7 @@ def run(
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
-                    slam = Slam(
-                        sequence.camera, config, first_pass=slam, depth_model=models[number], calibration=calibration
-                    )
+                    slam = Slam(sequence.camera, config, first_pass=slam, depth_model=model, calibration=calibration)
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 with closing(

@@ -146,7 +146,7 @@ def write_run_folder(
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
     if config.sensor.distortion:
-        model = slam.depth_distortion
+        model = slam.learnt_depth_model()
         metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
         steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:
