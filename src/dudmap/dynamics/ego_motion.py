@@ -244,7 +244,7 @@ def dominant_motion(
 
         max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
-    with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
+    with the inlier threshold t of the estimate and the median by surface, which people fill less of than of the image, and the image does not match at its static position as well; it is
     dropped if it does. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
     sigma.)
 
@@ -279,7 +279,8 @@ def dominant_motion(
     if np.count_nonzero(candidate & inlier) < FEWEST:
         return None
     share = float(areas[candidate & inlier].sum() / areas[candidate].sum())
-    sigma = np.median(error[error < MOVES_SIGMAS * threshold]) / np.sqrt(2 * np.log(2))
+    near = error < MOVES_SIGMAS * threshold
+    sigma = weighted_median(error[near], areas[near]) / np.sqrt(2 * np.log(2))
     least = np.maximum(pixels_at_width(MOVES_PX, camera), MOVES_SIGMAS * sigma)
     limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
     moves = error > limit
@@ -306,6 +307,13 @@ def dominant_motion(
             moves[seen],
         ),
     )
+
+
+def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
+    """Smallest of the values (n,), n > 0, that together with the smaller ones has half of the weight (n,)."""
+    order = np.argsort(values)
+    total = np.cumsum(weights[order])
+    return float(values[order][np.searchsorted(total, total[-1] / 2)])
 
 
 def propagate_to_segments(corners: LabelledCorners, *, whole_only: bool = False) -> NDArray[np.bool_]:
