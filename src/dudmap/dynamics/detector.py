@@ -185,7 +185,7 @@ class DynamicDetector:
             if self.config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None:
-                dynamic = dynamic | (moving & ~seen_static)
+                dynamic = dynamic | moving
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None

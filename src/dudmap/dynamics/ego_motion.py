@@ -102,6 +102,45 @@ class DominantMotion:
         return static_segments(self.after)
 
 
+@dataclass(frozen=True, eq=False)
+class OlderImage:
+    """A tracked image that later ones are compared with.
+
+    Attributes:
+        timestamp: Seconds.
+        T_world_camera: (4, 4).
+        pyramid: Its images.
+        segmentation: Its segments, at the resolution of the labels.
+    """
+
+    timestamp: float
+    T_world_camera: NDArray[np.float64]
+    pyramid: Pyramid
+    segmentation: Segmentation
+
+    def motion_to(
+        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64]
+    ) -> DominantMotion | None:
+        """Motion of the static world to a later image near a pose (4, 4); None if it cannot be determined."""
+        T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
+        return dominant_motion(self.pyramid, pyramid, (self.segmentation, segmentation), T_expected=T_expected)
+
+
+@dataclass(frozen=True, eq=False)
+class SlowMotion:
+    """What an image and an older one tell.
+
+    Attributes:
+        T_world_camera: (4, 4) pose of the new image, from that of the older one.
+        moving: (h, w) bool, pixels of the new image in segments that moved as a whole in between.
+        moving_first: (h, w) bool, the same of the older image if that is the first one of the map; else None.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    moving: NDArray[np.bool_]
+    moving_first: NDArray[np.bool_] | None
+
+
 class EgoMotionSegmenter:
     """Segments moving objects by comparing images, while the map is young or most of the view moves.
 
@@ -117,20 +156,21 @@ class EgoMotionSegmenter:
         self.seconds = seconds
         self.active = False
         self._young_until, self._latest_end = -np.inf, -np.inf
-        self._slow_motion_hidden_until = -np.inf
+        self._started = -np.inf
         self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
-        self._older: deque[tuple[float, NDArray[np.float64], Pyramid, Segmentation]] = deque()
+        self._older: deque[OlderImage] = deque()
         self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
 
     def start(self, timestamp: float) -> None:
         """Begin with the first frame of a map."""
         self._young_until, self._latest_end = timestamp + self.seconds, timestamp + 2 * self.seconds
-        self._slow_motion_hidden_until = timestamp + min(LONGEST_BASELINE, self.seconds)
+        self._started = timestamp
+        self._older.clear()
 
     @property
     def started(self) -> bool:
         """Whether ``start`` was called."""
-        return bool(np.isfinite(self._latest_end))
+        return bool(np.isfinite(self._started))
 
     def map_is_young(self, timestamp: float) -> bool:
         """Whether the map cannot tell static from moving yet."""
@@ -138,7 +178,7 @@ class EgoMotionSegmenter:
 
     def slow_motion_is_hidden(self, timestamp: float) -> bool:
         """Whether the map is younger than the longest baseline over which slow motion is looked for."""
-        return timestamp < self._slow_motion_hidden_until
+        return timestamp < self._started + min(LONGEST_BASELINE, self.seconds)
 
     def update(
         self,
@@ -163,8 +203,8 @@ class EgoMotionSegmenter:
         self.active = young or (hidden and self.seconds > 0 and self.started)
         if not young:
             self._older.clear()
-        elif not self._older or timestamp - self._older[-1][0] >= SHORTEST_BASELINE:
-            self._older.append((timestamp, T_world_camera, pyramid, segmentation))
+        elif not self._older or timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
+            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation))
 
     def reset(self) -> None:
         """Drop the last frame: nothing is compared before the next ``update``."""
@@ -201,10 +241,13 @@ class EgoMotionSegmenter:
                 self._young_until = min(timestamp + self.seconds, self._latest_end)
         return self._compared[1]
 
-    def slow_movers(
+    def slow_motion(
         self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, segmentation: Segmentation
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of segments that moved as a whole since an older frame; none once the map is not young.
+    ) -> SlowMotion | None:
+        """Comparison with an older image; None once the map is not young, or where they follow no common motion.
+
+        Where that shows something to move, the newest of the older images is compared, too: what came into view since
+        the oldest one was taken moves in neither comparison otherwise.
 
         Args:
             timestamp: Seconds, of the new frame.
@@ -212,16 +255,23 @@ class EgoMotionSegmenter:
             pyramid: Its images.
             segmentation: Its segments, at the resolution of the labels.
         """
-        while self._older and timestamp - self._older[0][0] > LONGEST_BASELINE:
+        while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
             self._older.popleft()
-        motion = None
-        if self._older and timestamp - self._older[0][0] >= SHORTEST_BASELINE and self.map_is_young(timestamp):
-            _, T_world_older, older, segmentation_older = self._older[0]
-            T_expected = se3.inverse(T_world_camera) @ T_world_older
-            motion = dominant_motion(older, pyramid, (segmentation_older, segmentation), T_expected=T_expected)
+        older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
+        if not older or not self.map_is_young(timestamp):
+            return None
+        oldest, newest = older[0], older[-1]
+        motion = oldest.motion_to(pyramid, segmentation, T_world_camera)
         if motion is None:
-            return np.zeros(pyramid.labelled.depth.shape, dtype=bool)
-        return propagate_to_segments(motion.after, whole_only=True)
+            return None
+        T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
+        moving = propagate_to_segments(motion.after, whole_only=True)
+        first = propagate_to_segments(motion.before, whole_only=True) if oldest.timestamp == self._started else None
+        if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
+            motion = newest.motion_to(pyramid, segmentation, T_world_camera)
+            if motion is not None:
+                moving = moving | propagate_to_segments(motion.after, whole_only=True)
+        return SlowMotion(T_world_camera, moving, first)
 
 
 def exceeds_noise_share(moving: NDArray[np.bool_], level: Level) -> bool:
