@@ -5,10 +5,9 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ego_motion import dominant_motion, exceeds_noise_share, propagate_to_segments
+from dudmap.dynamics.ego_motion import OlderImage, exceeds_noise_share, propagate_to_segments
 from dudmap.dynamics.masks import full_size
 from dudmap.frames.pyramid import reduced
-from dudmap.geometry import se3
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 
@@ -100,13 +99,17 @@ class Bootstrap:
             view: The present frame.
             T_world_camera: (4, 4) its pose.
         """
+        stamps = [frame.view.timestamp for frame in self._frames]
+        interval = (view.timestamp - stamps[0]) / len(stamps) if stamps else 0.0
         frames, self._frames = [frame for frame in self._frames if not frame.fused], []
         out = []
         for frame in frames:
             before = frame.view
-            T_expected = se3.inverse(T_world_camera) @ frame.estimate.T_world_camera
-            segmentations = before.segmentation(), view.segmentation()
-            motion = dominant_motion(before.pyramid, view.pyramid, segmentations, T_expected=T_expected)
+            older = OlderImage(
+                before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation()
+            )
+            intervals = (view.timestamp - before.timestamp) / interval
+            motion = older.motion_to(view.pyramid, view.segmentation(), T_world_camera, intervals)
             if motion is not None:
                 moving = propagate_to_segments(motion.before, whole_only=True)
                 moving = full_size(moving, before.labelled.depth, before.observation.depth)

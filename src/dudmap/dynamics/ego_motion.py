@@ -119,11 +119,22 @@ class OlderImage:
     segmentation: Segmentation
 
     def motion_to(
-        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64]
+        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
     ) -> DominantMotion | None:
-        """Motion of the static world to a later image near a pose (4, 4); None if it cannot be determined."""
+        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image.
+
+        Args:
+            pyramid: The later image.
+            segmentation: Its segments.
+            T_world_camera: (4, 4) prediction of its pose.
+            intervals: Number of intervals between consecutive images that lie between the two.
+
+        Returns:
+            None if it cannot be determined.
+        """
         T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
-        return dominant_motion(self.pyramid, pyramid, (self.segmentation, segmentation), T_expected=T_expected)
+        segmentations = self.segmentation, segmentation
+        return dominant_motion(self.pyramid, pyramid, segmentations, T_expected=T_expected, intervals=intervals)
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +167,7 @@ class EgoMotionSegmenter:
         self.seconds = seconds
         self.active = False
         self._young_until, self._latest_end = -np.inf, -np.inf
-        self._started = -np.inf
+        self._started = self._last_timestamp = -np.inf
         self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
         self._older: deque[OlderImage] = deque()
         self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
@@ -197,7 +208,7 @@ class EgoMotionSegmenter:
             segmentation: Its segments, at the resolution of the labels.
             moving: (h, w) bool, its moving pixels, if known.
         """
-        self._last, self._compared = (pyramid, segmentation, moving), None
+        self._last, self._last_timestamp, self._compared = (pyramid, segmentation, moving), timestamp, None
         young = self.map_is_young(timestamp)
         hidden = moving is not None and is_majority_dynamic(moving, pyramid.labelled)
         self.active = young or (hidden and self.seconds > 0 and self.started)
@@ -261,14 +272,16 @@ class EgoMotionSegmenter:
         if not older or not self.map_is_young(timestamp):
             return None
         oldest, newest = older[0], older[-1]
-        motion = oldest.motion_to(pyramid, segmentation, T_world_camera)
+        interval = timestamp - self._last_timestamp
+        ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
+        motion = oldest.motion_to(pyramid, segmentation, T_world_camera, ages[0])
         if motion is None:
             return None
         T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
         moving = propagate_to_segments(motion.after, whole_only=True)
         first = propagate_to_segments(motion.before, whole_only=True) if oldest.timestamp == self._started else None
         if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
-            motion = newest.motion_to(pyramid, segmentation, T_world_camera)
+            motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
             if motion is not None:
                 moving = moving | propagate_to_segments(motion.after, whole_only=True)
         return SlowMotion(T_world_camera, moving, first)
@@ -285,6 +298,7 @@ def dominant_motion(
     segmentations: tuple[Segmentation, Segmentation],
     moving: NDArray[np.bool_] | None = None,
     T_expected: NDArray[np.float64] | None = None,
+    intervals: float = np.inf,
 ) -> DominantMotion | None:
     """Motion of the static world between two images, and the corners that do not follow it.
 
@@ -305,6 +319,9 @@ def dominant_motion(
             the estimate of the motion.
         T_expected: (4, 4) predicted motion: the search for the corners starts there, and it is the prior of the
             estimate. None: the identity.
+        intervals: Corners that are off by more than so many times the limit are dropped. Between images so many
+            intervals apart, slower motion is hidden from image to image; what seems faster was confused with something
+            else, or is known.
 
     Returns:
         None if too few corners follow one motion.
@@ -335,6 +352,7 @@ def dominant_motion(
     limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
     moves = error > limit
     kept = ~moves
+    moves &= error <= intervals * limit
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
