@@ -5,7 +5,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ego_motion import OlderImage, exceeds_noise_share, propagate_to_segments
+from dudmap.dynamics.ego_motion import OlderImage, exceeds_noise_share
 from dudmap.dynamics.masks import full_size
 from dudmap.frames.pyramid import reduced
 from dudmap.tracking.estimate import PoseEstimate
@@ -110,9 +110,8 @@ class Bootstrap:
             )
             intervals = (view.timestamp - before.timestamp) / interval
             motion = older.motion_to(view.pyramid, view.segmentation(), T_world_camera, intervals)
-            if motion is not None:
-                moving = propagate_to_segments(motion.before, whole_only=True)
-                moving = full_size(moving, before.labelled.depth, before.observation.depth)
+            if motion is not None and older.moving is not None:
+                moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
                 out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
         return out
 

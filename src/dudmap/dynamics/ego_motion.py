@@ -102,7 +102,7 @@ class DominantMotion:
         return static_segments(self.after)
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class OlderImage:
     """A tracked image that later ones are compared with.
 
@@ -111,17 +111,21 @@ class OlderImage:
         T_world_camera: (4, 4).
         pyramid: Its images.
         segmentation: Its segments, at the resolution of the labels.
+        moving: (h, w) bool, its pixels that are known to move; None for none.
     """
 
     timestamp: float
     T_world_camera: NDArray[np.float64]
     pyramid: Pyramid
     segmentation: Segmentation
+    moving: NDArray[np.bool_] | None = None
 
     def motion_to(
         self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
     ) -> DominantMotion | None:
         """Motion of the static world to a later image, and what moves too slowly to be seen from image to image.
+
+        What is seen to move in this image is left out of the estimates of the next comparisons.
 
         Args:
             pyramid: The later image.
@@ -134,7 +138,11 @@ class OlderImage:
         """
         T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
         segmentations = self.segmentation, segmentation
-        return dominant_motion(self.pyramid, pyramid, segmentations, T_expected=T_expected, intervals=intervals)
+        motion = dominant_motion(self.pyramid, pyramid, segmentations, self.moving, T_expected, intervals)
+        if motion is not None:
+            moving = propagate_to_segments(motion.before, whole_only=True)
+            self.moving = moving if self.moving is None else self.moving | moving
+        return motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -215,7 +223,7 @@ class EgoMotionSegmenter:
         if not young:
             self._older.clear()
         elif not self._older or timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
-            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation))
+            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation, moving))
 
     def reset(self) -> None:
         """Drop the last frame: nothing is compared before the next ``update``."""
@@ -279,7 +287,7 @@ class EgoMotionSegmenter:
             return None
         T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
         moving = propagate_to_segments(motion.after, whole_only=True)
-        first = propagate_to_segments(motion.before, whole_only=True) if oldest.timestamp == self._started else None
+        first = oldest.moving if oldest.timestamp == self._started else None
         if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
             motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
             if motion is not None:
