@@ -105,9 +105,7 @@ class Bootstrap:
         out = []
         for frame in frames:
             before = frame.view
-            older = OlderImage(
-                before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation()
-            )
+            older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
             intervals = (view.timestamp - before.timestamp) / interval
             motion = older.motion_to(view.pyramid, view.segmentation(), T_world_camera, intervals)
             if motion is not None and older.moving is not None:

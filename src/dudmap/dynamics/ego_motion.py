@@ -316,9 +316,9 @@ def dominant_motion(
 
         max(MOVES_PX, MOVES_SIGMAS sigma) + MOVES_SHARE |flow|,   sigma = median{e : e < MOVES_SIGMAS t} / sqrt(2 ln 2)
 
-    with the inlier threshold t of the estimate and the median by surface, which people fill less of than of the image, and the image does not match at its static position as well; it is
+    with the inlier threshold t of the estimate, and the image does not match at its static position as well; it is
     dropped if it does. (The length of a vector of two normally distributed coordinates has the median sqrt(2 ln 2)
-    sigma.)
+    sigma.) The median is by surface: corners on slow people may be more than half of all, and near enough to count.
 
     Args:
         before, after: Both images; corners are tracked in the finest levels.

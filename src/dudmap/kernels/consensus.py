@@ -45,8 +45,9 @@ def msac_scores(
     weights: NDArray[np.float64],
     params: ConsensusParams,
 ) -> NDArray[np.float64]:
-    """Scores (g, k) of motion hypotheses at each noise level: gain sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) times the
-    prior of the motion.
+    """Scores (g, k) of motion hypotheses at each noise level.
+
+    They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) times the prior of the motion.
 
     The error e_n is the distance of the linearised flow ``J_n twist`` from the measured one, the argument of the prior
     the mean distance of ``J_n twist`` from the expected flow.
