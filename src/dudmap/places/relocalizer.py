@@ -53,7 +53,7 @@ class Relocalizer:
         self.prior_map = prior_map
         self._lost_since: float | None = None
         self._crowded = False  # most of the view moved in the last tracked frame
-        self._recent: deque[FrameView] = deque()  # the lost frames of LONGEST_BASELINE
+        self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
 
     @property
     def is_lost(self) -> bool:
@@ -127,8 +127,10 @@ class Relocalizer:
         since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
-        recent = [frame for frame in self._recent if observation.timestamp - frame.timestamp <= LONGEST_BASELINE]
-        self._recent = deque([*recent, view])
+        while len(self._recent) > 1 and observation.timestamp - self._recent[0].timestamp > LONGEST_BASELINE:
+            self._recent.popleft()
+        recent = list(self._recent)
+        self._recent.append(view)
         if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
         if observation.timestamp - self._lost_since < config.patience:
