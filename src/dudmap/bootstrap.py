@@ -5,7 +5,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.dynamics.ego_motion import OlderImage, exceeds_noise_share
+from dudmap.dynamics.dominant_motion import exceeds_noise_share
+from dudmap.dynamics.ego_motion import OlderImage
 from dudmap.dynamics.masks import full_size
 from dudmap.frames.pyramid import reduced
 from dudmap.tracking.estimate import PoseEstimate

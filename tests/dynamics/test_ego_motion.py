@@ -8,8 +8,9 @@ import pytest
 
 from dudmap import synthetic
 from dudmap.config import Config, TrackerConfig
+from dudmap.dynamics import dominant_motion as dominant
 from dudmap.dynamics import ego_motion
-from dudmap.dynamics.ego_motion import dominant_motion
+from dudmap.dynamics.dominant_motion import dominant_motion
 from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
 from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
@@ -109,7 +110,7 @@ def test_the_weighted_median_is_that_of_repeated_values():
     for count in (1, 2, 7, 40):
         values, weights = rng.normal(size=count), rng.integers(1, 9, count)
         repeated = np.sort(np.repeat(values, weights))
-        assert ego_motion.weighted_median(values, weights.astype(float)) == repeated[(len(repeated) - 1) // 2]
+        assert dominant.weighted_median(values, weights.astype(float)) == repeated[(len(repeated) - 1) // 2]
 
 
 @pytest.mark.parametrize("index", [0, 6, 20])
@@ -158,8 +159,8 @@ def test_a_shaken_image_makes_nothing_move(monkeypatch):
     bend = (1.0 * np.sin(v / 25)).astype(np.float32)
     bent = cv2.remap(after.intensity, u + bend, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     shaken = image(room, 5, intensity=bent)
-    assert compare(before, shaken).moving_after.mean() < ego_motion.NOISE_SHARE
-    monkeypatch.setattr(ego_motion, "MOVES_SIGMAS", 0.5)  # without regard to how well the other corners fit
+    assert compare(before, shaken).moving_after.mean() < dominant.NOISE_SHARE
+    monkeypatch.setattr(dominant, "MOVES_SIGMAS", 0.5)  # without regard to how well the other corners fit
     assert compare(before, shaken).moving_after.mean() > 0.1
 
 

@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.ego_motion import AGREED, LONGEST_BASELINE, dominant_motion
+from dudmap.dynamics.dominant_motion import AGREED, dominant_motion
+from dudmap.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume

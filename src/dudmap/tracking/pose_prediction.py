@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, SlowMotion, exceeds_noise_share
+from dudmap.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
+from dudmap.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry import se3
