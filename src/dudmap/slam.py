@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.bootstrap import Bootstrap
+from dudmap.bootstrap import Bootstrap, StartFrame
 from dudmap.calibration.depth_model import DepthModel
 from dudmap.color_calibration import ColorCalibration
 from dudmap.config import Config
@@ -96,7 +96,6 @@ class Slam:
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         self.bootstrap = Bootstrap()
-        self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
@@ -216,6 +215,7 @@ class Slam:
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
+        self._settle_start(view, estimate, mask, fused=fuse)
         self._extend_map(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
@@ -238,10 +238,9 @@ class Slam:
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self._extend_map(view, estimate, mask, fuse=True)
-        self._first_mask = mask
+        self.bootstrap.start(view, mask)
         self.color_motion.start(view)
         if self.config.dynamics.method == "em":
-            self.bootstrap.start(view, mask)
             self.predictor.start(view)
             self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
         self.predictor.update(view, estimate)
@@ -249,19 +248,29 @@ class Slam:
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
     def _revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
-        """Make the map of the first frame anew without what the second image shows to move in it."""
-        first = self.bootstrap.revised(prediction.moving_before)
-        if first is not None:
-            self.atlas.clear_first_frame()
-            self._first_mask = first.dynamic_mask
-            self._integrate(replace(first.view, timer=view.timer), PoseEstimate.at_origin(), first.dynamic_mask)
+        """Make the map anew of the first frame without what a later image shows to have moved in it."""
+        self._begin_anew(self.bootstrap.revised(prediction.moving_before), view)
 
     def _recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
         first = self.color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        self._begin_anew(None if first is None else self.bootstrap.recolored(first), view)
+
+    def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:
+        """Empty the map and fuse its first frame again; None leaves it as it is."""
         if first is not None:
-            self.atlas.clear_first_frame()
-            self._integrate(replace(first, timer=view.timer), PoseEstimate.at_origin(), self._first_mask)
+            self.atlas.clear_map()
+            self._integrate(replace(first.view, timer=view.timer), first.estimate, first.dynamic_mask)
+
+    def _settle_start(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool
+    ) -> None:
+        """Remember a frame of the first moments of a map; once these are over, fuse those that were held back."""
+        if self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+            self.bootstrap.add(view, estimate, dynamic_mask, fused=fused)
+            return
+        for frame in self.bootstrap.released(view, estimate.T_world_camera):
+            self._integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
@@ -275,6 +284,7 @@ class Slam:
         if found is None:
             return None
         self.atlas.current = found.submap
+        self.bootstrap.abandon()
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
         return found.estimate
 

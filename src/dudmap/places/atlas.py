@@ -106,10 +106,10 @@ class Atlas:
         motion = se3.log(se3.inverse(near[0].T_world_camera) @ near[-1].T_world_camera)
         return motion / (near[-1].timestamp - near[0].timestamp)
 
-    def clear_first_frame(self) -> None:
-        """Empty the current map, which holds a single frame."""
+    def clear_map(self) -> None:
+        """Empty the current map, which is the newest, and forget the frames stored of it."""
         self.volume.clear()
-        if self.history is not None:
+        while self.history is not None and self.history.submaps and self.history.submaps[-1] == self.current:
             self.history.drop_last()
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
