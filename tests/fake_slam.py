@@ -61,7 +61,12 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None):
+    saved_map = SimpleNamespace(save_keyframes=lambda path: path.write_bytes(b"keyframes"))
+
+    def __init__(
+        self, camera, config, first_pass=None, depth_model=None, calibration=None, saved_map=None, localize=False
+    ):
+        self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))

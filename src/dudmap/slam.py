@@ -30,6 +30,7 @@ from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.prior_map import PriorMap
 from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
+from dudmap.places.saved_map import SavedMap
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.color_motion import ColorMotion
@@ -56,6 +57,9 @@ class Slam:
         depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
             as it is, and with ``sensor.distortion`` learnt further for the next run.
         calibration: Of the colour camera; None for colour that is registered to depth.
+        saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
+            are lost until one is recognised in it, or a submap is started that is joined with it later.
+        localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
     """
 
     def __init__(
@@ -65,6 +69,8 @@ class Slam:
         first_pass: "Slam | None" = None,
         depth_model: DepthDistortion | None = None,
         calibration: Calibration | None = None,
+        saved_map: SavedMap | None = None,
+        localize: bool = False,
     ) -> None:
         self.config = config = config or Config()
         given = (
@@ -82,7 +88,7 @@ class Slam:
         known_poses = {}
         keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
         if self.prior_map is None:
-            frame_store = self._make_frame_store()
+            frame_store = None if localize else self._make_frame_store()
         else:
             known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
             submap = self.prior_map.submap
@@ -98,6 +104,11 @@ class Slam:
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
+        self.localize = localize
+        if saved_map is not None:
+            self.atlas.go_on_in(saved_map, self.camera)
+            self.monitor.restore(saved_map.registrations)
+            self.relocalizer.start_in_saved_map()
 
     @property
     def volume(self) -> TsdfVolume:
@@ -118,6 +129,13 @@ class Slam:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def saved_map(self) -> SavedMap:
+        """The main map as a later run goes on in it."""
+        main = self.atlas.by_size()[0]
+        keyframes = [keyframe for keyframe in self.atlas.keyframes.keyframes if keyframe.submap == main]
+        return SavedMap(self.atlas.volumes[main], keyframes, self.monitor.history)
 
     @property
     def calibration(self) -> Calibration:
@@ -178,7 +196,7 @@ class Slam:
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
+        reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
         view = self.color_motion.registered(view, estimate.T_world_camera)
@@ -188,7 +206,9 @@ class Slam:
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
-            fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
+            fuse = not (
+                view.blind or uncertain or self.localize or self.redundancy.is_redundant(self.volume, view, estimate)
+            )
         mask = self._dynamic_mask(view, estimate)
         self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
@@ -300,7 +320,7 @@ class Slam:
 
     def _add_keyframe(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Keep a frame for relocalization if the camera has been nowhere near."""
-        if self.config.relocalization.enabled and not view.blind:
+        if self.config.relocalization.enabled and not (view.blind or self.localize):
             with view.timer("keyframe"):
                 T_world_camera = estimate.T_world_camera
                 self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
@@ -356,7 +376,7 @@ class Slam:
             lost_reason=reason,
             T_world_camera=T_world_camera,
             fused=fused,
-            skipped_similar=not (fused or reason or uncertain or view.blind),
+            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,

@@ -4,17 +4,19 @@ Submaps are joined when one is recognised from another: Elvira, Tardos and Monti
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.place_recognition import KeyframeDatabase
+from dudmap.places.saved_map import SavedMap
 
 
 @dataclass(eq=False)
@@ -39,6 +41,8 @@ class Atlas:
         volumes: Maps by the numbers of their submaps.
         current: Number of the submap that is tracked.
         poses: Poses of all tracked frames, in order of time.
+        saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
+            submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
     """
 
     def __init__(
@@ -54,6 +58,13 @@ class Atlas:
         self.volumes = {number: make_volume()}
         self.current = number
         self.poses: list[TimedPose] = []
+        self.saved: int | None = None
+
+    def go_on_in(self, saved: SavedMap, camera: Camera) -> None:
+        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera."""
+        self.saved = self.current
+        self.volumes[self.current] = saved.volume.for_camera(camera)
+        self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
     def volume(self) -> TsdfVolume:
@@ -82,8 +93,9 @@ class Atlas:
         self.volumes[self.current] = self.make_volume()
 
     def by_size(self) -> list[int]:
-        """Numbers of the submaps, those with more tracked frames first."""
-        return sorted(self.volumes, key=lambda number: -sum(pose.submap == number for pose in self.poses))
+        """Numbers of the submaps: the saved one, then those with more tracked frames first."""
+        sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
+        return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
 
     def trajectory(self, submap: int) -> Trajectory:
         """Trajectory of the frames tracked in a submap."""

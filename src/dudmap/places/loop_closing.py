@@ -146,7 +146,8 @@ class LoopCloser:
     def _is_candidate(self, keyframe: Keyframe, now: float) -> bool:
         if keyframe.submap != self.atlas.current:
             return self.config.submaps.enabled
-        return self.config.loops.enabled and self._is_old(keyframe, now)
+        correctable = self.config.loops.enabled and self.atlas.current != self.atlas.saved
+        return correctable and self._is_old(keyframe, now)
 
     def _evaluate(self, search: LoopSearch, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Verify the matches of a search; returns the motion of the pose by a correction, None if none was made."""
