@@ -17,6 +17,7 @@ from dudmap.errors import DudmapError
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
     "merge": "Join the maps of two runs of one place.",
+    "export": "Write the results of a run for another program.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",
     "demo": "Render a short recording with a walking person and run on it.",
     "synth": "Render a synthetic recording with exact ground truth.",
