@@ -22,8 +22,8 @@ from dudmap.geometry import se3
 from dudmap.merging.map_merging import compare_maps
 from dudmap.slam import Slam
 
-sys.path.insert(0, str(Path(__file__).parent.parent / "tests" / "merging"))
-from places import CAMERA, TrueMap, looking_elsewhere, rearranged, record, retextured, true_map
+sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
+from rendered_places import CAMERA, TrueMap, looking_elsewhere, rearranged, record, retextured, true_map
 
 PAIRS = (
     ("room", (1, "pan"), (3, "handheld")),
@@ -75,6 +75,11 @@ def separate_pairs(limit: int | None) -> list[dict]:
     """Decisions on pairs of places without overlap."""
     places = {("desk", ""): true_map(record("desk", 11, "handheld"))}
     places["yard", ""] = true_map(record("yard", 12, "pan"))
+    places["yard", "rearranged"] = true_map(record("yard", 13, "handheld", change=lambda scene: rearranged(scene, 3)))
+    places["desk", "rearranged"] = true_map(record("desk", 14, "orbit", change=lambda scene: rearranged(scene, 4)))
+    places["desk", "other things"] = true_map(
+        record("desk", 15, "orbit", change=lambda scene: retextured(scene, 5, walls=False))
+    )
     for number, (scene, (name, change)) in enumerate(itertools.product(("room", "corridor"), CHANGES.items())):
         path = "pan" if scene == "room" else "handheld"
         places[scene, name] = true_map(record(scene, 20 + number, path, change=change))

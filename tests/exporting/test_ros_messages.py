@@ -29,7 +29,7 @@ def matrix(position, quaternion):
 
 
 def test_transform_odometry_and_path():
-    (tf,) = there_and_back(ros.transforms(TYPES, 12.25, T, "map", "camera")).transforms
+    (tf,) = there_and_back(ros.transforms(TYPES, [ros.transform(TYPES, 12.25, T, "map", "camera")])).transforms
     assert (tf.header.frame_id, tf.child_frame_id) == ("map", "camera")
     assert ros.seconds_of(tf) == 12.25
     np.testing.assert_allclose(matrix(tf.transform.translation, tf.transform.rotation), T, atol=1e-12)

@@ -1,8 +1,6 @@
 """Merging of maps: samples against an analytic distance, exact sums, relative poses of rendered rooms, refusals."""
 
 import json
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,9 +18,7 @@ from dudmap.merging.map_merging import compare_maps
 from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
 from dudmap.pipeline.merge import merge_runs
 from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
-
-sys.path.insert(0, str(Path(__file__).parent))
-from places import looking_elsewhere, rearranged, record, retextured, true_map
+from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
 WALL = 1.5
@@ -150,10 +146,10 @@ def test_two_maps_of_one_room_are_joined_at_the_true_pose(room):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        (looking_elsewhere, "no two keyframes"),
-        (retextured, "no two keyframes|the colours disagree"),
-        (lambda scene: retextured(scene, walls=False), "no two keyframes|the colours disagree"),
-        (rearranged, "no two keyframes|free space|the colours disagree"),
+        (looking_elsewhere, "too few places"),
+        (retextured, "too few places|the colours disagree"),
+        (lambda scene: retextured(scene, walls=False), "too few places|the colours disagree"),
+        (rearranged, "too few places|free space|the colours disagree"),
     ],
     ids=["elsewhere", "other textures", "other things", "rearranged"],
 )
@@ -195,6 +191,6 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path
 def test_a_refused_merge_says_why_and_writes_nothing(room, tmp_path):
     desk = true_map(record("desk", 1, "handheld", frames=30))
     a, b = run_folder(tmp_path / "a", room, [0.0]), run_folder(tmp_path / "b", desk, [0.0])
-    with pytest.raises(MapError, match="are not merged: no two keyframes of one were recognised in the other"):
+    with pytest.raises(MapError, match="are not merged: too few places of one were recognised in the other"):
         merge_runs(a, b, tmp_path / "ab")
     assert not (tmp_path / "ab").exists()

@@ -63,7 +63,7 @@ def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, f
         elapsed = stamp - before[0]
         velocity = se3.log(se3.inverse(before[1]) @ T) / elapsed if elapsed > 0 else np.zeros(6)
         before = stamp, T
-        yield "/tf", stamp, ros.transforms(types, stamp, T, frame, ros.CAMERA_FRAME)
+        yield "/tf", stamp, ros.transforms(types, [ros.transform(types, stamp, T, frame, ros.CAMERA_FRAME)])
         yield "/odometry", stamp, ros.odometry(types, stamp, T, velocity, frame, ros.CAMERA_FRAME)
         seen = movers.get(round(stamp, 6), [])
         if seen or had_movers:

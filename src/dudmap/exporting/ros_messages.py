@@ -80,19 +80,21 @@ def pose(types: MessageTypes, T: NDArray[np.float64]) -> Any:  # noqa: ANN401
     )
 
 
-def transforms(
-    types: MessageTypes, seconds: float, T_parent_child: NDArray[np.float64], parent: str, child: str
-) -> Any:  # noqa: ANN401
-    """``tf2_msgs/TFMessage`` with one transform: the pose of ``child`` in ``parent``."""
+def transform(types: MessageTypes, seconds: float, T_parent_child: NDArray[np.float64], parent: str, child: str) -> Any:  # noqa: ANN401
+    """``geometry_msgs/TransformStamped``: the pose (4, 4) of ``child`` in ``parent``."""
     T = T_parent_child
     motion = types.make(
         "geometry_msgs/msg/Transform", translation=vector(types, T[:3, 3]), rotation=rotation(types, T[:3, :3])
     )
-    stamped = types.make(
+    return types.make(
         "geometry_msgs/msg/TransformStamped",
         header=header(types, seconds, parent), child_frame_id=child, transform=motion,
     )  # fmt: skip
-    return types.make("tf2_msgs/msg/TFMessage", transforms=[stamped])
+
+
+def transforms(types: MessageTypes, stamped: Sequence[Any]) -> Any:  # noqa: ANN401
+    """``tf2_msgs/TFMessage`` of stamped transforms."""
+    return types.make("tf2_msgs/msg/TFMessage", transforms=list(stamped))
 
 
 def odometry(

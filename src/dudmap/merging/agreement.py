@@ -4,6 +4,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from dudmap.geometry import se3
 from dudmap.mapping.volume import TsdfVolume
@@ -22,9 +23,12 @@ MAX_COLOR_DIFFERENCE = 20.0
 
 MIN_AREA, MIN_OVERLAP = 1.0, 0.1
 """Surface that both maps must hold: square metres, and share of the surface of the smaller one."""
-MAX_DENIED = 0.05
-"""Largest share of the compared surface that lies in the free space of the other map. Two maps of one rendered room
-from different paths have 0.005 to 0.016, with every eighth piece of furniture moved 0.025, with every second 0.06."""
+CLEAR_DISTANCE = 0.1
+"""Surface denied by free space must be farther than this from all surface of the other map, metres: drift, noise and a
+bent map shift surface by centimetres, what is another place by decimetres."""
+MAX_DENIED = 0.01
+"""Largest share of the compared surface that free space may deny. Runs of one place have up to 0.0014 (a real desk, two
+parts of one recording) or 0 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
 have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
@@ -37,7 +41,8 @@ class Agreement:
     Attributes:
         area: Surface that both maps hold at the same place, square metres (mean of both directions).
         overlap: That surface over all surface of the smaller map.
-        denied: Share of the compared surface that lies in known free space of the other map, larger of both directions.
+        denied: Share of the compared surface that lies in known free space of the other map, larger of both directions,
+            counted where a camera came near enough for that to be certain.
         color_correlation: Correlation of the intensities of the common surface.
         color_share: Share of the cells of the common surface whose mean colours agree.
     """
@@ -72,11 +77,11 @@ def agreement(
         of_a, of_b: Points on their surfaces.
         T_a_b: World of b to world of a.
     """
-    common_b, denied_b, color_a = _compared(a, of_b, T_a_b)
-    common_a, denied_a, color_b = _compared(b, of_a, se3.inverse(T_a_b))
+    common_b, denied_b, color_a = _compared(a, of_a, of_b, T_a_b)
+    common_a, denied_a, color_b = _compared(b, of_b, of_a, se3.inverse(T_a_b))
     area = (common_b.sum() * of_b.area_each + common_a.sum() * of_a.area_each) / 2
     smaller = min(len(of_a) * of_a.area_each, len(of_b) * of_b.area_each)
-    denied = max(no.sum() / max(yes.sum() + no.sum(), 1) for yes, no in ((common_a, denied_a), (common_b, denied_b)))
+    denied = max(_share(denied_a & of_a.near, common_a & of_a.near), _share(denied_b & of_b.near, common_b & of_b.near))
     points = np.concatenate([transformed(T_a_b, of_b.points[common_b]), of_a.points[common_a]])
     colors_a = np.concatenate([color_a, of_a.color[common_a]]).astype(np.float64)
     colors_b = np.concatenate([of_b.color[common_b], color_b]).astype(np.float64)
@@ -85,17 +90,24 @@ def agreement(
     )
 
 
+def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
+    return denied.sum() / max(denied.sum() + common.sum(), 1)
+
+
 def _compared(
-    volume: TsdfVolume, surface: SurfacePoints, T: NDArray[np.float64]
+    volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
 ) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
-    """Which points (n,) a map confirms and which it denies, and its colours (m, 3) at those it confirms.
+    """Which points (n,) of a surface a map, with a surface of its own, confirms and which it denies, and its colours
+    (m, 3) at those it confirms.
 
     A point behind the surface of the map is neither: both sides of a thin plate cannot be in one map.
     """
-    samples = sample_map(volume, transformed(T, surface.points))
+    points = transformed(T, surface.points)
+    samples = sample_map(volume, points)
     known = samples.state == OBSERVED
     common = known & (np.abs(samples.sdf) < volume.truncation / 2)
     denied = (samples.state == EMPTY) | (known & (samples.sdf >= IN_BAND * volume.truncation))
+    denied[denied] = KDTree(own.points).query(points[denied])[0] > CLEAR_DISTANCE
     return common, denied, samples.color[common]
 
 

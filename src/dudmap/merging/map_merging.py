@@ -17,8 +17,9 @@ from dudmap.places.saved_map import SavedMap
 
 SURFACE_POINTS = 20_000
 """Points of each map's surface that the alignment and the checks use."""
-MIN_KEYFRAMES = 2
-"""Keyframes of one map that must be recognised in the other at the same relative pose."""
+MIN_KEYFRAMES, MIN_FEATURES = 2, 40
+"""Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
+features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
 MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
 """Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
 degrees: that of a relocalised frame (``relocalization.max_distance``)."""
@@ -31,7 +32,7 @@ class MapPair:
     Attributes:
         T_a_b: (4, 4) world of b to world of a, None if they are not to be joined.
         reason: Sentence on why not; empty if they are.
-        hypothesis, alignment, agreement: Of the accepted relative pose, or of the last one that was tried.
+        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one that was tried.
     """
 
     T_a_b: NDArray[np.float64] | None
@@ -66,23 +67,28 @@ def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     """
     check_voxel_sizes([a.volume, b.volume])
     found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
-    if not found or found[0].num_keyframes < MIN_KEYFRAMES:
-        return MapPair(None, "no two keyframes of one were recognised in the other at the same relative pose")
-    of_a, of_b = (surface_points(saved.volume, SURFACE_POINTS) for saved in (a, b))
-    last = MapPair(None, "")
+    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    if not found:
+        return MapPair(None, "too few places of one were recognised in the other at the same relative pose")
+    of_a, of_b = (surface_points(saved.volume, _positions(saved), SURFACE_POINTS) for saved in (a, b))
+    first = MapPair(None, "")
     for hypothesis in found:
-        if hypothesis.num_keyframes >= MIN_KEYFRAMES:
-            pair = _checked(a.volume, b.volume, of_a, of_b, hypothesis)
-            if pair.T_a_b is not None:
-                return pair
-            last = last if last.reason else pair
-    return last
+        pair = _checked(a.volume, b.volume, of_a, of_b, hypothesis)
+        if pair.T_a_b is not None:
+            return pair
+        first = first if first.reason else pair
+    return first
 
 
 def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
     """Fuse two maps into one in the world of a, with the keyframes of both."""
     moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
+
+
+def _positions(saved: SavedMap) -> NDArray[np.float64]:
+    """Positions (k, 3) of the keyframes."""
+    return np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
 
 
 def _checked(a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, hypothesis: Hypothesis) -> MapPair:

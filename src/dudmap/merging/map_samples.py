@@ -4,11 +4,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import KDTree
 
 from dudmap.kernels.points import EMPTY, INTENSITY, OBSERVED, RED, SDF, UNSEEN, WEIGHT, sample_points
 from dudmap.mapping.volume import TsdfVolume
 
 __all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
+
+NOISE_IN_BAND = 2.0
+"""Standard deviations of a reading that fit into the truncation distance where a surface is reliable enough to be
+contradicted by free space: 95 % of its readings were not farther off."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,20 +67,28 @@ class SurfacePoints:
         points: (n, 3) float64, metres, world frame of the map.
         intensity: (n,) float32, 0..1, 0 = unknown.
         color: (n, 3) float32, red green blue, 0..255.
+        near: (n,) bool, whether a camera came so near that its noise lies within the truncation band.
         area_each: Surface that a point stands for, square metres.
     """
 
     points: NDArray[np.float64]
     intensity: NDArray[np.float32]
     color: NDArray[np.float32]
+    near: NDArray[np.bool_]
     area_each: float
 
     def __len__(self) -> int:
         return len(self.points)
 
 
-def surface_points(volume: TsdfVolume, count: int, seed: int = 1) -> SurfacePoints:
+def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int, seed: int = 1) -> SurfacePoints:
     """At most ``count`` random vertices of the mesh of a map, which lie about evenly on its surface.
+
+    Args:
+        volume: The map.
+        cameras: (k, 3) positions of its keyframes, metres.
+        count: Largest number of points.
+        seed: Of the choice.
 
     Raises:
         MapError: The map is empty.
@@ -86,7 +99,9 @@ def surface_points(volume: TsdfVolume, count: int, seed: int = 1) -> SurfacePoin
         chosen = np.sort(np.random.default_rng(seed).choice(len(chosen), count, replace=False))
     points = mesh.vertices[chosen].astype(np.float64)
     samples = sample_map(volume, points)
-    return SurfacePoints(points, samples.intensity, samples.color, mesh.area() / max(len(chosen), 1))
+    distances = KDTree(cameras).query(points)[0] if len(cameras) else np.full(len(points), np.inf)
+    near = NOISE_IN_BAND * volume.sensor.sigma(distances) < volume.truncation
+    return SurfacePoints(points, samples.intensity, samples.color, near, mesh.area() / max(len(chosen), 1))
 
 
 def transformed(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
