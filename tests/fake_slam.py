@@ -63,7 +63,20 @@ class FakeSlam:
 
     script: ClassVar[dict] = {}
 
-    def __init__(self, camera, config, first_pass=None, depth_model=None, calibration=None, live=False):
+    saved_map = SimpleNamespace(save_keyframes=lambda path: path.write_bytes(b"keyframes"))
+
+    def __init__(
+        self,
+        camera,
+        config,
+        first_pass=None,
+        depth_model=None,
+        calibration=None,
+        live=False,
+        saved_map=None,
+        localize=False,
+    ):
+        self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))

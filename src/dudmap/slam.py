@@ -32,6 +32,7 @@ from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.prior_map import PriorMap
 from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
+from dudmap.places.saved_map import SavedMap
 from dudmap.result import FrameResult
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.color_motion import ColorMotion
@@ -60,6 +61,9 @@ class Slam:
         calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
             as it is; another is where the estimation begins, with ``sensor.self_calibration``.
         live: A calibration is used as soon as it is found, and not at a fixed frame.
+        saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
+            are lost until one is recognised in it, or a submap is started that is joined with it later.
+        localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
     """
 
     def __init__(
@@ -70,6 +74,8 @@ class Slam:
         depth_model: DepthModel | None = None,
         calibration: Calibration | None = None,
         live: bool = False,
+        saved_map: SavedMap | None = None,
+        localize: bool = False,
     ) -> None:
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
@@ -87,7 +93,7 @@ class Slam:
         known_poses = {}
         keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
         if self.prior_map is None:
-            frame_store = self._make_frame_store()
+            frame_store = None if localize else FrameStore.of(config, self.camera)
         else:
             known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
             submap = self.prior_map.submap
@@ -103,6 +109,11 @@ class Slam:
         self.balance = BalanceEstimator(config.sensor, config.preprocess)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
+        self.localize = localize
+        if saved_map is not None:
+            self.atlas.go_on_in(saved_map, self.camera)
+            self.monitor.restore(saved_map.registrations)
+            self.relocalizer.start_in_saved_map()
 
     @property
     def volume(self) -> TsdfVolume:
@@ -123,6 +134,11 @@ class Slam:
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
         """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def saved_map(self) -> SavedMap:
+        """The main map as a later run goes on in it."""
+        return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
 
     @property
     def calibration(self) -> Calibration:
@@ -201,7 +217,7 @@ class Slam:
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_first_frame(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        reason = self.monitor.rejection_reason(view, estimate, prediction.image_pose)
+        reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
         if reason and not relocalized:
@@ -211,7 +227,8 @@ class Slam:
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
-            fuse = not (view.blind or uncertain or self.redundancy.is_redundant(self.volume, view, estimate))
+            fuse = not (view.blind or uncertain or self.localize)
+            fuse = fuse and not self.redundancy.is_redundant(self.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
@@ -329,7 +346,7 @@ class Slam:
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool
     ) -> None:
         """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
-        if self.config.relocalization.enabled and not view.blind:
+        if self.config.relocalization.enabled and not (view.blind or self.localize):
             with view.timer("keyframe"):
                 T_world_camera = estimate.T_world_camera
                 self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
@@ -384,33 +401,16 @@ class Slam:
         labels = None if estimate is None else estimate.labels
         readings = view.observation.depth > 0
         return FrameResult(
-            timestamp=view.timestamp,
-            state="lost" if reason else "tracked",
-            lost_reason=reason,
-            T_world_camera=T_world_camera,
-            fused=fused,
-            skipped_similar=not (fused or reason or uncertain or view.blind),
+            timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
+            T_world_camera=T_world_camera, fused=fused,
+            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels,
-            tracking=None if estimate is None else estimate.tracking,
-            timings=view.timer.timings,
-            relocalized=relocalized,
-            movers=movers,
-            submap=self.atlas.current,
-            corrected=corrected,
-            blind=view.blind,
-            uncertain=uncertain,
-            balance=balance,
-            calibrated=calibrated,
-        )
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
+            relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
+            uncertain=uncertain, balance=balance, calibrated=calibrated,
+        )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
         return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
-
-    def _make_frame_store(self) -> FrameStore | None:
-        loops = self.config.loops
-        if not self.config.relocalization.enabled or not (loops.enabled or self.config.submaps.enabled):
-            return None
-        return FrameStore(self.camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)

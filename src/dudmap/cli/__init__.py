@@ -16,6 +16,8 @@ from dudmap.errors import DudmapError
 
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
+    "merge": "Join the maps of two runs of one place.",
+    "export": "Write the results of a run for another program.",
     "live": "Run on a camera, or on a recording as if it were one.",
     "info": "Say what a recording holds, and what looks wrong in it.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",

@@ -9,6 +9,7 @@ from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from dudmap.config import Config
+    from dudmap.places.saved_map import SavedMap
 
 app = typer.Typer(add_completion=False)
 
@@ -70,20 +71,33 @@ def run(
         Path | None,
         typer.Option("--depth-model", help="depth_model.npz of an earlier run: distortion of the depth to remove."),
     ] = None,
+    saved: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"
+        ),
+    ] = None,
+    localize: Annotated[
+        bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
+    ] = False,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene from a recording.
 
-    Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json and timings.csv into the run folder; with
-    --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving object.
+    Writes trajectory.txt, mesh.ply, map.npz, keyframes.npz, config.toml, metrics.json and timings.csv into the run
+    folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving
+    object.
     """
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
+    if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
+        config = saved / "config.toml"
     parameters = read_config(config, preset, assignments or [])
+    saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:
         _print_notice(f"warning: {warning}")
@@ -99,7 +113,7 @@ def run(
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-        depth_model=depth_model, calibration=given,
+        depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
     )  # fmt: skip
     print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
 
@@ -118,6 +132,19 @@ def read_config(file: Path | None, preset: str | None, assignments: list[str]) -
         )
     config = Config.load(file) if file is not None else Config.from_tree({"preset": preset} if preset else {})
     return config.override(assignments)
+
+
+def read_saved_map(folder: Path, config: "Config", out: Path | None) -> "SavedMap":
+    """Map of a run folder for a run with this configuration."""
+    from dudmap.places.saved_map import SavedMap
+
+    if out is not None and out.resolve() == folder.resolve():
+        raise ConfigError(
+            f"the map to go on in lies in the run folder {out}, which is emptied; name another with --out"
+        )
+    if not config.relocalization.enabled:
+        raise ConfigError("the camera is found in a saved map by relocalisation; drop relocalization.enabled=false")
+    return SavedMap.load(folder, config.volume.voxel_size)
 
 
 def free_folder(wanted: Path) -> Path:

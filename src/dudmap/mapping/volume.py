@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
@@ -182,6 +183,12 @@ class TsdfVolume:
         self.blocks, self.window = other.blocks, other.window
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
+    def for_camera(self, camera: Camera) -> "TsdfVolume":
+        """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
+        other.blocks, other._frame_number = self.blocks, self._frame_number
+        return other
+
     def take_colors(self, other: "TsdfVolume") -> None:
         """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
 
@@ -306,14 +313,14 @@ class TsdfVolume:
     # -- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write the map as NumPy archive; ``load`` gives an equal volume.
+        """Write the map as NumPy archive, replacing an older file at the end; ``load`` gives an equal volume.
 
         Raises:
             MapError: The file cannot be written.
         """
         n, slots = self.blocks.num_entries, self.active_slots
         try:
-            with Path(path).open("wb") as file:
+            with atomic_file(path) as file:
                 np.savez_compressed(
                     file,
                     format=FORMAT,

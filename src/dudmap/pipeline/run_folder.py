@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml",
+    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz", "merge.json",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -136,10 +136,11 @@ def write_run_folder(
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))
-    if not volume.is_empty:
+    if not (volume.is_empty or slam.localize):
         steps.append(save_mesh)
         if save_map:
             steps.append(lambda: volume.save(out / "map.npz"))
+            steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
     for number, (path, part) in enumerate(others, start=2):
         steps += [
             partial(path.save, out / f"trajectory-{number}.txt"),

@@ -11,6 +11,7 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import Config
 from dudmap.errors import MapError
 from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
@@ -86,6 +87,14 @@ class FrameStore:
         self._file: IO[bytes] | None = None
         self._encoder: ThreadPoolExecutor | None = None
         self._pending: deque[Future[tuple[bytes, bytes, bytes]]] = deque()
+
+    @classmethod
+    def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
+        """The store that a configuration asks for; None if neither loops nor submaps need one."""
+        loops = config.loops
+        if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
+            return None
+        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
 
     def __len__(self) -> int:
         return len(self.timestamps)

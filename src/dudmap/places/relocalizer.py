@@ -55,11 +55,21 @@ class Relocalizer:
         self._lost_since: float | None = None
         self._crowded = False  # most of the view moved in the last tracked frame
         self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
+        self._place_unknown = False
 
     @property
     def is_lost(self) -> bool:
         """Whether no frame has been tracked since the last call of ``lost``."""
         return self._lost_since is not None
+
+    def start_in_saved_map(self) -> None:
+        """Declare the camera's place in the current map unknown until a frame is recognised."""
+        self._place_unknown = True
+
+    @property
+    def reason(self) -> str:
+        """Sentence on why no registration from a predicted pose can be trusted, empty if one can."""
+        return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
 
     def lost(self, timestamp: float, *, crowded: bool = False) -> None:
         """Record a frame (timestamp in seconds) that was neither tracked nor relocalized.
@@ -73,7 +83,7 @@ class Relocalizer:
 
     def found(self) -> None:
         """Record that the camera is tracked again or that a new submap was started."""
-        self._lost_since, self._crowded = None, False
+        self._lost_since, self._crowded, self._place_unknown = None, False, False
         self._recent.clear()
 
     def recover(
