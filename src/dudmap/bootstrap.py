@@ -91,28 +91,28 @@ class Bootstrap:
         self._frames = [first, *(replace(frame, fused=False) for frame in self._frames[1:])]
         return first
 
-    def released(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> list[StartFrame]:
-        """The frames that are to be fused yet, without what has moved since then; they are forgotten.
+    def released(self) -> list[StartFrame]:
+        """The frames that are to be fused yet, without what has moved until the last of them; they are forgotten.
 
-        A frame that follows no common motion with the present one is left out.
-
-        Args:
-            view: The present frame.
-            T_world_camera: (4, 4) its pose.
+        A frame that follows no common motion with the last one is left out.
         """
-        stamps = [frame.view.timestamp for frame in self._frames]
-        interval = (view.timestamp - stamps[0]) / len(stamps) if stamps else 0.0
-        frames, self._frames = [frame for frame in self._frames if not frame.fused], []
+        if not self._frames:
+            return []
+        last, frames = self._frames[-1], [frame for frame in self._frames[:-1] if not frame.fused]
+        now = last.view.timestamp
+        interval = (now - self._frames[0].view.timestamp) / max(len(self._frames) - 1, 1)
+        self._frames = []
         out = []
         for frame in frames:
             before = frame.view
             older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
-            intervals = (view.timestamp - before.timestamp) / interval
-            motion = older.motion_to(view.pyramid, view.segmentation(), T_world_camera, intervals)
+            intervals = (now - before.timestamp) / interval
+            T_world_camera = last.estimate.T_world_camera
+            motion = older.motion_to(last.view.pyramid, last.view.segmentation(), T_world_camera, intervals)
             if motion is not None and older.moving is not None:
                 moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
                 out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
-        return out
+        return out if last.fused else [*out, last]
 
     def abandon(self) -> None:
         """Forget the frames: the camera is tracked in another map."""

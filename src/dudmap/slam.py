@@ -215,7 +215,7 @@ class Slam:
             return self._start_map(view)
         view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
-        self._revise_first_frame(view, prediction)
+        self._revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
         reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
@@ -232,7 +232,6 @@ class Slam:
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
-        self._settle_start(view, estimate, mask, fused=fuse)
         self._extend_map(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
@@ -264,9 +263,13 @@ class Slam:
         self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
 
-    def _revise_first_frame(self, view: FrameView, prediction: PosePrediction) -> None:
-        """Make the map anew of the first frame without what a later image shows to have moved in it."""
+    def _revise_start(self, view: FrameView, prediction: PosePrediction) -> None:
+        """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
+        can be seen, fuse the frames that were held back until then."""
         self._begin_anew(self.bootstrap.revised(prediction.moving_before), view)
+        if not self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+            for frame in self.bootstrap.released():
+                self._integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
 
     def _recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
@@ -278,16 +281,6 @@ class Slam:
         if first is not None:
             self.atlas.clear_map()
             self._integrate(replace(first.view, timer=view.timer), first.estimate, first.dynamic_mask)
-
-    def _settle_start(
-        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool
-    ) -> None:
-        """Remember a frame of the first moments of a map; once these are over, fuse those that were held back."""
-        if self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
-            self.bootstrap.add(view, estimate, dynamic_mask, fused=fused)
-            return
-        for frame in self.bootstrap.released(view, estimate.T_world_camera):
-            self._integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
@@ -352,6 +345,8 @@ class Slam:
                 self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
         if fuse:
             self._integrate(view, estimate, dynamic_mask)
+        if self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+            self.bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
 
     def _integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""

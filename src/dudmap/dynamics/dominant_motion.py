@@ -32,6 +32,8 @@ FEWEST_MOVING = 3
 """Fewest moving (static) corners of a moving (static) segment: three points determine a rigid motion."""
 AGREED = 0.7
 """Smallest share of moving corners of a segment that moves as a whole, and of the neighbours of a moving pixel."""
+SAME_SURFACE = 0.02
+"""Change of depth, as a share of it, between neighbouring readings of one surface, and by the noise at 5 m."""
 NOISE_SHARE = 0.02
 """Moving readings up to this share of all are taken for noise."""
 
@@ -128,9 +130,10 @@ def dominant_motion(
             the estimate of the motion.
         T_expected: (4, 4) predicted motion: the search for the corners starts there, and it is the prior of the
             estimate. None: the identity.
-        intervals: Corners that are off by more than so many times the limit are dropped. Between images so many
-            intervals apart, slower motion is hidden from image to image; what seems faster was confused with something
-            else, or is known.
+        intervals: Corners that are off by more than so many times the limit are dropped, and so are those whose depth
+            changed by more than such a motion along the line of sight. Between images so many intervals apart, slower
+            motion is hidden from image to image; what seems faster was confused with something else, such as the
+            surface that a person uncovers, or is known.
 
     Returns:
         None if too few corners follow one motion.
@@ -161,7 +164,7 @@ def dominant_motion(
     limit = least + MOVES_SHARE * np.linalg.norm(targets - pixels, axis=1)
     moves = error > limit
     kept = ~moves
-    moves &= error <= intervals * limit
+    moves &= (error <= intervals * limit) & (_depth_change(T, points, targets, fine_after) <= intervals * limit)
     kept[moves] = ~consistent_with_static(
         first, second, pixels[moves], predicted[moves], limit[moves], difference[moves]
     )
@@ -184,6 +187,23 @@ def dominant_motion(
             moves[seen],
         ),
     )
+
+
+def _depth_change(
+    T: NDArray[np.float64], points: NDArray[np.float64], targets: NDArray[np.float64], level: Level
+) -> NDArray[np.float64]:
+    """Length (n,) of the change of depth of corners, as pixels of a motion across the line of sight at that depth.
+
+    Args:
+        T: (4, 4) motion of the static world.
+        points: (n, 3) the corners, metres, first camera's frame.
+        targets: (n, 2) where they were found in the second image; without a reading there is no change.
+        level: The second image.
+    """
+    u, v = np.clip(np.rint(targets), 0, np.array(level.depth.shape[::-1]) - 1).astype(np.int64).T
+    found, expected = level.depth[v, u], points @ T[2, :3] + T[2, 3]
+    change = np.maximum(np.abs(found - expected) - SAME_SURFACE * expected, 0) / np.maximum(expected, 1e-6)
+    return np.where(found > 0, change * level.camera.fx, 0.0)
 
 
 def weighted_median(values: NDArray[np.float64], weights: NDArray[np.float64]) -> float:
