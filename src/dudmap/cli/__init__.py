@@ -16,6 +16,8 @@ from dudmap.errors import DudmapError
 
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
+    "view": "Show a run folder in the browser.",
+    "report": "Write one page on a run that opens offline.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",
     "demo": "Render a short recording with a walking person and run on it.",
     "synth": "Render a synthetic recording with exact ground truth.",

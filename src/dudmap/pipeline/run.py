@@ -15,6 +15,7 @@ from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask,
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.observer import RunObserver
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
@@ -37,6 +38,7 @@ def run(
     depth_model: str | Path | None = None,
     calibration: "Calibration | None" = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
+    observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
@@ -69,6 +71,7 @@ def run(
         depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         calibration: Of the colour camera; None takes that of the recording.
         observe: Called after each processed frame with its number, what was read, and the result.
+        observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with ``live``.
@@ -109,6 +112,8 @@ def run(
                     )
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
+                for observer in observers:
+                    observer.start(slam, out, count)
                 with closing(
                     in_real_time(sequence, count, given_masks)
                     if live
@@ -122,6 +127,7 @@ def run(
                             display,
                             out if save_masks and last else None,
                             observe if last else None,
+                            observers,
                         )
             if len(slam.maps) > 1:
                 display.note(_unmerged_submaps(slam))
@@ -141,6 +147,8 @@ def run(
             if stopped and finished is not None:  # the first pass is complete, the second is not
                 slam, record = finished
             report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map)
+            for observer in observers:
+                observer.finish(out)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -177,6 +185,7 @@ def _process(
     display: RunProgress,
     mask_folder: Path | None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None",
+    observers: "tuple[RunObserver, ...]",
 ) -> None:
     """Process one frame, count it, save its mask, and report it."""
     index, read = source.number, source.read
@@ -206,4 +215,6 @@ def _process(
         save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, read, result)
+    for observer in observers:
+        observer.frame(index, read, result, 1000 * (end - start))
     display.frame(index, result, record.dropped)
