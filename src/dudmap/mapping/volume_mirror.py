@@ -2,6 +2,8 @@
 
 import copy
 
+import numpy as np
+
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import VoxelBlocks, grown
 
@@ -34,7 +36,9 @@ class VolumeMirror:
         if len(target.geometry) < len(source.geometry):
             target.geometry = grown(target.geometry, len(source.geometry), 0)
             target.colors = grown(target.colors, len(source.colors), 0)
-        target.geometry[slots], target.colors[slots] = source.geometry[slots], source.colors[slots]
+        for part in np.split(slots, np.flatnonzero(np.diff(slots) > 1) + 1):  # runs of slots: no intermediate copy
+            run = slice(part[0], part[-1] + 1) if len(part) else slice(0)
+            target.geometry[run], target.colors[run] = source.geometry[run], source.colors[run]
         for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "written", "fused"):
             setattr(target, name, getattr(source, name).copy())
         target.num_entries, target.num_slots = source.num_entries, source.num_slots

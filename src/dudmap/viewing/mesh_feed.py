@@ -12,8 +12,8 @@ from dudmap.mapping.volume_mirror import VolumeMirror
 if TYPE_CHECKING:
     from dudmap.mapping.volume import TsdfVolume
 
-BUDGET_MS = 1.5
-"""Mean time per frame for copying the map, milliseconds: half of what watching a run may cost."""
+BUDGET_MS = 1.0
+"""Mean time per frame for copying the map, milliseconds: a third of what watching a run may cost."""
 LONGEST_WAIT = 60
 """Frames after which the budget allows another copy in any case: two seconds of a camera."""
 

@@ -106,17 +106,18 @@ def depth_colors(depth: NDArray[np.floating]) -> NDArray[np.uint8]:
     import cv2
 
     scaled = np.clip(255 * depth / DEPTH_RANGE, 0, 255).astype(np.uint8)
-    colors = np.asarray(cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO))[..., ::-1].copy()
+    colors = np.array(cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1], dtype=np.uint8)
     colors[depth <= 0] = _NO_READING
     return colors
 
 
 def mask_overlay(color: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    """Colour image (h, w, 3) with the masked pixels tinted red and the others dimmed."""
-    out = np.right_shift(color, 1)
-    if mask.shape == color.shape[:2]:
-        out[mask] = out[mask] + np.array([127, 0, 0], dtype=np.uint8)
-    return out
+    """Colour image (h, w, 3), dimmed, with the masked pixels tinted red."""
+    dim = np.right_shift(color, 1)
+    if mask.shape != color.shape[:2]:  # a colour camera of another size, whose image has no mask
+        return dim
+    tint = np.array([127, 0, 0], dtype=np.uint8)
+    return np.where(mask[..., None], dim + tint, dim).astype(np.uint8)
 
 
 def residual_colors(residuals: NDArray[np.floating]) -> NDArray[np.uint8]:
