@@ -153,6 +153,20 @@ def test_a_mirror_follows_a_growing_volume(volume):
             assert_equal(live, volume)
 
 
+def test_a_mirror_that_copies_a_few_blocks_at_a_time_catches_up(volume):
+    mirror = VolumeMirror(volume)
+    live = IncrementalMesh(mirror.volume)
+    for number, angle in enumerate((0, 5, 90, 180)):
+        volume.integrate(wall(1.5 + 0.02 * number, number), turned(angle))
+        mirror.update(limit=40)
+        live.update()
+    assert len(live.mesh().faces) < len(volume.extract_mesh().faces)
+    for _ in range(volume.num_blocks // 40 + 1):
+        mirror.update(limit=40)
+        live.update()
+    assert_equal(live, volume)
+
+
 def test_a_mirror_does_not_change_by_itself(volume):
     mirror = VolumeMirror(volume)
     volume.integrate(wall(1.5), turned(0))

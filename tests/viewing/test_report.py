@@ -69,6 +69,11 @@ def test_the_page_loads_nothing(page):
         assert tag != "script" or "src" not in values
 
 
+def test_the_page_carries_the_licence_of_what_it_ships(text):
+    assert "Permission is hereby granted, free of charge" in text
+    assert "three.js authors" in text
+
+
 def test_the_mesh_is_that_of_the_run(page):
     about = json.loads(page.by_id["run"])["mesh"]
     data = gzip.decompress(base64.b64decode(page.by_id["mesh"]))

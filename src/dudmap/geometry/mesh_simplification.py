@@ -40,7 +40,9 @@ def clustered(mesh: Mesh, cell: float) -> Mesh:
     faces = cluster.reshape(-1)[mesh.faces]
     faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]
     turned = (np.argmin(faces, axis=1)[:, None] + np.arange(3)) % 3  # smallest corner first, to find doubles
-    faces = np.unique(np.take_along_axis(faces, turned, axis=1), axis=0)
+    faces = np.take_along_axis(faces, turned, axis=1)
+    faces = faces[np.lexsort(faces.T[::-1])]
+    faces = faces[np.any(np.diff(faces, axis=0, prepend=-1) != 0, axis=1)]
     normals = mean(mesh.normals)
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-9)
     return Mesh(

@@ -7,9 +7,12 @@ import numpy as np
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import VoxelBlocks, grown
 
+GROWTH = 4
+"""Capacity in units of the volume's: growing copies all blocks at once, spare capacity is only address space."""
+
 
 class VolumeMirror:
-    """Copy of a volume, brought up to date by copying only the blocks that were written since the last update.
+    """Copy of a volume, brought up to date by copying only the blocks that were written since they were copied.
 
     ``update`` runs in the thread that changes the volume; between two updates any thread may read the copy.
 
@@ -17,30 +20,40 @@ class VolumeMirror:
         volume: The volume to follow.
 
     Attributes:
-        volume: The copy; for reading only (``sample``, ``extract_mesh``, ``IncrementalMesh``).
+        volume: The copy; for reading only (``extract_mesh``, ``IncrementalMesh``). Its frames count the updates.
     """
 
     def __init__(self, volume: TsdfVolume) -> None:
         self.volume = copy.copy(volume)
-        self.volume.blocks = VoxelBlocks()
         self._source = volume
-        self._map_id, self._seen = -1, -1
+        self._start()
 
-    def update(self) -> None:
-        """Take over what was integrated since the last update."""
+    def _start(self) -> None:
+        self.volume.blocks = VoxelBlocks()
+        self.volume.map_id, self.volume._frame_number = self._source.map_id, 0
+        self._copied = np.zeros(0, dtype=np.int32)  # frame up to which each slot was copied
+
+    def update(self, limit: int | None = None) -> None:
+        """Take over what was integrated since the last update.
+
+        Args:
+            limit: Number of blocks to copy at most, those copied longest ago first; the others keep an earlier state.
+                None copies all.
+        """
+        if self._source.map_id != self.volume.map_id:  # the map was cleared
+            self._start()
         source, target = self._source.blocks, self.volume.blocks
-        if self._source.map_id != self._map_id:  # the map was cleared: its frames count from zero again
-            self.volume.blocks = target = VoxelBlocks()
-            self._map_id, self._seen = self._source.map_id, -1
-        slots, _ = self._source.written_since(self._seen)
-        if len(target.geometry) < len(source.geometry):
-            target.geometry = grown(target.geometry, len(source.geometry), 0)
-            target.colors = grown(target.colors, len(source.colors), 0)
-        for part in np.split(slots, np.flatnonzero(np.diff(slots) > 1) + 1):  # runs of slots: no intermediate copy
-            run = slice(part[0], part[-1] + 1) if len(part) else slice(0)
-            target.geometry[run], target.colors[run] = source.geometry[run], source.colors[run]
-        for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "written", "fused"):
+        if len(self._copied) < len(source.geometry):
+            for name in ("geometry", "colors", "written"):
+                setattr(target, name, grown(getattr(target, name), GROWTH * len(source.geometry), 0))
+            self._copied = grown(self._copied, GROWTH * len(source.geometry), -1)
+        slots = np.flatnonzero(source.written[: source.num_slots] > self._copied[: source.num_slots])
+        if limit is not None and len(slots) > limit:
+            slots = np.sort(slots[np.argpartition(self._copied[slots], limit)[:limit]])
+        target.geometry[slots], target.colors[slots] = source.geometry[slots], source.colors[slots]
+        for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "fused"):
             setattr(target, name, getattr(source, name).copy())
         target.num_entries, target.num_slots = source.num_entries, source.num_slots
-        self.volume._frame_number = self._seen = self._source.num_integrated
-        self.volume.map_id = self._map_id
+        self.volume._frame_number += 1
+        target.written[slots] = self.volume._frame_number
+        self._copied[slots] = self._source.num_integrated

@@ -14,8 +14,10 @@ if TYPE_CHECKING:
 
 BUDGET_MS = 1.0
 """Mean time per frame for copying the map, milliseconds: a third of what watching a run may cost."""
-LONGEST_WAIT = 60
-"""Frames after which the budget allows another copy in any case: two seconds of a camera."""
+BLOCKS = 512
+"""Blocks that one hand-over copies at most: 2 MB, about a millisecond, so that no frame is held up for long."""
+LONGEST_WAIT = 15
+"""Frames after which the budget allows another hand-over in any case: half a second of a camera."""
 
 
 @dataclass
@@ -35,7 +37,7 @@ class MeshFeed:
     """Hands a growing map from the thread that changes it to one that extracts its mesh.
 
     Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
-    the one before, the changed blocks are copied. The other thread extracts the changed parts of the mesh from the
+    the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh from the
     copy.
 
     Args:
@@ -68,7 +70,7 @@ class MeshFeed:
             start = time.perf_counter()
             if self._mirror is None or self._volume is not volume:
                 self._volume, self._mirror = volume, VolumeMirror(volume)
-            self._mirror.update()
+            self._mirror.update(None if now else BLOCKS)
             self._cost, self._saved, self._waiting = 1000 * (time.perf_counter() - start), 0.0, True
 
     def take(self) -> MeshChanges:

@@ -79,6 +79,7 @@ def report_page(run: RunFiles) -> str:
         "mesh": mesh,
         "css": _asset("report.css"),
         "three": _asset("three.min.js"),
+        "licence": _asset("three.LICENSE.txt"),
         "script": _asset("report.js"),
     }
     return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("report.html"))

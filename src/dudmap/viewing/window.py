@@ -174,7 +174,8 @@ class Window:
 
     def stop(self) -> None:
         """End the server."""
-        self._server.stop()
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
 
     # -- controls -----------------------------------------------------------------------------------------------------
 
@@ -276,7 +277,9 @@ class Window:
         chosen = self._frames[::step]
         t = np.array([frame.timestamp for frame in chosen]) - self._frames[0].timestamp
         self._time_plot.data = (t, np.array([frame.ms for frame in chosen]))
-        self._residual_plot.data = (t, np.nan_to_num(1000 * np.array([frame.residual for frame in chosen])))
+        residuals = 1000 * np.array([frame.residual for frame in chosen])
+        self._residual_plot.visible = bool(np.isfinite(residuals).any())  # a run folder does not hold them
+        self._residual_plot.data = (t, np.nan_to_num(residuals))
 
     def _add(self, name: str, method: str, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
         self._handles[name] = getattr(self._server.scene, method)(name, **values)
