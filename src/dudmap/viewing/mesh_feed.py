@@ -37,8 +37,8 @@ class MeshFeed:
     """Hands a growing map from the thread that changes it to one that extracts its mesh.
 
     Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
-    the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh from the
-    copy.
+    the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh
+    from the copy.
 
     Args:
         budget_ms: Mean time per frame, milliseconds.
