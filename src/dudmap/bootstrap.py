@@ -1,11 +1,15 @@
-"""The start of a map: its first frame, and the revision of that frame by the second."""
+"""The start of a map: its first frame, and the frames held back until it is known what moves in them."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.dynamics.dominant_motion import exceeds_noise_share
+from dudmap.dynamics.ego_motion import OlderImage
 from dudmap.dynamics.masks import full_size
+from dudmap.frames.pyramid import reduced
+from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 
 MIN_READINGS = 0.02
@@ -13,23 +17,29 @@ MIN_READINGS = 0.02
 
 
 @dataclass(frozen=True, eq=False)
-class FirstFrame:
-    """The frame that a map was made of.
+class StartFrame:
+    """A frame of the first moments of a map.
 
     Attributes:
         view: The frame.
-        dynamic_mask: (H, W) bool, pixels that were not fused.
+        estimate: Its pose and labels.
+        dynamic_mask: (H, W) bool, pixels that are not fused.
+        fused: Whether it is part of the map.
     """
 
     view: FrameView
+    estimate: PoseEstimate
     dynamic_mask: NDArray[np.bool_]
+    fused: bool
 
 
 class Bootstrap:
-    """Knows which frame a map consists of while it is the only one, and what of it must be taken back.
+    """Knows the first frames of a map, and what of them must be taken back.
 
     A single image does not tell what moves, so everything in the first frame is taken as static that the caller does
-    not declare dynamic. The ego-motion to the second image shows what moved in the first.
+    not declare dynamic, and motion that is slow shows only after a while. What moved is taken out of the first frame as
+    soon as it shows, and the map begins anew with it. The frames since then are fused once slow motion can be seen,
+    without what is seen from there to have moved in them.
 
     Attributes:
         textureless: Whether the image of the first frame carries no information: later ones are then not called blind.
@@ -37,7 +47,7 @@ class Bootstrap:
 
     def __init__(self) -> None:
         self.textureless = False
-        self._first: FirstFrame | None = None
+        self._frames: list[StartFrame] = []
 
     @staticmethod
     def rejection_reason(view: FrameView, dynamic_mask: NDArray[np.bool_]) -> str:
@@ -48,20 +58,62 @@ class Bootstrap:
 
     def start(self, view: FrameView, dynamic_mask: NDArray[np.bool_]) -> None:
         """Remember the frame that a map was made of."""
-        self._first = FirstFrame(view, dynamic_mask)
+        self._frames = [StartFrame(view, PoseEstimate.at_origin(), dynamic_mask, fused=True)]
 
-    def revised(self, moving_before: NDArray[np.bool_] | None) -> FirstFrame | None:
+    def add(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fused: bool) -> None:
+        """Remember another frame of the first moments."""
+        if self._frames:
+            self._frames.append(StartFrame(view, estimate, dynamic_mask, fused))
+
+    def recolored(self, view: FrameView) -> StartFrame | None:
+        """The first frame with other colours; None if it is no longer remembered."""
+        if self._frames:
+            self._frames[0] = replace(self._frames[0], view=view)
+        return self._frames[0] if self._frames else None
+
+    def revised(self, moving_before: NDArray[np.bool_] | None) -> StartFrame | None:
         """The first frame with the mask it should have been fused with; None where the map is right as it is.
 
+        The others then count as not fused.
+
         Args:
-            moving_before: (h, w) bool, label resolution, what the second image shows to have moved in the first; None
-                if that is not known yet.
+            moving_before: (h, w) bool, label resolution, what a later image shows to have moved in the first; None if
+                that is not known.
         """
-        if self._first is None or moving_before is None:
+        if not self._frames or moving_before is None:
             return None
-        first, self._first = self._first, None
-        if not moving_before.any():
+        first = self._frames[0]
+        labelled = first.view.labelled
+        if not exceeds_noise_share(moving_before & ~reduced(first.dynamic_mask, labelled), labelled):
             return None
-        view = first.view
-        moving = full_size(moving_before, view.labelled.depth, view.observation.depth)
-        return FirstFrame(view, first.dynamic_mask | moving)
+        moving = full_size(moving_before, labelled.depth, first.view.observation.depth)
+        first = replace(first, dynamic_mask=first.dynamic_mask | moving)
+        self._frames = [first, *(replace(frame, fused=False) for frame in self._frames[1:])]
+        return first
+
+    def released(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> list[StartFrame]:
+        """The frames that are to be fused yet, without what has moved since then; they are forgotten.
+
+        A frame that follows no common motion with the present one is left out.
+
+        Args:
+            view: The present frame.
+            T_world_camera: (4, 4) its pose.
+        """
+        stamps = [frame.view.timestamp for frame in self._frames]
+        interval = (view.timestamp - stamps[0]) / len(stamps) if stamps else 0.0
+        frames, self._frames = [frame for frame in self._frames if not frame.fused], []
+        out = []
+        for frame in frames:
+            before = frame.view
+            older = OlderImage(before.timestamp, frame.estimate.T_world_camera, before.pyramid, before.segmentation())
+            intervals = (view.timestamp - before.timestamp) / interval
+            motion = older.motion_to(view.pyramid, view.segmentation(), T_world_camera, intervals)
+            if motion is not None and older.moving is not None:
+                moving = full_size(older.moving, before.labelled.depth, before.observation.depth)
+                out.append(replace(frame, dynamic_mask=frame.dynamic_mask | moving))
+        return out
+
+    def abandon(self) -> None:
+        """Forget the frames: the camera is tracked in another map."""
+        self._frames = []

@@ -32,11 +32,15 @@ class SensorConfig(ConfigSection):
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
     distortion: bool = False
-    """Learn the static distortion of the depth images against the map and write it to ``depth_model.npz``, which the
+    """Estimate the static distortion of the depth images after the run and write it to ``depth_model.npz``, which the
     option ``--depth-model`` of later runs with the same camera applies."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
     row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""
+
+    self_calibration: bool = True
+    """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
+    before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
@@ -110,6 +114,8 @@ class VolumeConfig(ConfigSection):
     max_readings: int = Field(default=48, ge=1, le=255)
     """Largest weight to which a reading can raise a voxel, in multiples of its own weight, so that the influence of
     readings of low weight fades once there are better ones."""
+    antialias: bool = True
+    """Average the colours of the pixels that a voxel covers, instead of taking that of the pixel at its centre."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)
@@ -391,7 +397,7 @@ class Config(ConfigSection):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
-        "sensor": {"color_time_sigma": 0.0},
+        "sensor": {"color_time_sigma": 0.0, "self_calibration": False},
         "volume": {
             "voxel_size": 0.01,
             # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on
@@ -401,6 +407,7 @@ PRESETS: dict[str, dict[str, Any]] = {
             "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
+            "antialias": False,
             "weighting": "constant",
             "take_turns": False,
         },

@@ -35,6 +35,7 @@ class FrameResult:
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
+        calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
         balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
             frame, else None.
@@ -59,3 +60,4 @@ class FrameResult:
     blind: bool = False
     uncertain: str = ""
     balance: TermBalance | None = None
+    calibrated: bool = False

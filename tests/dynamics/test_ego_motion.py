@@ -8,8 +8,9 @@ import pytest
 
 from dudmap import synthetic
 from dudmap.config import Config, TrackerConfig
+from dudmap.dynamics import dominant_motion as dominant
 from dudmap.dynamics import ego_motion
-from dudmap.dynamics.ego_motion import dominant_motion
+from dudmap.dynamics.dominant_motion import dominant_motion
 from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
 from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
@@ -89,6 +90,29 @@ def test_the_motion_of_most_surface_is_found_or_the_expected_one_of_two(share, e
     np.testing.assert_allclose(rigid_motion(points, targets, CAMERA, expected), found, atol=1e-6)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_a_motion_between_those_of_the_world_and_of_slow_people_is_not_taken(seed):
+    rng = np.random.default_rng(seed)
+    room, people = (
+        rng.uniform([-2, -1.5, 2.5], [2, 1.5, 4], (400, 3)),
+        rng.uniform([-0.5, -0.5, 0.9], [0.5, 0.5, 1.1], (320, 3)),
+    )
+    steps = np.eye(4)
+    steps[0, 3] = 0.01  # 0.3 m/s at 30 images per second: 2.6 pixels at 1 m
+    points = np.concatenate([room, people])
+    targets = np.concatenate([reproject(SLOW, room, CAMERA), reproject(SLOW @ steps, people, CAMERA)])
+    found = rigid_motion(points, targets + rng.normal(0, 0.07, (720, 2)), CAMERA, np.eye(4))
+    assert np.linalg.norm((se3.inverse(SLOW) @ found)[:3, 3]) < 0.0015  # 8 to 10 mm at a noise fixed at 0.29 pixels
+
+
+def test_the_weighted_median_is_that_of_repeated_values():
+    rng = np.random.default_rng(2)
+    for count in (1, 2, 7, 40):
+        values, weights = rng.normal(size=count), rng.integers(1, 9, count)
+        repeated = np.sort(np.repeat(values, weights))
+        assert dominant.weighted_median(values, weights.astype(float)) == repeated[(len(repeated) - 1) // 2]
+
+
 @pytest.mark.parametrize("index", [0, 6, 20])
 def test_a_crowd_over_half_of_the_image_is_not_the_world(crowd, index):
     before = image(crowd, index)
@@ -135,8 +159,8 @@ def test_a_shaken_image_makes_nothing_move(monkeypatch):
     bend = (1.0 * np.sin(v / 25)).astype(np.float32)
     bent = cv2.remap(after.intensity, u + bend, v, cv2.INTER_LINEAR, None, cv2.BORDER_REPLICATE)
     shaken = image(room, 5, intensity=bent)
-    assert compare(before, shaken).moving_after.mean() < 0.01
-    monkeypatch.setattr(ego_motion, "MOVES_SIGMAS", 0.5)  # without regard to how well the other corners fit
+    assert compare(before, shaken).moving_after.mean() < dominant.NOISE_SHARE
+    monkeypatch.setattr(dominant, "MOVES_SIGMAS", 0.5)  # without regard to how well the other corners fit
     assert compare(before, shaken).moving_after.mean() > 0.1
 
 
@@ -270,7 +294,7 @@ def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_alon
     results = [slam.process(sequence[index]) for index in range(len(sequence))]
     truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
     off = np.linalg.norm(truth[-1, :3, 3] - results[-1].T_world_camera[:3, 3])
-    assert off < 0.045, f"{off:.3f} m"
+    assert off < 0.015, f"{off:.3f} m"
     mask = sequence.mask(31)
     assert results[-1].dynamic_mask[mask].mean() > 0.5
 
@@ -338,17 +362,28 @@ def uncertain_frames(sequence):
     return results
 
 
-def test_a_young_map_with_a_slow_crowd_is_uncertain_and_not_fused():
+# the camera followed people of 0.3 m/s for a while, and those of 0.1 m/s, over half of the image, for good
+@pytest.mark.parametrize(("coverage", "speed", "seed"), [(0.42, 0.3, 0), (0.42, 0.3, 1), (0.5, 0.1, 20)])
+def test_a_young_map_with_a_slow_crowd_is_uncertain_and_begins_anew_without_it(coverage, speed, seed, monkeypatch):
     camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
     sequence = synthetic.sequence(
-        "room", coverage=0.42, speed=0.3, start_dynamic=True, frames=16, camera=camera, seed=1
+        "room", coverage=coverage, speed=speed, start_dynamic=True, frames=16, camera=camera, seed=seed
     )
+    fused = []
+    integrate = Slam._integrate
+    monkeypatch.setattr(Slam, "_integrate", lambda slam, *args: (fused.append(args), integrate(slam, *args)))
     results = uncertain_frames(sequence)
-    assert [bool(result.uncertain) for result in results] == [0 < index < 12 for index in range(16)]
+    assert all(result.uncertain for result in results[4:12])
+    assert not any(result.uncertain for result in results[12:])
     truth = se3.inverse(sequence.ground_truth.Ts_world_camera[0]) @ sequence.ground_truth.Ts_world_camera
     errors = [np.linalg.norm(result.T_world_camera[:3, 3] - T[:3, 3]) for result, T in zip(results, truth, strict=True)]
-    assert not any(result.fused for result in results[1:12])
-    assert max(errors[12:]) < 0.03, errors
+    assert max(errors[12:]) < 0.015, errors
+    stamps = list(sequence.timestamps[:16])
+    masks = {stamps.index(view.timestamp): mask for view, _, mask in fused}  # the last fusion of each frame
+    assert sorted(masks) == list(range(16))  # those held back are fused once the motion shows
+    for index in (0, 1, 5, 11):
+        people = sequence.mask(index) & (sequence[index].depth > 0)
+        assert masks[index][people].mean() > 0.85, index
 
 
 def test_an_empty_room_and_a_crowd_that_is_seen_to_move_are_not_uncertain():

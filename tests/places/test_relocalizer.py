@@ -196,6 +196,23 @@ def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, sh
     assert subject.wants_new_submap(lost_view(10.0)) == wanted
 
 
+@pytest.mark.parametrize("slow", [False, True])
+def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeypatch, slow):
+    few, most = motion_of(moving_share=0.1, share=0.9), motion_of(moving_share=0.7, share=0.9)
+    monkeypatch.setattr(
+        "dudmap.places.relocalizer.dominant_motion",
+        lambda before, after, _: most if slow and after - before > 0.2 else few,
+    )
+    subject = relocalizer()
+    subject.lost(0.0)
+    wanted = []
+    for timestamp in np.arange(0.1, 3, 0.1):
+        view = lost_view(timestamp)
+        view.pyramid = timestamp
+        wanted.append(subject.wants_new_submap(view))
+    assert any(wanted) != slow
+
+
 @pytest.mark.parametrize("crowded", [False, True])
 def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monkeypatch, crowded):
     monkeypatch.setattr("dudmap.places.relocalizer.dominant_motion", lambda *_: None)

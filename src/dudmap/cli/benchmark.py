@@ -161,6 +161,27 @@ def bias(
             typer.echo(bias_table(measure_pulls(world, config, stride)))
 
 
+@app.command("first-second")
+def first_second(
+    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of worlds of each scene.")] = 3,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
+    from dudmap import synthetic
+    from dudmap.benchmark.first_second import FRAMES, first_second_table, measure_first_second
+    from dudmap.config import Config
+
+    config = Config().override(assignments or [])
+    worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
+    runs = [
+        measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES, noise="none", seed=seed), config)
+        for scene, seed in worlds
+    ]
+    typer.echo(first_second_table(runs))
+
+
 @app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(

@@ -10,11 +10,18 @@ from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
     from dudmap.config import Config
+    from dudmap.places.saved_map import SavedMap
 
 app = typer.Typer(add_completion=False)
 
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Intrinsics: fx,fy,cx,cy[,w,h[,depth_scale]].", metavar="NUMBERS")
+]
+TopicsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--topics", help="Of a bag: color=/a,depth=/b,color_info=/c,depth_info=/d,world=frame.", metavar="KEY=TOPIC,..."
+    ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
@@ -22,8 +29,8 @@ CalibrationOption = Annotated[
     str,
     typer.Option(
         "--calibration",
-        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay takes it "
-        "as given); given takes what the recording says; or calibration.toml of another run or of calibrate.",
+        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while it "
+        "runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
         metavar="auto|given|FILE",
     ),
 ]
@@ -49,12 +56,15 @@ RerunOption = Annotated[
 
 @app.command()
 def run(
-    sequence: Annotated[Path, typer.Argument(help="Recording: folder in TUM layout (rgb.txt, depth.txt).")],
+    sequence: Annotated[
+        Path, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    topics: TopicsOption = None,
     calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
@@ -74,6 +84,15 @@ def run(
         Path | None,
         typer.Option("--depth-model", help="depth_model.npz of an earlier run: distortion of the depth to remove."),
     ] = None,
+    saved: Annotated[
+        Path | None,
+        typer.Option(
+            "--map", help="Run folder of an earlier run: go on in its map and its world frame.", metavar="RUN"
+        ),
+    ] = None,
+    localize: Annotated[
+        bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
+    ] = False,
     report: ReportOption = True,
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
@@ -84,16 +103,22 @@ def run(
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene from a recording.
 
-    Writes trajectory.txt, mesh.ply, map.npz, config.toml, metrics.json, timings.csv and report.html into the run
-    folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving
-    object.
+    Writes trajectory.txt, mesh.ply, map.npz, keyframes.npz, config.toml, metrics.json, timings.csv and report.html
+    into the run folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid
+    moving object.
     """
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
+    if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
+        config = saved / "config.toml"
     parameters = read_config(config, preset, assignments or [])
-    recording = open_sequence(sequence, camera)
+    saved_map = None if saved is None else read_saved_map(saved, parameters, out)
+    recording = open_sequence(sequence, camera, topics=topics)
+    for warning in inspect(recording).warnings:
+        _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
     if calibration == "auto" and not live:
         from dudmap.pipeline.calibration import calibrate_start
@@ -101,11 +126,13 @@ def run(
         given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
     else:
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
+    if calibration != "auto":
+        parameters = parameters.override(["sensor.self_calibration=false"])
     with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, observers=watching,
+            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
@@ -124,6 +151,19 @@ def read_config(file: Path | None, preset: str | None, assignments: list[str]) -
         )
     config = Config.load(file) if file is not None else Config.from_tree({"preset": preset} if preset else {})
     return config.override(assignments)
+
+
+def read_saved_map(folder: Path, config: "Config", out: Path | None) -> "SavedMap":
+    """Map of a run folder for a run with this configuration."""
+    from dudmap.places.saved_map import SavedMap
+
+    if out is not None and out.resolve() == folder.resolve():
+        raise ConfigError(
+            f"the map to go on in lies in the run folder {out}, which is emptied; name another with --out"
+        )
+    if not config.relocalization.enabled:
+        raise ConfigError("the camera is found in a saved map by relocalisation; drop relocalization.enabled=false")
+    return SavedMap.load(folder, config.volume.voxel_size)
 
 
 def free_folder(wanted: Path) -> Path:

@@ -175,7 +175,7 @@ class DynamicDetector:
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, np.linspace(0, MAX_RESIDUAL, BINS + 1))
-        evidence, seen_static = self._evidence(frame, residual, mixture)
+        evidence = self._evidence(frame, residual, mixture)
         probability = volume.backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
@@ -185,7 +185,7 @@ class DynamicDetector:
             if self.config.pieces:
                 dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None:
-                dynamic = dynamic | (moving & ~seen_static)
+                dynamic = dynamic | moving
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
             probability = np.where(dynamic, np.float32(0), np.float32(1))
         hidden = None
@@ -219,10 +219,8 @@ class DynamicDetector:
         self.memory.reset()
         self.background.reset()
 
-    def _evidence(
-        self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture
-    ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
-        """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown, and pixels (h, w) seen to be static.
+    def _evidence(self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture) -> NDArray[np.float32]:
+        """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown.
 
         Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
         free space they are -MAX_LOG_ODDS.
@@ -233,14 +231,12 @@ class DynamicDetector:
         within_noise = surface & (np.abs(sample.distance) < frame.noise)
         evidence[within_noise] = np.maximum(evidence[within_noise], 1)
         if not self.config.free_space:
-            return evidence, np.zeros(depth.shape, dtype=bool)
+            return evidence
         unknown = float(np.mean(frame.unknown[depth > 0])) if depth.any() else 0.0
         max_gap = np.float32(1.5) * frame.noise.astype(np.float32)
-        seen_free, seen_static = self.memory.free_and_static(
-            frame.timestamp, frame.level, frame.T_world_camera, max_gap, unknown
-        )
+        seen_free = self.memory.free(frame.timestamp, frame.level, frame.T_world_camera, max_gap, unknown)
         evidence[frame.free | seen_free] = -MAX_LOG_ODDS
-        return evidence, seen_static
+        return evidence
 
     def _regions(
         self, frame: _Comparison, seeds: NDArray[np.bool_], evidence: NDArray[np.float32]

@@ -13,6 +13,14 @@ REFERENCE_WIDTH = 320
 NOISE_PX = 0.7
 """Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
 degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
+REFINED = 5
+"""Hypotheses of each noise level that are refined: three noisy corners seldom give the best one outright."""
+NOISE_LEVELS = 1.0, 0.5, 0.25
+"""Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
+corners of a right motion are measured with 0.07 px per coordinate."""
+OUTLIER_GAIN = 2.996
+"""Log-likelihood ratio of a corner without error to an outlier at the largest noise level, 5.99 / 2: a corner is an
+inlier up to the error at which both are equally likely."""
 NEAR_PX = 5.0
 """Scale of the prior on the distance of a motion from the expected one, pixels: a turn by 1.1 degrees at a focal length
 of 262 pixels, by which a prediction at constant velocity errs where a turn of 33 degrees/s begins within 1/30 s."""
@@ -33,15 +41,20 @@ def rigid_motion(
     of a motion is that of MSAC (Torr and Zisserman 2000), each correspondence weighted by its depth squared, to
     which the surface that it stands for is proportional, times a prior:
 
-        score(T) = sum_n z_n^2 (1 - min(e_n^2 / NOISE_PX^2, 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
+        score(T, sigma) = gain sum_n z_n^2 (1 - min(e_n^2 / (2 gain sigma^2), 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
+        gain = log(A / (2 pi sigma^2))
 
     where e_n is the reprojection error and d the mean distance, in pixels, of the reprojected points from where the
-    expected motion puts them. The prior decides between two motions that explain nearly as much surface: a crowd that
+    expected motion puts them. The sum is the log-likelihood of normally distributed errors against that of outliers
+    spread over an area A. The noise sigma is unknown like the motion, and the pair of the highest score is searched: at
+    a noise fixed too large, a motion between that of the static world and that of slow people explains both.
+
+    The prior decides between two motions that explain nearly as much surface: a crowd that
     walks abreast may cover more of it than the static world, and two images alone cannot tell which of the two moves.
     The prior ranges from 1 to 1/2 only, because the expected motion is a prediction and may be wrong.
 
-    The best hypothesis and the expected motion are refined on their inliers with the exact projection, and the one of
-    the higher score is returned.
+    The REFINED best hypotheses of each noise level and the expected motion are refined on their inliers with the exact
+    projection, and the one of the highest score is returned.
 
     Args:
         points: (n, 3) metres, first camera's frame.
@@ -63,9 +76,15 @@ def rigid_motion(
     A = A + 1e-9 * np.eye(6)  # samples with a repeated point are degenerate; their hypotheses have no support
     twists = np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64)
     scores = consensus.msac_scores(twists, J, flow, expected - start, areas, params)
-    candidates = T_expected, se3.exp(twists[int(np.argmax(scores))])
-    refined = [_refined(T, points, targets, camera) for T in candidates]
-    return max(refined, key=lambda T: _score(reproject(T, points, camera), targets, expected, areas, params))
+    best, best_score = T_expected, -np.inf
+    for k, limit in enumerate(params.inlier_px):
+        highest = np.argpartition(scores[:, k], -REFINED)[-REFINED:]
+        for T in (T_expected, *(se3.exp(twists[number]) for number in highest)):
+            refined = _refined(T, points, targets, camera, limit)
+            score = _score(reproject(refined, points, camera), targets, expected, areas, params)
+            if score > best_score:
+                best, best_score = refined, score
+    return best
 
 
 def _refined(
@@ -73,10 +92,11 @@ def _refined(
     points: NDArray[np.float64],
     targets: NDArray[np.float64],
     camera: Camera,
+    inlier_px: float,
 ) -> NDArray[np.float64]:
     """Least-squares motion of the inliers of a motion near it, by Gauss-Newton; arguments as above."""
     for scale in (2.0, 1.0, 1.0):  # the hypothesis comes from three noisy corners: begin with a wider inlier threshold
-        limit = scale * _params(camera).inlier_px
+        limit = scale * inlier_px
         H, gradient, count = consensus.normal_equations(points, targets, T, camera.intrinsics, limit)
         if count < 6:
             break
@@ -91,10 +111,14 @@ def _score(
     areas: NDArray[np.float64],
     params: ConsensusParams,
 ) -> float:
-    """Score of a motion that reprojects the points to ``pixels`` (n, 2)."""
-    error = np.sum((pixels - targets) ** 2, axis=1) / params.inlier_px**2
+    """Score, at the best noise level, of a motion that reprojects the points to ``pixels`` (n, 2)."""
+    square = np.sum((pixels - targets) ** 2, axis=1)
+    sums = [
+        gain * (areas * (1 - np.minimum(square / limit**2, 1))).sum()
+        for limit, gain in zip(params.inlier_px, params.gain, strict=True)
+    ]
     distance = np.linalg.norm(pixels - expected, axis=1).mean() / params.prior_px
-    return float((areas * (1 - np.minimum(error, 1))).sum() * consensus.motion_prior(distance))
+    return float(max(sums) * consensus.motion_prior(distance))
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:
@@ -103,7 +127,10 @@ def pixels_at_width(distance: float, camera: Camera) -> float:
 
 
 def _params(camera: Camera) -> ConsensusParams:
-    return ConsensusParams(pixels_at_width(NOISE_PX, camera), pixels_at_width(NEAR_PX, camera))
+    levels = np.array(NOISE_LEVELS)
+    gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
+    limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
+    return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(NEAR_PX, camera))
 
 
 def flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:

@@ -22,14 +22,8 @@ YOUNG_PERIODS = 3.0
 """Age of the map, in units of ``start_seconds``, up to which single frames give free space; later the map does."""
 YOUNG_UNKNOWN_SHARE = 0.1
 """Share of the readings in space unknown to the map from which on single frames give free space at any age."""
-SAME_INTENSITY = 0.08
-"""Largest intensity difference of two readings of one static point."""
-STATIC_PERIOD = 0.3
-"""Time, in units of ``start_seconds``, over which a point must have been seen in place to count as static."""
 SEAM = 1
 """Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
-STATIC_RADIUS = 2
-"""Radius of the median filter of static pixels, pixels at REFERENCE_WIDTH."""
 DYNAMIC_SHARE = 0.2
 """Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
 
@@ -143,22 +137,21 @@ class TemporalMemory:
         ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
         return (marks > 0) & (np.abs(gap) < max_gap)
 
-    def free_and_static(
+    def free(
         self,
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
         noise: NDArray[np.float32],
         unknown: float = 0.0,
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
-        """Pixels in space that single frames have seen to be free, and pixels seen to be static.
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) in space that single frames have seen to be free.
 
         Single frames are compared while the map is young, and where it does not know much of what is in view;
-        otherwise both masks are empty. In the first seconds of a second pass later frames are compared, too.
+        otherwise the mask is empty. In the first seconds of a second pass later frames are compared, too.
 
         A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
-        at least half as many frames have as have seen a surface at it. A point is static if all frames that see it,
-        two at least, have seen the same surface and intensity there, over STATIC_PERIOD at least.
+        at least half as many frames have as have seen a surface at it.
 
         Args:
             timestamp: Seconds.
@@ -166,32 +159,21 @@ class TemporalMemory:
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest depth difference between two readings of one point, metres.
             unknown: Share of the readings that lie in space unknown to the map.
-
-        Returns:
-            (h, w) bool in free space, (h, w) bool static.
         """
         import cv2
 
-        shape = level.depth.shape
-        num_free, num_surface, num_same, num_seen, age = (np.zeros(shape, dtype=np.float32) for _ in range(5))
+        num_free, num_surface = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(2))
         if timestamp < self._young_until:
             candidates = self._start_frames if self._imported else self._recent_frames
         else:
             candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
         frames = [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
-        for frame, (gap, difference, _) in zip(frames, reproject(level, T_world_camera, frames), strict=True):
-            seen, surface = ~np.isnan(gap), np.abs(gap) <= noise
+        for gap, _, _ in reproject(level, T_world_camera, frames):
             num_free += gap > noise
-            num_surface += surface
-            num_same += surface & (np.abs(difference) < SAME_INTENSITY)
-            num_seen += seen
-            age[seen] = np.maximum(age[seen], abs(timestamp - frame.timestamp))
-        static = (num_seen >= 2) & (num_same == num_seen) & (age >= STATIC_PERIOD * self.config.start_seconds)
-        static = cv2.medianBlur(static.astype(np.uint8), scaled_side(STATIC_RADIUS, level)) > 0
+            num_surface += np.abs(gap) <= noise
         free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
         side = scaled_side(SEAM, level)
-        free = cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
-        return free, static
+        return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
 
     def settled(
         self,

@@ -51,14 +51,19 @@ class Backend(Protocol):
         intrinsics: NDArray[np.float32],
         projection: ColorProjection,
         fallback: float,
+        start: int,
+        stop: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Coordinates u, v (H, W) in the colour image of each pixel of a depth image.
+        """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
+
+        Calls may run at the same time.
 
         Args:
             depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
             intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
             projection: Of the colour camera.
             fallback: Depth of rows without a reading, metres.
+            start, stop: First row, and that after the last.
         """
         ...
 
@@ -106,6 +111,19 @@ class Backend(Protocol):
             free_after: Observations that make a block known free space.
             frame_number: Number of this frame, larger than all before.
             parameters: Of the fusion.
+        """
+        ...
+
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """Mean colour (H, W, 3) uint8 of the surface within a voxel of each reading.
+
+        Args:
+            color: (H, W, 3) uint8.
+            depth: (H, W) float32, metres, 0 = none; pixels without a reading keep their colour.
+            focal: Focal length, pixels.
+            voxel_size: Metres.
         """
         ...
 

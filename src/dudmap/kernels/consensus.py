@@ -15,11 +15,13 @@ class ConsensusParams(NamedTuple):
     """Scales of the consensus, pixels.
 
     Attributes:
-        inlier_px: Reprojection error from which on a correspondence is an outlier.
+        inlier_px: Reprojection errors from which on a correspondence is an outlier, one per noise level.
+        gain: Log-likelihood ratio of a correspondence without error to an outlier, one per noise level.
         prior_px: Mean distance from the expected image positions at which the prior of a motion is 3/4.
     """
 
-    inlier_px: float
+    inlier_px: tuple[float, ...]
+    gain: tuple[float, ...]
     prior_px: float
 
 
@@ -43,7 +45,9 @@ def msac_scores(
     weights: NDArray[np.float64],
     params: ConsensusParams,
 ) -> NDArray[np.float64]:
-    """Scores (g,) of motion hypotheses: sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) times the prior of the motion.
+    """Scores (g, k) of motion hypotheses at each noise level.
+
+    They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) times the prior of the motion.
 
     The error e_n is the distance of the linearised flow ``J_n twist`` from the measured one, the argument of the prior
     the mean distance of ``J_n twist`` from the expected flow.
@@ -59,7 +63,7 @@ def msac_scores(
     by_axis = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
     measured, expected = np.ascontiguousarray(flow.T), np.ascontiguousarray(expected_flow.T)
     twists = np.ascontiguousarray(twists)
-    scores = np.empty(len(twists))
+    scores = np.empty((len(twists), len(params.gain)))
     run_bands(
         lambda start, stop: _score_band(start, stop, twists, by_axis, measured, expected, weights, params, scores),
         bands(len(twists), BAND),
@@ -70,21 +74,29 @@ def msac_scores(
 @kernel
 def _score_band(start, stop, twists, jacobian, flow, expected_flow, weights, params, scores):
     """Scores of the hypotheses ``start`` to ``stop``; jacobian (2, 6, n), flows (2, n)."""
-    by_square = 1.0 / (params.inlier_px * params.inlier_px)
+    levels = scores.shape[1]
+    by_square = np.empty(levels)
+    for k in range(levels):
+        by_square[k] = 1.0 / (params.inlier_px[k] * params.inlier_px[k])
     for g in range(start, stop):
         a, b, c = twists[g, 0], twists[g, 1], twists[g, 2]
         d, e, f = twists[g, 3], twists[g, 4], twists[g, 5]
-        total, distance = 0.0, 0.0
+        distance = 0.0
+        scores[g] = 0.0
         for n in range(weights.size):
             u = jacobian[0, 0, n] * a + jacobian[0, 1, n] * b + jacobian[0, 2, n] * c
             u += jacobian[0, 3, n] * d + jacobian[0, 4, n] * e + jacobian[0, 5, n] * f
             v = jacobian[1, 0, n] * a + jacobian[1, 1, n] * b + jacobian[1, 2, n] * c
             v += jacobian[1, 3, n] * d + jacobian[1, 4, n] * e + jacobian[1, 5, n] * f
             du, dv = u - flow[0, n], v - flow[1, n]
-            total += weights[n] * inlier_score((du * du + dv * dv) * by_square)
+            square = du * du + dv * dv
+            for k in range(levels):
+                scores[g, k] += weights[n] * inlier_score(square * by_square[k])
             du, dv = u - expected_flow[0, n], v - expected_flow[1, n]
             distance += np.sqrt(du * du + dv * dv)
-        scores[g] = total * motion_prior(distance / (params.prior_px * weights.size))
+        prior = motion_prior(distance / (params.prior_px * weights.size))
+        for k in range(levels):
+            scores[g, k] *= params.gain[k] * prior
 
 
 @kernel

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import (
+    antialiasing,
     color_registration,
     filtering,
     integration,
@@ -103,16 +104,13 @@ class CpuBackend:
         intrinsics: NDArray[np.float32],
         projection: ColorProjection,
         fallback: float,
+        start: int,
+        stop: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Backend.color_pixels``."""
-        us, vs = np.empty((2, *depth.shape), dtype=np.float32)
+        us, vs = np.empty((2, stop - start, depth.shape[1]), dtype=np.float32)
         arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
-        run_bands(
-            lambda start, stop: color_registration.color_pixels_rows(
-                start, stop, depth, intrinsics, *arrays, *numbers, us, vs
-            ),
-            bands(depth.shape[0], PIXEL_ROWS),
-        )
+        color_registration.color_pixels_rows(start, stop, depth, intrinsics, *arrays, *numbers, us, vs)
         return us, vs
 
     def _limited_buffer(self, shape: tuple[int, ...]) -> NDArray[np.float32]:
@@ -168,6 +166,20 @@ class CpuBackend:
             bands(depth.shape[0], PIXEL_ROWS),
         )
         return weights
+
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """See ``Backend.footprint_colors``."""
+        rgb, (h, w) = np.ascontiguousarray(color), depth.shape
+        sums, out = np.empty((h + 1, w + 1), dtype=np.int64), np.empty_like(rgb)
+        antialiasing.sum_table(rgb, sums)
+        by_depth, tolerance = np.float32(focal * voxel_size), np.float32(antialiasing.SAME_SURFACE * voxel_size)
+        run_bands(
+            lambda start, stop: antialiasing.footprint_means(start, stop, depth, rgb, sums, by_depth, tolerance, out),
+            bands(h, PIXEL_ROWS),
+        )
+        return out
 
     def touched_cells(
         self,

@@ -147,6 +147,8 @@ class Integrator:
         if len(window.near) == 0:
             return
         turn = frame_number if self.config.take_turns else -1
+        if self.config.antialias:
+            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
         slots, occupied = self.backend.fuse(
             self.grid(blocks, window), view, color, weights, window.near, blocks.fused, turn, count, self.parameters
         )

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
@@ -31,6 +32,8 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 FORMAT = "dudmap map 1"
+INTENSITY = 0xFF
+"""Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -180,6 +183,29 @@ class TsdfVolume:
         self.blocks, self.window = other.blocks, other.window
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
+    def for_camera(self, camera: Camera) -> "TsdfVolume":
+        """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
+        other.blocks, other._frame_number = self.blocks, self._frame_number
+        return other
+
+    def take_colors(self, other: "TsdfVolume") -> None:
+        """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
+
+        A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
+        """
+        assert other.config == self.config
+        slots = self.active_slots
+        there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
+        known = there >= 0
+        intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
+        intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
+        colors[known] = other.blocks.colors[there[known]]
+        self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
+        self.blocks.colors[slots] = colors
+        self._frame_number += 1
+        self.blocks.written[slots] = self._frame_number
+
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         self.window.look_at(T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach, self.blocks)
@@ -287,14 +313,14 @@ class TsdfVolume:
     # -- files -------------------------------------------------------------------------------------------------------
 
     def save(self, path: str | Path) -> None:
-        """Write the map as NumPy archive; ``load`` gives an equal volume.
+        """Write the map as NumPy archive, replacing an older file at the end; ``load`` gives an equal volume.
 
         Raises:
             MapError: The file cannot be written.
         """
         n, slots = self.blocks.num_entries, self.active_slots
         try:
-            with Path(path).open("wb") as file:
+            with atomic_file(path) as file:
                 np.savez_compressed(
                     file,
                     format=FORMAT,

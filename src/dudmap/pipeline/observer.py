@@ -15,8 +15,8 @@ class RunObserver:
     All methods are called in the thread of the run, between two frames, when nothing changes the map.
     """
 
-    def start(self, slam: "Slam", out: Path, count: int) -> None:
-        """A pass over ``count`` frames with this system begins; its run folder exists and is empty."""
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Frame number ``index`` was read and processed in ``ms`` milliseconds."""

@@ -16,6 +16,7 @@ from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask,
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.observer import RunObserver
+    from dudmap.places.saved_map import SavedMap
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
     from dudmap.sequences.masks import MaskFolder
@@ -37,12 +38,15 @@ def run(
     passes: int = 1,
     depth_model: str | Path | None = None,
     calibration: "Calibration | None" = None,
+    saved_map: "SavedMap | None" = None,
+    localize: bool = False,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
-    The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz, config.toml,
+    The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz and keyframes.npz
+    (what a later run needs to go on in the map), config.toml,
     metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), movers.jsonl
     (one JSON object per frame with moving objects: timestamp, and per object id, centroid, box, velocity, speed and
     pixels; metres, m/s, world frame), groundtruth.txt if the true trajectory is known, masks/<timestamp>.png (255 =
@@ -57,7 +61,7 @@ def run(
         out: The run folder; created if needed.
         max_frames: Process only this many frames.
         save_masks: Write the dynamic mask of every frame.
-        save_map: Write map.npz.
+        save_map: Write map.npz and keyframes.npz.
         masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
             ones. Frames with and without a mask are counted.
         progress: Show a progress bar on a terminal.
@@ -70,16 +74,19 @@ def run(
             written.
         depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         calibration: Of the colour camera; None takes that of the recording.
+        saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
+        localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
 
     Raises:
-        ConfigError: ``passes`` is not 1 or 2, or 2 with ``live``.
+        ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
+            ``saved_map``.
         DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
+    from dudmap.calibration.depth_model import DepthModel
     from dudmap.slam import Slam
-    from dudmap.tracking.depth_distortion import DepthDistortion
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -91,10 +98,17 @@ def run(
         raise ConfigError(
             f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
         )
+    if saved_map is None and localize:
+        raise ConfigError("there is nothing to localize in; name the run folder of a saved map (--map)")
+    if saved_map is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     given_masks = None if masks is None else _open_masks(masks, sequence)
-    models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
+    model = None if depth_model is None else DepthModel.load(Path(depth_model))
     calibration = calibration or sequence.calibration
-    slam = Slam(sequence.camera, config, depth_model=models[0], calibration=calibration)
+    slam = Slam(
+        sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
+        localize=localize,
+    )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -107,9 +121,7 @@ def run(
             for number in range(passes):
                 if number > 0:
                     finished = slam, record
-                    slam = Slam(
-                        sequence.camera, config, first_pass=slam, depth_model=models[number], calibration=calibration
-                    )
+                    slam = Slam(sequence.camera, config, first_pass=slam, depth_model=model, calibration=calibration)
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
                 for observer in observers:
@@ -120,7 +132,7 @@ def run(
                     else in_order(sequence, count, ahead, given_masks, slam)
                 ) as frames:
                     for frame in frames:
-                        _process(
+                        process_source(
                             frame,
                             slam,
                             record,
@@ -178,14 +190,14 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
     return MaskFolder(folder, sequence.timestamps, sequence.camera)
 
 
-def _process(
+def process_source(
     source: SourceFrame,
     slam: "Slam",
     record: RunRecord,
     display: RunProgress,
     mask_folder: Path | None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None",
-    observers: "tuple[RunObserver, ...]",
+    observers: "tuple[RunObserver, ...]" = (),
 ) -> None:
     """Process one frame, count it, save its mask, and report it."""
     index, read = source.number, source.read
@@ -217,4 +229,6 @@ def _process(
         observe(index, read, result)
     for observer in observers:
         observer.frame(index, read, result, 1000 * (end - start))
+    if result.calibrated:
+        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

@@ -16,15 +16,18 @@ from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.sequences import is_recording
 
 if TYPE_CHECKING:
+    from dudmap.cameras import LiveCamera
     from dudmap.objects.object_map import RigidObject
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "report.html",
+    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz", "merge.json",
+    "report.html",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -61,7 +64,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
     Raises:
         DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
     """
-    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or (out.is_dir() and is_recording(out)):
         raise DudmapError(
             f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
         )
@@ -89,7 +92,7 @@ def write_run_folder(
     out: Path,
     slam: "Slam",
     record: RunRecord,
-    sequence: "Sequence",
+    sequence: "Sequence | LiveCamera",
     config: Config,
     stopped: str,
     *,
@@ -106,7 +109,6 @@ def write_run_folder(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
-    metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
     noise = slam.depth_noise.fitted()
     metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
     calibration = slam.calibration
@@ -135,17 +137,18 @@ def write_run_folder(
     if sequence.ground_truth is not None:
         truth = sequence.ground_truth
         steps.append(lambda: truth.save(out / "groundtruth.txt"))
-    if not volume.is_empty:
+    if not (volume.is_empty or slam.localize):
         steps.append(save_mesh)
         if save_map:
             steps.append(lambda: volume.save(out / "map.npz"))
+            steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
     for number, (path, part) in enumerate(others, start=2):
         steps += [
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
     if config.sensor.distortion:
-        model = slam.depth_distortion
+        model = slam.learnt_depth_model()
         metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
         steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:

@@ -3,18 +3,23 @@
 Submaps are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.place_recognition import KeyframeDatabase
+from dudmap.places.saved_map import SavedMap
+from dudmap.tracking.motion_model import VELOCITY_LIFETIME
 
 
 @dataclass(eq=False)
@@ -39,6 +44,8 @@ class Atlas:
         volumes: Maps by the numbers of their submaps.
         current: Number of the submap that is tracked.
         poses: Poses of all tracked frames, in order of time.
+        saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
+            submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
     """
 
     def __init__(
@@ -54,22 +61,76 @@ class Atlas:
         self.volumes = {number: make_volume()}
         self.current = number
         self.poses: list[TimedPose] = []
+        self.saved: int | None = None
+
+    def go_on_in(self, saved: SavedMap, camera: Camera) -> None:
+        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera."""
+        self.saved = self.current
+        self.volumes[self.current] = saved.volume.for_camera(camera)
+        self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
     def volume(self) -> TsdfVolume:
         """The map of the current submap."""
         return self.volumes[self.current]
 
-    def integrate(self, frame: Frame, static_mask: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> None:
-        """Fuse the static pixels (H, W) of a frame into the current map, and keep the frame for later corrections."""
-        self.volume.integrate(frame, T_world_camera, static_mask)
-        if self.history is not None:
-            self.history.add(frame, static_mask, T_world_camera, self.current)
+    def integrate(
+        self,
+        frame: Frame,
+        static_mask: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float] = (1.0, 0.0),
+        recorded: Frame | None = None,
+    ) -> None:
+        """Fuse the static pixels of a frame into the current map, and keep the frame for later corrections.
 
-    def clear_first_frame(self) -> None:
-        """Empty the current map, which holds a single frame."""
-        self.volume.clear()
+        Args:
+            frame: Depth and registered colour.
+            static_mask: (H, W) bool.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset to the colours of the map.
+            recorded: The frame with its colour as it was recorded, which is kept; None for the same.
+        """
+        color = exposed_color(frame.color, exposure)
+        self.volume.integrate(replace(frame, color=color), T_world_camera, static_mask)
         if self.history is not None:
+            self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
+
+    def recolor(self) -> None:
+        """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
+
+        A saved map keeps its colours: not all its frames are stored.
+        """
+        assert self.history is not None
+        for number, volume in self.volumes.items():
+            if number == self.saved:
+                continue
+            painted = self.make_volume()
+            self.history.reintegrate(painted, self.nodes(number))
+            volume.take_colors(painted)
+
+    def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
+        number = min(bisect_left(self.poses, timestamp, key=lambda pose: pose.timestamp), len(self.poses) - 1)
+        near = [
+            pose
+            for pose in self.poses[max(number - 1, 0) : number + 2]
+            if abs(pose.timestamp - timestamp) <= VELOCITY_LIFETIME and pose.submap == self.poses[number].submap
+        ]
+        if len(near) < 2:
+            return np.zeros(6)
+        motion = se3.log(se3.inverse(near[0].T_world_camera) @ near[-1].T_world_camera)
+        return motion / (near[-1].timestamp - near[0].timestamp)
+
+    def as_saved_map(self) -> SavedMap:
+        """The main map and its keyframes; how well frames fit it is left to the caller."""
+        main = self.by_size()[0]
+        return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
+
+    def clear_map(self) -> None:
+        """Empty the current map, which is the newest, and forget the frames stored of it."""
+        self.volume.clear()
+        while self.history is not None and self.history.submaps and self.history.submaps[-1] == self.current:
             self.history.drop_last()
 
     def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
@@ -82,8 +143,9 @@ class Atlas:
         self.volumes[self.current] = self.make_volume()
 
     def by_size(self) -> list[int]:
-        """Numbers of the submaps, those with more tracked frames first."""
-        return sorted(self.volumes, key=lambda number: -sum(pose.submap == number for pose in self.poses))
+        """Numbers of the submaps: the saved one, then those with more tracked frames first."""
+        sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
+        return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
 
     def trajectory(self, submap: int) -> Trajectory:
         """Trajectory of the frames tracked in a submap."""

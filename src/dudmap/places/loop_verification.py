@@ -9,6 +9,7 @@ from dudmap.config import Config
 from dudmap.frames.observation import Level, Observation
 from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree
+from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
 from dudmap.places.loop_correction import path_length
 from dudmap.places.place_recognition import PlaceMatch
@@ -75,12 +76,32 @@ class LoopVerifier:
     def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place.
 
+        A place in a saved map, whose frames are not stored, is verified against that map.
+
         Returns:
             None unless features, distances and intensities agree.
         """
-        history = self.atlas.history
+        limits = self.config.relocalization
+        local = self._local_map(place)
+        if local is None:
+            return None
+        exposure = query.tracking.exposure
+        found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
+        if (
+            found.converged
+            and not monitor.deviation(found, recognized=True)
+            and found.inlier_share >= limits.min_on_map
+            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
+        ):
+            return found.T_world_camera
+        return None
+
+    def _local_map(self, place: PlaceMatch) -> TsdfVolume | None:
+        """Map around a place at the time when it was last seen; None without stored frames of it."""
+        history, keyframe = self.atlas.history, place.keyframe
         assert history is not None
-        keyframe, limits = place.keyframe, self.config.relocalization
+        if keyframe.submap == self.atlas.saved:
+            return self.atlas.volumes[keyframe.submap]
         nodes = [
             n
             for n in self.atlas.nodes(keyframe.submap)
@@ -94,13 +115,4 @@ class LoopVerifier:
             return None
         local = self.atlas.make_volume()
         history.reintegrate(local, nearest)
-        exposure = query.tracking.exposure
-        found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
-        if (
-            found.converged
-            and not monitor.deviation(found, recognized=True)
-            and found.inlier_share >= limits.min_on_map
-            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
-        ):
-            return found.T_world_camera
-        return None
+        return local

@@ -1,5 +1,6 @@
 """Relocalization: the pose of a lost frame from recognised keyframes, and the decision to start a new submap."""
 
+from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -7,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.ego_motion import AGREED, dominant_motion
+from dudmap.dynamics.dominant_motion import AGREED, dominant_motion
+from dudmap.dynamics.ego_motion import LONGEST_BASELINE
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
@@ -52,12 +54,22 @@ class Relocalizer:
         self.prior_map = prior_map
         self._lost_since: float | None = None
         self._crowded = False  # most of the view moved in the last tracked frame
-        self._last: FrameView | None = None  # the last lost frame
+        self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
+        self._place_unknown = False
 
     @property
     def is_lost(self) -> bool:
         """Whether no frame has been tracked since the last call of ``lost``."""
         return self._lost_since is not None
+
+    def start_in_saved_map(self) -> None:
+        """Declare the camera's place in the current map unknown until a frame is recognised."""
+        self._place_unknown = True
+
+    @property
+    def reason(self) -> str:
+        """Sentence on why no registration from a predicted pose can be trusted, empty if one can."""
+        return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
 
     def lost(self, timestamp: float, *, crowded: bool = False) -> None:
         """Record a frame (timestamp in seconds) that was neither tracked nor relocalized.
@@ -71,7 +83,8 @@ class Relocalizer:
 
     def found(self) -> None:
         """Record that the camera is tracked again or that a new submap was started."""
-        self._lost_since, self._crowded, self._last = None, False, None
+        self._lost_since, self._crowded, self._place_unknown = None, False, False
+        self._recent.clear()
 
     def recover(
         self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
@@ -120,10 +133,15 @@ class Relocalizer:
         """Whether tracking should go on in a new, empty submap that starts with this lost frame.
 
         That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
-        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``.
+        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``. It
+        is compared with the last lost image, in which fast people are found again, and with one LONGEST_BASELINE older,
+        since when slow people have moved.
         """
         config, observation = self.config.submaps, view.observation
-        last, self._last = self._last, view
+        while len(self._recent) > 1 and observation.timestamp - self._recent[0].timestamp > LONGEST_BASELINE:
+            self._recent.popleft()
+        recent = list(self._recent)
+        self._recent.append(view)
         if not config.enabled or self.atlas.history is None or self._lost_since is None:
             return False
         if observation.timestamp - self._lost_since < config.patience:
@@ -132,10 +150,12 @@ class Relocalizer:
             return False
         if len(self.atlas.keyframes.extract(observation)) < self.config.relocalization.min_inliers:
             return False
-        return self._shows_static_world(last, view)
+        if len(recent) < 2:
+            return self._shows_static_world(recent[0] if recent else None, view)
+        return self._shows_static_world(recent[-1], view) and self._shows_static_world(recent[0], view)
 
-    def _shows_static_world(self, last: FrameView | None, view: FrameView) -> bool:
-        """Whether the motion from the last lost image to this one is certainly that of the camera.
+    def _shows_static_world(self, before: FrameView | None, view: FrameView) -> bool:
+        """Whether the motion from an earlier lost image to this one is certainly that of the camera.
 
         Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
         near; the static world may fill most of the surface, since it is far. A map is only begun where one motion does
@@ -146,8 +166,8 @@ class Relocalizer:
         if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
             return True
         motion = None
-        if last is not None:
-            motion = dominant_motion(last.pyramid, view.pyramid, (last.segmentation(), view.segmentation()))
+        if before is not None:
+            motion = dominant_motion(before.pyramid, view.pyramid, (before.segmentation(), view.segmentation()))
         if motion is None:
             return not self._crowded
         return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

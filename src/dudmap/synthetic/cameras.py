@@ -2,7 +2,8 @@
 
 Each is described as its driver delivers it: colour registered to depth, so that only what registration leaves over is a
 fault of place; add ``color_translation`` and the like for unregistered streams. "Assumed" marks what no publication
-was found for.
+was found for; "read" what was compared with the text of the source, "cited" what is quoted from a publication of which
+only the abstract could be read.
 """
 
 from dataclasses import dataclass
@@ -37,12 +38,14 @@ class CameraModel:
 
 
 CAMERAS: dict[str, CameraModel] = {
-    # View: 57 degrees (manufacturer). Noise: Khoshelham & Elberink 2012, Accuracy and resolution of Kinect depth data.
-    # Both shutters are rolling: Ringaby & Forssen 2011, Scan rectification for structured light range sensors with
-    # rolling shutters; the readout of 26 ms is assumed, and that of the depth is not simulated. Depth distortion:
-    # Teichman, Miller & Thrun 2013, Unsupervised intrinsic calibration of depth sensors via SLAM (accurate to 3 m, bent
-    # beyond); 1 % at 2 m is assumed. Colour and depth are not synchronised: any delay up to half an interval, 12 ms
-    # assumed. Bands, exposure, vignetting, and the rest of the registration assumed.
+    # View: 57 degrees (manufacturer, assumed). Noise: Khoshelham & Elberink 2012, Accuracy and resolution of Kinect
+    # depth data, read: "a few millimetres up to about 4 cm at the maximum range", which 1.425 mm z^2 (cited) gives at 5
+    # m. Both shutters are rolling: Ringaby & Forssen 2011, Scan rectification for structured light range sensors with
+    # rolling shutters, read; the readout of 26 ms is assumed, and that of the depth is not simulated. Depth distortion:
+    # Teichman, Miller & Thrun 2013, Unsupervised intrinsic calibration of depth sensors via SLAM, read: accurate to
+    # about three metres, significantly bent beyond, different from one sensor to the next; 1 % at 2 m is assumed.
+    # Colour and depth are not synchronised: any delay up to half an interval, 12 ms assumed. Bands, exposure,
+    # vignetting, and the rest of the registration assumed.
     "kinect_v1": CameraModel(
         "kinect",
         57.0,
@@ -60,9 +63,12 @@ CAMERAS: dict[str, CameraModel] = {
             dropped_frames=0.02,
         ),
     ),
-    # View: 70 degrees (manufacturer). Noise: Fankhauser et al. 2015. Offset of -18 mm, flying pixels and multi-path:
-    # Wasenmueller & Stricker 2016, Comparison of Kinect v1 and v2 depth images in terms of accuracy and precision; the
-    # shares are assumed, as are delay, readout, exposure and the rest of the registration.
+    # View: 70 degrees (manufacturer, assumed). Noise: Fankhauser et al. 2015, cited. Offset of -18 mm: Wasenmueller &
+    # Stricker 2016, Comparison of Kinect v1 and v2 depth images in terms of accuracy and precision, cited; that flying
+    # pixels and multi-path occur: there, read. Their shares are assumed, as are delay, readout, exposure and the rest
+    # of the registration. The Azure Kinect is another sensor: distance error below 11 mm and standard deviation at most
+    # 17 mm up to 3.5 m (Tolgyessy et al. 2021, Sensors 21, 413, read), so about as accurate to 3.5 m without the
+    # offset.
     "kinect_v2": CameraModel(
         "kinect_v2",
         70.0,
@@ -80,9 +86,10 @@ CAMERAS: dict[str, CameraModel] = {
             multipath=0.5,
         ),
     ),
-    # View: 75 degrees at 4:3, depth with a global and colour with a rolling shutter (Intel, D400 series datasheet,
-    # which allows an error of 2 % at 2 m: half of it is taken as scale, the rest as distortion). Noise:
-    # Grunnet-Jepsen et al. 2018. Delay, readout, exposure and the rest of the registration assumed.
+    # View: 75 degrees at 4:3 (of 85.2 degrees at 16:9, read, in a table of the D400 series), depth with a global
+    # shutter (there, read); colour with a rolling one, and an error of at most 2 % at 2 m: Intel, D400 series
+    # datasheet, cited; half of it is taken as scale, the rest as distortion. Noise: Grunnet-Jepsen et al. 2018, see
+    # sensors.py. Delay, readout, exposure and the rest of the registration assumed.
     "realsense_d435": CameraModel(
         "d435",
         75.0,
@@ -100,8 +107,9 @@ CAMERAS: dict[str, CameraModel] = {
             late_frames=0.02,
         ),
     ),
-    # View: 70 degrees, error 5 mm at 1 m to 14 mm at 9 m, noise: Intel, LiDAR Camera L515 datasheet 2021. The depth is
-    # scanned by a mirror during the frame, which is not simulated. The rest assumed.
+    # View: 70 x 55 degrees, range 0.25 to 9 m, error of about 5 mm to about 14 mm up to 9 m: Intel's comparison of its
+    # cameras, read. Noise: Intel, LiDAR Camera L515 datasheet, revision 003, January 2021, cited. The depth is scanned
+    # by a mirror during the frame, which is not simulated. The rest assumed.
     "realsense_l515": CameraModel(
         "l515",
         70.0,
@@ -120,9 +128,10 @@ CAMERAS: dict[str, CameraModel] = {
             late_frames=0.02,
         ),
     ),
-    # Depth of 256 x 192 pixels, registered and synchronous: Baruch et al. 2021, ARKitScenes. Error of about 1 cm:
-    # Luetzenburg, Kroon & Bjork 2021, Evaluation of the Apple iPhone 12 Pro LiDAR. View of the wide camera about 60
-    # degrees; JPEG as recording apps store it; readout, exposure and the division of the error assumed.
+    # Depth of 256 x 192 pixels: read in programs that read ARKit's and those of ARKitScenes (Baruch et al. 2021);
+    # registered and synchronous: cited from there. Error of about 1 cm: Luetzenburg, Kroon & Bjork 2021, Evaluation of
+    # the Apple iPhone 12 Pro LiDAR, cited. View of the wide camera about 60 degrees; JPEG as recording apps store it;
+    # readout, exposure and the division of the error assumed.
     "iphone_lidar": CameraModel(
         "iphone",
         60.0,

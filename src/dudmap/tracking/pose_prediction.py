@@ -7,7 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.dynamics.ego_motion import DominantMotion, EgoMotionSegmenter, exceeds_noise_share
+from dudmap.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
+from dudmap.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import is_majority_dynamic
 from dudmap.geometry import se3
@@ -29,7 +30,7 @@ class PosePrediction:
         T_world_camera: (4, 4).
         image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
         moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
-        moving_before: (h, w) bool, the same for the first image of a map made of that image alone; else None.
+        moving_before: (h, w) bool, the same for the first image of the map where it is compared with that; else None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
     """
 
@@ -82,7 +83,7 @@ class PosePredictor:
         moving = np.zeros(view.labelled.depth.shape, bool)
         for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
             moving = moving if mask is None else moving | mask
-        if not exceeds_noise_share(moving, view.labelled) or is_majority_dynamic(moving, view.labelled):
+        if not exceeds_noise_share(moving, view.labelled) or prediction.unverified_mask is not None:
             return ""
         return "something moves in view, and the map is too young to show what else does"
 
@@ -108,8 +109,11 @@ class PosePredictor:
             T_image = self._image_pose(motion)
             if motion is None or T_image is None:
                 return by_velocity
+            slow = self._slow_motion(view, T_image, motion.moving_after)
             if timestamp in self._known_poses:
                 T_image = T_expected
+            elif slow is not None:
+                T_image = slow.T_world_camera
             elif not self._single_frame_map and self.fits_better(
                 volume, T_expected, T_image, pyramid.coarse, previously_dynamic
             ):
@@ -117,8 +121,8 @@ class PosePredictor:
             moving_before = motion.moving_before if self._single_frame_map else None
             self._single_frame_map = False
             moving = motion.moving_after
-            if not exceeds_noise_share(moving, view.labelled):  # else the pose is too uncertain for slow motion
-                moving = moving | self.ego_motion.slow_movers(timestamp, T_image, pyramid, view.segmentation())
+            if slow is not None:
+                moving, moving_before = moving | slow.moving, slow.moving_first
             young = self.ego_motion.map_is_young(timestamp)
             self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
             unverified = ~motion.static_after if self._crowded_start else None
@@ -136,6 +140,24 @@ class PosePredictor:
         dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
         T = estimate.T_world_camera
         self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+
+    def _slow_motion(
+        self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
+    ) -> SlowMotion | None:
+        """Comparison with an older image, where that shows more to move than the last one does.
+
+        Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
+        most of the view is seen to move anyway, few corners would be found again after a longer time.
+
+        Args:
+            view: The frame.
+            T_world_camera: (4, 4) its pose by the last image.
+            moving: (h, w) bool, what moves by the last image.
+        """
+        if is_majority_dynamic(moving, view.labelled):
+            return None
+        slow = self.ego_motion.slow_motion(view.timestamp, T_world_camera, view.pyramid, view.segmentation())
+        return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
 
     def _ego_motion(self, view: FrameView) -> DominantMotion | None:
         """Motion of the static world from the previous image to this one."""

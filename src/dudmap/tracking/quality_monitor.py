@@ -1,6 +1,7 @@
 """Acceptance of a registration: absolute checks, and comparison with the registrations before it."""
 
 from collections import deque
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,6 +25,21 @@ UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
 """Multiples of the median residuals from which on a registration is repeated from another initial pose."""
 MIN_VERIFIED_SHARE = 0.09
 """Share of the readings that must be static and lie on the map where most of the view is dynamic."""
+
+
+@dataclass(frozen=True)
+class RegistrationHistory:
+    """Residuals of the last accepted registrations, oldest first.
+
+    Attributes:
+        residuals: Root mean square distances to the map, metres.
+        shares: Shares of the static readings on the map.
+        colors: Root mean square intensity differences (0..1).
+    """
+
+    residuals: tuple[float, ...] = ()
+    shares: tuple[float, ...] = ()
+    colors: tuple[float, ...] = ()
 
 
 class QualityMonitor:
@@ -51,6 +67,17 @@ class QualityMonitor:
         self._colors: deque[float] = deque(maxlen=HISTORY)
         self.recovering = False
         self.images.reset()
+
+    @property
+    def history(self) -> RegistrationHistory:
+        """The registrations that new ones are compared with."""
+        return RegistrationHistory(tuple(self._residuals), tuple(self._shares), tuple(self._colors))
+
+    def restore(self, history: RegistrationHistory) -> None:
+        """Compare new registrations with those of an earlier run in the same map."""
+        self._residuals.extend(history.residuals)
+        self._shares.extend(history.shares)
+        self._colors.extend(history.colors)
 
     def rejection_reason(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> str:
         """Sentence on the first check that a registered frame fails, empty if it passes all.

@@ -60,7 +60,7 @@ class LiveView(RunObserver):
         self._thread = threading.Thread(target=self._show, name="dudmap-view", daemon=True)
         self._thread.start()
 
-    def start(self, slam: "Slam", out: Path, count: int) -> None:
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """Begin with an empty page."""
         self._slam = slam
         none = np.zeros(0, dtype=np.int32)

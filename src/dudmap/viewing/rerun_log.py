@@ -66,7 +66,7 @@ class RerunLog(RunObserver):
         self._parts: set[str] = set()
         self._start: float | None = None
 
-    def start(self, slam: "Slam", out: Path, count: int) -> None:
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """Follow this system; what an earlier pass left is overwritten frame by frame."""
         self._slam, self._feed = slam, MeshFeed(BUDGET_MS)
 

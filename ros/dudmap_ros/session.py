@@ -1,0 +1,149 @@
+"""A mapping session on ROS messages, without ROS: what the node does with a pair of images, and its services."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from dudmap.config import Config, keys
+from dudmap.errors import ConfigError, DatasetError, MapError
+from dudmap.exporting import ros_messages as ros
+from dudmap.frames.frame import Frame
+from dudmap.geometry.mesh import Mesh
+from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+from dudmap.result import FrameResult
+from dudmap.slam import Slam
+
+
+def default_parameters() -> dict[str, Any]:
+    """All configuration keys with their default values, tuples as lists."""
+    tree = Config().model_dump()
+    out: dict[str, Any] = {}
+    for key in keys():
+        part, _, name = key.partition(".")
+        value = tree[part][name] if name else tree[part]
+        out[key] = list(value) if isinstance(value, tuple) else value
+    return out
+
+
+def config_of(values: Mapping[str, Any]) -> Config:
+    """Configuration of dotted keys; those that have the default value leave the choice to the preset.
+
+    Raises:
+        ConfigError: A value is invalid.
+    """
+    defaults, tree = default_parameters(), {}
+    for key, value in values.items():
+        value = list(value) if isinstance(defaults[key], list) else value
+        if value != defaults[key]:
+            part, _, name = key.partition(".")
+            if name:
+                tree.setdefault(part, {})[name] = value
+            else:
+                tree[part] = value
+    return Config.from_tree(tree)
+
+
+class Session:
+    """One map that grows with every pair of images.
+
+    Args:
+        config: All parameters.
+        saved_map: Run folder to go on in, None for a new map.
+        localize: Only find the camera in the saved map.
+
+    Attributes:
+        slam: The system; None before the first pair.
+        processed, stale: Pairs that were processed, and pairs older than the one before, which were dropped.
+
+    Raises:
+        ConfigError: ``localize`` without a saved map.
+    """
+
+    def __init__(self, config: Config, saved_map: str | None = None, localize: bool = False) -> None:
+        if localize and saved_map is None:
+            raise ConfigError("there is nothing to localise in; set the parameter saved_map to a run folder")
+        self.config = config
+        self.saved_map = saved_map
+        self.localize = localize
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the map; a saved map is loaded anew with the next pair, without one mapping begins again."""
+        self.localize = self.localize and self.saved_map is not None
+        self.slam: Slam | None = None
+        self.processed = self.stale = 0
+        self._last = float("-inf")
+
+    def set_localize(self, localize: bool) -> None:
+        """Stop, or go on with, changing the map.
+
+        Raises:
+            MapError: There is no map to localise in.
+        """
+        if localize and self.saved_map is None and (self.slam is None or self.slam.volume.is_empty):
+            raise MapError("there is no map to localise in; map first, or set the parameter saved_map")
+        self.localize = localize
+        if self.slam is not None:
+            self.slam.localize = localize
+
+    def process(self, depth: Any, color: Any, info: Any) -> FrameResult | None:  # noqa: ANN401
+        """Process a depth image registered to colour, a colour image and the camera_info of both.
+
+        Returns:
+            None for a pair that is not newer than the last one.
+
+        Raises:
+            DatasetError: An encoding is unknown, the camera is not calibrated, or the images differ in size.
+        """
+        stamp = ros.seconds_of(depth)
+        if stamp <= self._last:
+            self.stale += 1
+            return None
+        frame = Frame(stamp, ros.depth_of(depth), ros.color_of(color))
+        if frame.depth.shape != frame.color.shape[:2]:
+            sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (frame.depth, frame.color)]
+            raise DatasetError(
+                f"depth is {sizes[0]} and colour {sizes[1]}; subscribe to the depth that the driver aligns to colour"
+            )
+        if self.slam is None:
+            self.slam = self._started(info)
+        self._last = stamp
+        self.processed += 1
+        return self.slam.process(frame)
+
+    def mesh(self) -> Mesh | None:
+        """Static surface of the main map, None before there is one."""
+        if self.slam is None:
+            return None
+        volume = self.slam.maps[0][1]
+        return None if volume.is_empty else volume.extract_mesh()
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the map as a run folder: trajectory.txt, mesh.ply, map.npz, keyframes.npz, config.toml.
+
+        Raises:
+            MapError: There is no map yet, or a file cannot be written.
+        """
+        mesh, folder = self.mesh(), Path(folder)
+        if self.slam is None or mesh is None:
+            raise MapError("there is no map to save yet")
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            trajectory, volume = self.slam.maps[0]
+            trajectory.save(folder / "trajectory.txt")
+            self.config.save(folder / "config.toml")
+            mesh.save(folder / "mesh.ply")
+            volume.save(folder / MAP_FILE)
+            self.slam.saved_map.save_keyframes(folder / KEYFRAME_FILE)
+        except OSError as error:
+            raise MapError(f"cannot write into {folder}: {error.strerror or error}") from error
+        return folder
+
+    def _started(self, info: Any) -> Slam:  # noqa: ANN401
+        camera = ros.camera_of(info)
+        if self.saved_map is None:
+            return Slam(camera, self.config)
+        saved = SavedMap.load(self.saved_map, self.config.volume.voxel_size)
+        slam = Slam(camera, self.config, saved_map=saved)
+        slam.localize = self.localize
+        return slam

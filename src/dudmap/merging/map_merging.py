@@ -1,0 +1,108 @@
+"""Joining two saved maps: relative pose, refinement, checks, fusion."""
+
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.geometry import se3
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.merging.agreement import Agreement, agreement
+from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
+from dudmap.merging.map_samples import SurfacePoints, surface_points
+from dudmap.merging.relative_pose import Hypothesis, relative_poses
+from dudmap.merging.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
+from dudmap.places.saved_map import SavedMap
+
+SURFACE_POINTS = 20_000
+"""Points of each map's surface that the alignment and the checks use."""
+MIN_KEYFRAMES, MIN_FEATURES = 2, 40
+"""Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
+features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
+MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
+"""Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
+degrees: that of a relocalised frame (``relocalization.max_distance``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapPair:
+    """What was found about two maps.
+
+    Attributes:
+        T_a_b: (4, 4) world of b to world of a, None if they are not to be joined.
+        reason: Sentence on why not; empty if they are.
+        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one that was tried.
+    """
+
+    T_a_b: NDArray[np.float64] | None
+    reason: str
+    hypothesis: Hypothesis | None = None
+    alignment: SdfAlignment | None = None
+    agreement: Agreement | None = None
+
+    def tree(self) -> dict[str, Any]:
+        """The figures, for a JSON file."""
+        out: dict[str, Any] = {"reason": self.reason or None}
+        if self.T_a_b is not None:
+            out["T_a_b"] = self.T_a_b.tolist()
+        if self.hypothesis is not None:
+            out |= {"keyframes": self.hypothesis.num_keyframes, "features": self.hypothesis.num_inliers}
+        if self.alignment is not None:
+            out |= {"residual_m": round(self.alignment.residual, 6), "stiffness": round(self.alignment.stiffness, 6)}
+        if self.agreement is not None:
+            out |= {key: round(value, 4) for key, value in asdict(self.agreement).items()}
+        return out
+
+
+def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
+    """Find the relative pose of two maps and decide whether they show the same place.
+
+    Relative poses that the features suggest are refined and checked one after the other; the first that passes all
+    checks is taken.
+
+    Raises:
+        ConfigError: The voxels differ in size.
+        MapError: A map has no surface.
+    """
+    check_voxel_sizes([a.volume, b.volume])
+    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
+    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    if not found:
+        return MapPair(None, "too few places of one were recognised in the other at the same relative pose")
+    of_a, of_b = (surface_points(saved.volume, _positions(saved), SURFACE_POINTS) for saved in (a, b))
+    first = MapPair(None, "")
+    for hypothesis in found:
+        pair = _checked(a.volume, b.volume, of_a, of_b, hypothesis)
+        if pair.T_a_b is not None:
+            return pair
+        first = first if first.reason else pair
+    return first
+
+
+def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
+    """Fuse two maps into one in the world of a, with the keyframes of both."""
+    moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
+    return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
+
+
+def _positions(saved: SavedMap) -> NDArray[np.float64]:
+    """Positions (k, 3) of the keyframes."""
+    return np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
+
+
+def _checked(a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, hypothesis: Hypothesis) -> MapPair:
+    """Refine a relative pose and check what follows from it."""
+    aligned = align_maps(a, b, of_a, of_b, hypothesis.T_a_b)
+    if not aligned.converged:
+        return MapPair(None, "their surfaces do not settle on each other", hypothesis, aligned)
+    if aligned.stiffness < MIN_STIFFNESS:
+        return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
+    correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b
+    middle = of_b.points.mean(axis=0)
+    moved = np.linalg.norm(correction[:3, :3] @ middle + correction[:3, 3] - middle)
+    if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
+        return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
+    checked = agreement(a, b, of_a, of_b, aligned.T_a_b)
+    reason = checked.rejection_reason()
+    return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

@@ -1,0 +1,78 @@
+"""Merging of run folders: two saved maps of one place become one run folder."""
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap.errors import DudmapError, MapError
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
+from dudmap.pipeline.run_folder import prepare_run_folder
+from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+
+MERGE_FILE = "merge.json"
+
+
+@dataclass(frozen=True, eq=False)
+class MergeReport:
+    """Result of a merge.
+
+    Attributes:
+        out: The new run folder.
+        pair: What was found about the two maps.
+        tree: Content of merge.json.
+    """
+
+    out: Path
+    pair: MapPair
+    tree: dict[str, Any]
+
+
+def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
+    """Join the maps of two run folders into a new run folder, in the world frame of the first.
+
+    The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
+    runs in the common world frame (trajectory.txt, trajectory-2.txt, ...) and merge.json: the runs, the relative pose
+    and the figures of all checks. Nothing is written if the maps are not to be joined.
+
+    Raises:
+        MapError: A map is incomplete, or the maps are not to be joined; the message says why.
+        ConfigError: The voxels differ in size.
+        DudmapError: ``out`` is one of the runs or cannot be written.
+    """
+    a, b, out = Path(a), Path(b), Path(out)
+    if out.resolve() in (a.resolve(), b.resolve()):
+        raise DudmapError(f"{out} is one of the runs to be merged; name another folder")
+    maps = SavedMap.load(a), SavedMap.load(b)
+    pair = compare_maps(*maps)
+    if pair.T_a_b is None:
+        raise MapError(f"{a} and {b} are not merged: {pair.reason}")
+    merged = merged_map(*maps, pair.T_a_b)
+    trajectories = [*_trajectories(a, np.eye(4)), *_trajectories(b, pair.T_a_b)]
+    prepare_run_folder(out, None, save_masks=False)
+    names = ["trajectory.txt", *(f"trajectory-{number}.txt" for number in range(2, len(trajectories) + 1))]
+    for name, trajectory in zip(names, trajectories, strict=True):
+        trajectory.save(out / name)
+    merged.volume.save(out / MAP_FILE)
+    merged.save_keyframes(out / KEYFRAME_FILE)
+    mesh = merged.volume.extract_mesh()
+    mesh.save(out / "mesh.ply")
+    if (a / "config.toml").is_file():
+        (out / "config.toml").write_bytes((a / "config.toml").read_bytes())
+    tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
+    tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
+    tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
+    (out / MERGE_FILE).write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    return MergeReport(out, pair, tree)
+
+
+def _trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
+    """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several."""
+    names = ["trajectory.txt"]
+    if (folder / MERGE_FILE).is_file():
+        names = json.loads((folder / MERGE_FILE).read_text(encoding="utf-8"))["trajectories"]
+    found = [Trajectory.load(folder / name) for name in names]
+    return [Trajectory(one.timestamps, T @ one.Ts_world_camera) for one in found]

@@ -1,0 +1,196 @@
+"""Merging of maps: samples against an analytic distance, exact sums, relative poses of rendered rooms, refusals."""
+
+import json
+
+import numpy as np
+import pytest
+
+from dudmap.config import Config, VolumeConfig
+from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.merging.block_sums import block_sums, fused
+from dudmap.merging.map_fusion import fuse_maps
+from dudmap.merging.map_merging import compare_maps
+from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
+from dudmap.pipeline.merge import merge_runs
+from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
+
+SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)
+WALL = 1.5
+
+
+def wall(distance=WALL, grey=100, config=None, poses=None):
+    """Volume of a wall z = distance, seen from several poses that only shift along x and y."""
+    volume = TsdfVolume(SMALL, config or VolumeConfig(voxel_size=0.02))
+    depth = np.full(SMALL.shape, distance, np.float32)
+    color = np.full((*SMALL.shape, 3), grey, np.uint8)
+    for T in poses or [np.eye(4)]:
+        for _ in range(6):
+            volume.integrate(Frame(0.0, depth, color), T)
+    return volume
+
+
+def shifted(x=0.0, y=0.0, z=0.0):
+    T = np.eye(4)
+    T[:3, 3] = x, y, z
+    return T
+
+
+def test_samples_are_the_distance_to_the_wall():
+    volume = wall()
+    points = np.array([[0.1, -0.05, WALL + d] for d in (-0.05, -0.013, 0.0, 0.007, 0.03)])
+    samples = sample_map(volume, points)
+    assert (samples.state == OBSERVED).all()
+    np.testing.assert_allclose(samples.sdf, WALL - points[:, 2], atol=2e-3)
+    np.testing.assert_allclose(samples.sdf_gradient[1:4], np.tile([0, 0, -1], (3, 1)), atol=0.08)
+    np.testing.assert_allclose(samples.color[2], 100, atol=1)
+    np.testing.assert_allclose(samples.intensity[2], 100 / 255, atol=0.01)
+    far = sample_map(volume, np.array([[0.0, 0.0, 0.7], [0.0, 0.0, 3.0]]))
+    assert list(far.state) == [EMPTY, 0]
+
+
+def words(volume):
+    """Content of a map by block."""
+    blocks = volume.blocks
+    order = np.lexsort(blocks.coords[: blocks.num_entries].T)
+    slots = blocks.slot_of[: blocks.num_entries][order]
+    geometry = np.where((slots >= 0)[:, None], blocks.geometry[np.maximum(slots, 0)], 0)
+    colors = np.where((slots >= 0)[:, None], blocks.colors[np.maximum(slots, 0)], 0)
+    return blocks.coords[: blocks.num_entries][order], blocks.free_count[: blocks.num_entries][order], geometry, colors
+
+
+def test_any_order_and_grouping_of_the_sums_gives_the_same_voxels():
+    rng = np.random.default_rng(0)
+    volumes = [wall(1.5 + 0.004 * k, grey=60 + 20 * k, poses=[shifted(*rng.uniform(-0.4, 0.4, 2))]) for k in range(5)]
+    coords = np.unique(np.concatenate([v.blocks.coords[: v.blocks.num_entries] for v in volumes]), axis=0)
+    Ts = [None, se3.exp(np.array([0.01, 0, 0, 0, 0.02, 0])), None, None, se3.exp(np.array([0, 0.02, 0, 0.01, 0, 0]))]
+    unit = volumes[0].sdf_unit
+    sums = [block_sums(v, coords.astype(np.int32), T, unit) for v, T in zip(volumes, Ts, strict=True)]
+    expected = fused(((sums[0] + sums[1]) + (sums[2] + sums[3])) + sums[4], 1000, 4, 4)
+    for order in ([4, 3, 2, 1, 0], [2, 0, 4, 1, 3]):
+        total = sums[order[0]]
+        for number in order[1:]:
+            total = sums[number] + total
+        found = fused(total, 1000, 4, 4)
+        for name in ("geometry", "colors", "has_voxels", "free_count"):
+            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+
+
+def test_a_map_fused_alone_stays_as_it_is_and_orders_do_not_matter():
+    a, b = wall(1.5, 80), wall(1.52, 120, poses=[shifted(0.3)])
+    alone = fuse_maps([a], [np.eye(4)])
+    for found, expected in zip(words(alone), words(a), strict=True):
+        np.testing.assert_array_equal(found, expected)
+    for found, expected in zip(
+        words(fuse_maps([a, b], [np.eye(4)] * 2)), words(fuse_maps([b, a], [np.eye(4)] * 2)), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
+def test_the_fused_wall_is_the_weighted_mean():
+    a, b = wall(1.50), wall(1.51)
+    merged = fuse_maps([a, b], [np.eye(4), np.eye(4)])
+    point = np.array([[0.0, 0.0, 1.5]])
+    in_a, in_b, in_both = (sample_map(volume, point) for volume in (a, b, merged))
+    mean = (in_a.sdf * in_a.weight + in_b.sdf * in_b.weight) / (in_a.weight + in_b.weight)
+    np.testing.assert_allclose(in_both.sdf, mean, atol=1e-3)
+    np.testing.assert_allclose(in_both.weight, in_a.weight + in_b.weight)
+
+
+def test_a_moved_map_lies_where_its_pose_says():
+    T = se3.exp(np.array([0.05, -0.02, 0.1, 0.03, 0.05, -0.04]))
+    moved = fuse_maps([wall(9.9), wall()], [np.eye(4), T])  # the first sees nothing within range
+    local = np.array([[x, y, WALL + d] for x in (-0.3, 0.2) for y in (-0.2, 0.1) for d in (-0.02, 0.0, 0.02)])
+    samples = sample_map(moved, local @ T[:3, :3].T + T[:3, 3])
+    assert (samples.state == OBSERVED).all()
+    np.testing.assert_allclose(samples.sdf, WALL - local[:, 2], atol=3e-3)
+
+
+def test_what_stood_in_one_run_and_was_gone_in_the_other_leaves_the_map():
+    config = VolumeConfig(voxel_size=0.02)
+    ghost, empty = wall(1.0, config=config), wall(2.0, config=config, poses=[np.eye(4)] * 6)
+    assert sample_map(ghost, np.array([[0.0, 0.0, 1.0]])).state[0] == OBSERVED
+    merged = fuse_maps([ghost, empty], [np.eye(4), np.eye(4)])
+    behind = sample_map(merged, np.array([[0.0, 0.0, 1.0], [0.0, 0.0, 1.01], [0.0, 0.0, 2.0]]))
+    assert (behind.sdf[:2] > 0.02).all()
+    np.testing.assert_allclose(behind.sdf[2], 0, atol=2e-3)
+
+
+def test_other_voxel_sizes_are_refused():
+    with pytest.raises(ConfigError, match=r"voxels of 0\.02 and 0\.05 m cannot be merged"):
+        fuse_maps([wall(), wall(config=VolumeConfig(voxel_size=0.05))], [np.eye(4)] * 2)
+
+
+@pytest.fixture(scope="module")
+def room():
+    return true_map(record("room", 1))
+
+
+def test_two_maps_of_one_room_are_joined_at_the_true_pose(room):
+    other = true_map(record("room", 3, "handheld"))
+    pair = compare_maps(room.saved, other.saved)
+    assert pair.reason == ""
+    error = se3.inverse(room.T_world_other(other)) @ pair.T_a_b
+    assert np.linalg.norm(error[:3, 3]) < 0.01
+    assert np.degrees(se3.rotation_angle(error)) < 0.2
+    swapped = compare_maps(other.saved, room.saved)
+    back = swapped.T_a_b @ pair.T_a_b
+    assert np.linalg.norm(back[:3, 3]) < 0.005
+
+
+@pytest.mark.parametrize(
+    ("change", "reason"),
+    [
+        (looking_elsewhere, "too few places"),
+        (retextured, "too few places|the colours disagree"),
+        (lambda scene: retextured(scene, walls=False), "too few places|the colours disagree"),
+        (rearranged, "too few places|free space|the colours disagree"),
+    ],
+    ids=["elsewhere", "other textures", "other things", "rearranged"],
+)
+def test_look_alikes_are_refused(room, change, reason):
+    pair = compare_maps(room.saved, true_map(record("room", 2, change=change)).saved)
+    assert pair.T_a_b is None
+    assert any(part in pair.reason for part in reason.split("|"))
+
+
+def run_folder(folder, found, times):
+    folder.mkdir()
+    found.saved.volume.save(folder / MAP_FILE)
+    found.saved.save_keyframes(folder / KEYFRAME_FILE)
+    Config().save(folder / "config.toml")
+    Trajectory(np.array(times), np.tile(np.eye(4), (len(times), 1, 1))).save(folder / "trajectory.txt")
+    return folder
+
+
+def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path):
+    other, third = true_map(record("room", 3, "handheld")), true_map(record("room", 5))
+    a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", other, [0.0, 1.0, 2.0])
+    report = merge_runs(a, b, tmp_path / "ab")
+    assert sorted(path.name for path in report.out.iterdir()) == [
+        "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "trajectory-2.txt", "trajectory.txt",
+    ]  # fmt: skip
+    tree = json.loads((report.out / "merge.json").read_text())
+    assert tree == report.tree
+    np.testing.assert_allclose(
+        Trajectory.load(report.out / "trajectory-2.txt").Ts_world_camera[1], report.pair.T_a_b, atol=1e-6
+    )
+    merged = SavedMap.load(report.out)
+    assert len(merged.keyframes) == len(room.saved.keyframes) + len(other.saved.keyframes)
+    again = merge_runs(report.out, run_folder(tmp_path / "c", third, [5.0]), tmp_path / "abc")
+    assert again.tree["trajectories"] == ["trajectory.txt", "trajectory-2.txt", "trajectory-3.txt"]
+    with pytest.raises(DudmapError, match="is one of the runs to be merged"):
+        merge_runs(a, b, a)
+
+
+def test_a_refused_merge_says_why_and_writes_nothing(room, tmp_path):
+    desk = true_map(record("desk", 1, "handheld", frames=30))
+    a, b = run_folder(tmp_path / "a", room, [0.0]), run_folder(tmp_path / "b", desk, [0.0])
+    with pytest.raises(MapError, match="are not merged: too few places of one were recognised in the other"):
+        merge_runs(a, b, tmp_path / "ab")
+    assert not (tmp_path / "ab").exists()
