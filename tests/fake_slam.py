@@ -36,7 +36,9 @@ class FakeResult:
     calibrated: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
+    residuals: np.ndarray = field(default_factory=lambda: np.full((HEIGHT // 2, WIDTH // 2), 0.01, np.float32))
     labels: None = None
+    tracking: None = None
     movers: tuple = ()
     timings: dict = field(default_factory=lambda: {"track": 2.0})
 

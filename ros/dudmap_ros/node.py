@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import rclpy
+from dudmap.exporting.mesh_simplification import simplified
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from nav_msgs.msg import Odometry, Path
 from rclpy.executors import ExternalShutdownException
@@ -18,7 +19,6 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from dudmap.errors import DudmapError
 from dudmap.exporting import ros_messages as ros
-from dudmap.exporting.mesh_simplification import simplified
 from dudmap_ros.session import Session, config_of, default_parameters
 
 SETTINGS = {

@@ -11,9 +11,9 @@ from rosbags.typesys import Stores, get_typestore
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting import ros_messages as ros
 from dudmap.exporting.exporters import EXPORTERS, export_run
-from dudmap.exporting.mesh_simplification import simplified
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.mesh_simplification import simplified
 from dudmap.geometry.trajectory import Trajectory
 
 

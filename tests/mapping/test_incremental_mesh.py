@@ -6,6 +6,7 @@ import pytest
 from dudmap.geometry import se3
 from dudmap.mapping.incremental_mesh import EDGE, IncrementalMesh
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.mapping.volume_mirror import VolumeMirror
 from wavy_wall import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1})
@@ -134,5 +135,56 @@ def test_a_map_made_anew_is_meshed_anew(volume):
     assert not live.chunks
     for angle in (-60, -60, -60):
         volume.integrate(wall(1.5), turned(angle))
+    live.update()
+    assert_equal(live, volume)
+
+
+# -- the copy for another thread --------------------------------------------------------------------------------------
+
+
+def test_a_mirror_follows_a_growing_volume(volume):
+    mirror = VolumeMirror(volume)
+    live = IncrementalMesh(mirror.volume)
+    for number, angle in enumerate((0, 3, -40, 40, 120)):
+        volume.integrate(wall(1.5 + 0.02 * number, number), turned(angle))
+        if number % 2 == 0:
+            mirror.update()
+            live.update()
+            assert_equal(live, volume)
+
+
+def test_a_mirror_that_copies_a_few_blocks_at_a_time_catches_up(volume):
+    mirror = VolumeMirror(volume)
+    live = IncrementalMesh(mirror.volume)
+    for number, angle in enumerate((0, 5, 90, 180)):
+        volume.integrate(wall(1.5 + 0.02 * number, number), turned(angle))
+        mirror.update(limit=40)
+        live.update()
+    assert len(live.mesh().faces) < len(volume.extract_mesh().faces)
+    for _ in range(volume.num_blocks // 40 + 1):
+        mirror.update(limit=40)
+        live.update()
+    assert_equal(live, volume)
+
+
+def test_a_mirror_does_not_change_by_itself(volume):
+    mirror = VolumeMirror(volume)
+    volume.integrate(wall(1.5), turned(0))
+    mirror.update()
+    before = triangles(mirror.volume.extract_mesh())
+    volume.integrate(wall(1.3, 1), turned(30))
+    np.testing.assert_array_equal(triangles(mirror.volume.extract_mesh()), before)
+
+
+def test_a_mirror_follows_a_volume_that_was_cleared(volume):
+    mirror = VolumeMirror(volume)
+    live = IncrementalMesh(mirror.volume)
+    for number in range(3):
+        volume.integrate(wall(1.5, number), turned(0))
+    mirror.update()
+    live.update()
+    volume.clear()
+    volume.integrate(wall(1.2), turned(90))
+    mirror.update()
     live.update()
     assert_equal(live, volume)

@@ -16,6 +16,8 @@ from dudmap.errors import DudmapError
 
 COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
+    "view": "Show a run folder in the browser.",
+    "report": "Write one page on a run that opens offline.",
     "merge": "Join the maps of two runs of one place.",
     "export": "Write the results of a run for another program.",
     "live": "Run on a camera, or on a recording as if it were one.",

@@ -5,7 +5,20 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.run import JsonOption, QuietOption, SetOption, free_folder, print_report, read_config
+from dudmap.cli.run import (
+    HostOption,
+    JsonOption,
+    PortOption,
+    QuietOption,
+    ReportOption,
+    RerunOption,
+    SetOption,
+    ViewOption,
+    free_folder,
+    print_report,
+    read_config,
+)
+from dudmap.cli.view import observers
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
@@ -25,6 +38,11 @@ def demo(
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/demo.")] = None,
     frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames.")] = 120,
     assignments: SetOption = None,
+    report: ReportOption = True,
+    view: ViewOption = False,
+    host: HostOption = "127.0.0.1",
+    port: PortOption = 8080,
+    rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -40,9 +58,13 @@ def demo(
     recording = sequence(scene="room", movers=("person",), frames=frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
-    report = run(recording, config, out, save_masks=True, progress=not quiet, ahead=0, observe=keeper.observe)
-    keeper.save_picture(out, recording.camera)
-    print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
+    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+        done = run(
+            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observe=keeper.observe,
+            observers=watching,
+        )  # fmt: skip
+        keeper.save_picture(out, recording.camera)
+        print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
 class MostDynamicFrame:

@@ -7,14 +7,20 @@ import typer
 
 from dudmap.cli.run import (
     ConfigOption,
+    HostOption,
     JsonOption,
+    PortOption,
     PresetOption,
     QuietOption,
+    ReportOption,
+    RerunOption,
     SetOption,
+    ViewOption,
     free_folder,
     print_report,
     read_config,
 )
+from dudmap.cli.view import observers
 
 app = typer.Typer(add_completion=False)
 
@@ -43,6 +49,11 @@ def live(
     ] = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
+    report: ReportOption = True,
+    view: ViewOption = False,
+    host: HostOption = "127.0.0.1",
+    port: PortOption = 8080,
+    rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -57,8 +68,10 @@ def live(
     parameters = read_config(config, preset, assignments or [])
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
-    report = run_live(
-        source, parameters, out or free_folder(Path("runs") / source.name),
-        max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,
-    )  # fmt: skip
-    print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
+    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+        done = run_live(
+            source, parameters, out or free_folder(Path("runs") / source.name),
+            max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,
+            observers=watching,
+        )  # fmt: skip
+        print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.view import observers
 from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -39,6 +40,18 @@ SetOption = Annotated[
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
+ReportOption = Annotated[
+    bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
+]
+ViewOption = Annotated[bool, typer.Option("--view", help="Show the run in the browser while it goes on (extra view).")]
+HostOption = Annotated[
+    str, typer.Option("--host", help="Address the page of --view is served at; 0.0.0.0 lets other machines see it.")
+]
+PortOption = Annotated[int, typer.Option("--port", help="Port of the page of --view.", min=1, max=65535)]
+RerunOption = Annotated[
+    Path | None,
+    typer.Option("--rerun", help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd"),
+]
 
 
 @app.command()
@@ -80,14 +93,19 @@ def run(
     localize: Annotated[
         bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False,
+    report: ReportOption = True,
+    view: ViewOption = False,
+    host: HostOption = "127.0.0.1",
+    port: PortOption = 8080,
+    rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene from a recording.
 
-    Writes trajectory.txt, mesh.ply, map.npz, keyframes.npz, config.toml, metrics.json and timings.csv into the run
-    folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid moving
-    object.
+    Writes trajectory.txt, mesh.ply, map.npz, keyframes.npz, config.toml, metrics.json, timings.csv and report.html
+    into the run folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid
+    moving object.
     """
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.inspection import inspect
@@ -110,12 +128,13 @@ def run(
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto":
         parameters = parameters.override(["sensor.self_calibration=false"])
-    report = run_sequence(
-        recording, parameters, out,
-        max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-        depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
-    )  # fmt: skip
-    print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)
+    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+        done = run_sequence(
+            recording, parameters, out,
+            max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
+            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
+        )  # fmt: skip
+        print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
 def _print_notice(text: str) -> None:

@@ -72,10 +72,17 @@ def plot_rpe(path: Path, result: RpeResult) -> None:
 
 
 def plot_residuals(path: Path, residuals: Path) -> None:
+    """Plot of the registration residuals as a PNG file; see ``draw_residuals``."""
+    figure, (axes,) = _figure(1)
+    draw_residuals(axes, residuals)
+    _save(figure, path)
+
+
+def draw_residuals(axes: "Axes", residuals: Path) -> None:
     """Histogram of the registration residuals with the fitted mixture.
 
     Args:
-        path: The PNG file.
+        axes: Where to draw.
         residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the reading and ``counts``
             (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,), ``sigma`` (2,).
 
@@ -87,7 +94,6 @@ def plot_residuals(path: Path, residuals: Path) -> None:
             edges, counts, prior, sigma = (data[key].astype(float) for key in ("edges", "counts", "prior", "sigma"))
     except (OSError, ValueError, KeyError) as error:
         raise DatasetError(f"{residuals} does not hold edges, counts, prior and sigma of residuals: {error}") from error
-    figure, (axes,) = _figure(1)
     widths, r = np.diff(edges), np.linspace(edges[0], edges[-1], 600)
     axes.bar(
         edges[:-1], counts / max(counts.sum(), 1) / widths, widths, align="edge", color="#b9c4d0", label="residuals"
@@ -102,7 +108,6 @@ def plot_residuals(path: Path, residuals: Path) -> None:
     axes.set_ylim(low / 2, 3 * max(highest, low))
     axes.set_title("residuals of the registration and the fitted mixture")
     axes.legend()
-    _save(figure, path)
 
 
 def plot_surface(path: Path, result: SurfaceResult) -> None:

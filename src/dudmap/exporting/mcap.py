@@ -9,9 +9,9 @@ import numpy as np
 
 from dudmap.errors import ConfigError
 from dudmap.exporting import ros_messages as ros
-from dudmap.exporting.mesh_simplification import simplified
 from dudmap.exporting.run_content import RunContent
 from dudmap.geometry import se3
+from dudmap.geometry.mesh_simplification import simplified
 
 MESH_TRIANGLES = 50_000
 """Triangles of the mesh marker: viewers take every corner as a message of its own. The point cloud has all vertices."""

@@ -89,9 +89,9 @@ class VoxelBlocks:
         needed = self.num_entries + unknown
         if needed > len(self.coords):
             capacity = max(needed, 2 * len(self.coords))
-            self.coords = _grown(self.coords, capacity, 0)
-            self.slot_of = _grown(self.slot_of, capacity, -1)
-            self.free_count = _grown(self.free_count, capacity, 0)
+            self.coords = grown(self.coords, capacity, 0)
+            self.slot_of = grown(self.slot_of, capacity, -1)
+            self.free_count = grown(self.free_count, capacity, 0)
         if needed > MAX_LOAD * len(self.table):
             size = max(int(needed / MAX_LOAD), len(self.table)) * 3 // 2  # a search in a full table would not end
             self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
@@ -106,12 +106,12 @@ class VoxelBlocks:
         needed = self.num_slots + len(entries) - len(reused)
         if needed > len(self.geometry):
             capacity = max(needed, len(self.geometry) * 3 // 2)
-            self.geometry = _grown(self.geometry, capacity, 0)
-            self.colors = _grown(self.colors, capacity, 0)
-            self.entry_of = _grown(self.entry_of, capacity, -1)
-            self.slot_coords = _grown(self.slot_coords, capacity, 0)
-            self.written = _grown(self.written, capacity, 0)
-            self.fused = _grown(self.fused, capacity, 0)
+            self.geometry = grown(self.geometry, capacity, 0)
+            self.colors = grown(self.colors, capacity, 0)
+            self.entry_of = grown(self.entry_of, capacity, -1)
+            self.slot_coords = grown(self.slot_coords, capacity, 0)
+            self.written = grown(self.written, capacity, 0)
+            self.fused = grown(self.fused, capacity, 0)
         slots = np.concatenate([reused, np.arange(self.num_slots, needed, dtype=np.int32)])
         self.num_slots = needed
         self.entry_of[slots] = entries
@@ -167,7 +167,7 @@ class VoxelBlocks:
         return blocks
 
 
-def _grown(array: NDArray, capacity: int, value: int) -> NDArray:
+def grown(array: NDArray, capacity: int, value: int) -> NDArray:
     """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
     shape = (capacity, *array.shape[1:])
     out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)

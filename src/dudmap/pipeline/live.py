@@ -20,6 +20,7 @@ from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, write_run_
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.observer import RunObserver
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream begins."""
@@ -36,6 +37,7 @@ def run_live(
     record: str | Path | None = None,
     calibration: "Calibration | None" = None,
     progress: bool = True,
+    observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
     """Run the system on a camera until the stream ends, ``max_frames`` are processed, or Ctrl-C; write a run folder.
 
@@ -72,9 +74,11 @@ def run_live(
             first = Slam(camera.camera, config, calibration=calibration)
             for frame in camera.preview(PREVIEW):
                 first.process(frame)
+            for observer in observers:
+                observer.start(slam, out, None)
             with closing(_newest_frames(camera, recorder)) as frames:
                 for source in frames:
-                    process_source(source, slam, metrics, display, out if save_masks else None, None)
+                    process_source(source, slam, metrics, display, out if save_masks else None, None, observers)
                     if max_frames is not None and len(metrics.rows) >= max_frames:
                         break
         except KeyboardInterrupt:
@@ -89,6 +93,8 @@ def run_live(
             camera.close()
             display.working("writing")
             report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map)
+            for observer in observers:
+                observer.finish(out)
             _finish(recorder, display)
     if metrics.dropped:
         display.note(f"live: {metrics.dropped} of {metrics.dropped + len(metrics.rows)} frames were dropped")

@@ -15,6 +15,7 @@ from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask,
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.observer import RunObserver
     from dudmap.places.saved_map import SavedMap
     from dudmap.result import FrameResult
     from dudmap.sequences import Sequence
@@ -40,6 +41,7 @@ def run(
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
+    observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
@@ -75,6 +77,7 @@ def run(
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         observe: Called after each processed frame with its number, what was read, and the result.
+        observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
@@ -121,6 +124,8 @@ def run(
                     slam = Slam(sequence.camera, config, first_pass=slam, depth_model=model, calibration=calibration)
                     record = RunRecord(masked=record.masked and 0, dropped=None)
                 last = number == passes - 1
+                for observer in observers:
+                    observer.start(slam, out, count)
                 with closing(
                     in_real_time(sequence, count, given_masks)
                     if live
@@ -134,6 +139,7 @@ def run(
                             display,
                             out if save_masks and last else None,
                             observe if last else None,
+                            observers,
                         )
             if len(slam.maps) > 1:
                 display.note(_unmerged_submaps(slam))
@@ -153,6 +159,8 @@ def run(
             if stopped and finished is not None:  # the first pass is complete, the second is not
                 slam, record = finished
             report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map)
+            for observer in observers:
+                observer.finish(out)
     if record.rows and not len(report.trajectory):
         raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
     if not record.rows:
@@ -189,6 +197,7 @@ def process_source(
     display: RunProgress,
     mask_folder: Path | None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None",
+    observers: "tuple[RunObserver, ...]" = (),
 ) -> None:
     """Process one frame, count it, save its mask, and report it."""
     index, read = source.number, source.read
@@ -218,6 +227,8 @@ def process_source(
         save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, read, result)
+    for observer in observers:
+        observer.frame(index, read, result, 1000 * (end - start))
     if result.calibrated:
         display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
     "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz", "merge.json",
+    "report.html",
 )  # fmt: skip
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
@@ -78,7 +79,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
-        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt"
+        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt", "thumbnails/*.jpg"
         for part in (path for pattern in parts for path in out.glob(pattern)):
             part.unlink()
         if save_masks:

@@ -1,0 +1,30 @@
+"""``dudmap report``: one page on a run that needs nothing but a browser."""
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def report(
+    run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="HTML file; default: report.html in the run folder.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the path and the size as one JSON object.")] = False,
+) -> None:
+    """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.
+
+    The page is one file and loads nothing, so that it can be sent by mail and opened offline.
+    """
+    from dudmap.viewing.report import write_report
+
+    path = write_report(run, out)
+    if as_json:
+        typer.echo(json.dumps({"report": str(path), "bytes": path.stat().st_size}))
+    else:
+        typer.echo(f"written: {path} ({1e-6 * path.stat().st_size:.1f} MB)")

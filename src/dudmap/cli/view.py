@@ -1,0 +1,73 @@
+"""``dudmap view``: a run folder in the browser. Also what ``dudmap run`` and ``demo`` need to be watched."""
+
+import sys
+import time
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:
+    from dudmap.pipeline.observer import RunObserver
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def view(
+    run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
+    host: Annotated[
+        str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines see the page.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option("--port", help="Port to serve at.", min=1, max=65535)] = 8080,
+) -> None:
+    """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
+    from dudmap.viewing.stored_view import open_run
+
+    window = open_run(run, host, port)
+    typer.echo(f"{window.url} shows {run}; ctrl-C ends it", err=True)
+    _wait()
+    window.stop()
+
+
+@contextmanager
+def observers(*, report: bool, page: tuple[str, int] | None, rerun: Path | None) -> "Iterator[tuple[RunObserver, ...]]":
+    """Observers of a run as wanted: its report, the page at host and port, the log for Rerun.
+
+    A page stays open after the run until ctrl-C, unless nobody sits at the terminal.
+    """
+    with ExitStack() as stack:
+        watching: list[RunObserver] = []
+        if report:
+            from dudmap.viewing.report import ReportObserver
+
+            watching.append(ReportObserver())
+        if rerun is not None:
+            from dudmap.viewing.rerun_log import RerunLog
+
+            watching.append(RerunLog(rerun))
+        if page is not None:
+            from dudmap.viewing.live_view import LiveView
+            from dudmap.viewing.window import Window
+
+            window = Window(*page, "dudmap")
+            stack.callback(window.stop)
+            live_view = LiveView(window)
+            stack.callback(live_view.close)
+            watching.append(live_view)
+            typer.echo(f"{window.url} shows the run", err=True)
+        yield tuple(watching)
+        if page is not None and sys.stdin.isatty():
+            typer.echo("the page stays open; ctrl-C ends it", err=True)
+            _wait()
+
+
+def _wait() -> None:
+    """Wait for ctrl-C."""
+    try:
+        while True:
+            time.sleep(3600)
+    except KeyboardInterrupt:
+        return

@@ -1,0 +1,25 @@
+"""What watches a run without taking part in it: viewers, logs, pictures."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from dudmap.pipeline.frame_source import FrameRead
+    from dudmap.result import FrameResult
+    from dudmap.slam import Slam
+
+
+class RunObserver:
+    """Observer of a run; this one does nothing.
+
+    All methods are called in the thread of the run, between two frames, when nothing changes the map.
+    """
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """Frame number ``index`` was read and processed in ``ms`` milliseconds."""
+
+    def finish(self, out: Path) -> None:
+        """The run is over, also by an error or an interrupt, and its run folder is written."""

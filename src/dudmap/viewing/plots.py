@@ -1,0 +1,138 @@
+"""Plots of a run for the report, as SVG text."""
+
+import io
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.evaluation.plots import draw_residuals
+from dudmap.viewing.run_files import RunFiles
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+POINTS = 400
+"""Points of a curve over time: a plot is about this many pixels wide."""
+MAX_STAGES = 9
+"""Stages with a colour of their own; the shortest ones are added up."""
+DIRECTIONS = ("x", "y", "z", "about x", "about y", "about z")
+"""Directions of the pose's uncertainty, camera frame."""
+
+
+def plots(run: RunFiles) -> dict[str, str]:
+    """SVG text by title: time per stage, share that moves, residuals, uncertainty of the pose; those with data."""
+    out: dict[str, str] = {}
+    if run.frames and run.stages:
+        out["Time per stage"] = _times(run)
+    if run.frames:
+        out["Share of the readings that move"] = _dynamic_share(run)
+    if (run.folder / "residuals.npz").is_file():
+        with _drawing("residuals") as (figure, picture):
+            axes = figure.subplots()
+            draw_residuals(axes, run.folder / "residuals.npz")
+            axes.set_title("")
+        out["Residuals"] = picture[0]
+    if run.metrics.get("balance"):
+        out["Uncertainty of the pose"] = _balance(run)
+    return out
+
+
+def _times(run: RunFiles) -> str:
+    t = _seconds(run)
+    times = {stage: run.column(stage) for stage in run.stages}
+    ranked = sorted(times, key=lambda stage: -float(times[stage].sum()))
+    if len(ranked) > MAX_STAGES:
+        rest = ranked[MAX_STAGES - 1 :]
+        ranked = [*ranked[: MAX_STAGES - 1], "others"]
+        times["others"] = np.sum([times[stage] for stage in rest], axis=0)
+    curves = [_binned(t, times[stage]) for stage in ranked]
+    # a few frames may take very long, such as the first one, in which the kernels are loaded
+    highest = 1.3 * max(float(np.percentile(np.sum([curve[1] for curve in curves], axis=0), 95)), 1e-3)
+    with _drawing("times") as (figure, picture):
+        axes = figure.subplots()
+        labels = [f"{stage}: {times[stage].mean():.1f} ms" for stage in ranked]
+        axes.stackplot(curves[0][0], *(curve[1] for curve in curves), labels=labels, linewidth=0)
+        axes.set(xlabel="time, s", ylabel="ms per frame", xlim=_limits(t), ylim=(0, highest))
+        handles, names = axes.get_legend_handles_labels()
+        axes.legend(handles[::-1], names[::-1], loc="upper left", bbox_to_anchor=(1, 1), frameon=False)
+    return picture[0]
+
+
+def _dynamic_share(run: RunFiles) -> str:
+    t = _seconds(run)
+    lost = t[np.array([row["state"] == "lost" for row in run.frames])]
+    with _drawing("dynamic") as (figure, picture):
+        axes = figure.subplots()
+        at, share = _binned(t, 100 * run.column("dynamic_share"))
+        axes.fill_between(at, share, color="#d95f02", alpha=0.6, linewidth=0)
+        if len(lost):
+            axes.plot(lost, np.zeros(len(lost)), "|", color="black", markersize=12, label=f"{len(lost)} frames lost")
+            axes.legend(frameon=False)
+        axes.set(xlabel="time, s", ylabel="%", xlim=_limits(t), ylim=(0, None))
+    return picture[0]
+
+
+def _balance(run: RunFiles) -> str:
+    balance = run.metrics["balance"]
+    at = np.arange(3)
+    with _drawing("balance") as (figure, picture):
+        first, second, third = figure.subplots(1, 3, width_ratios=(1, 1, 2))
+        first.bar(at, balance["pose_sigma_mm"], color="#4c78a8")
+        first.set(ylabel="sigma, mm", xticks=at, xticklabels=DIRECTIONS[:3])
+        second.bar(at, balance["pose_sigma_deg"], color="#4c78a8")
+        second.set(ylabel="sigma, degrees", xticks=at, xticklabels=DIRECTIONS[:3])
+        _shares(third, 100 * np.array(balance["color_share"], dtype=float))
+    return picture[0]
+
+
+def _shares(axes: "Axes", color: NDArray[np.float64]) -> None:
+    """Bars of how much of each direction rests on colour and how much on distances."""
+    at = np.arange(len(color))
+    axes.barh(at, color, color="#e45756", label="colour")
+    axes.barh(at, 100 - color, left=color, color="#b9c4d0", label="distances")
+    axes.set(xlabel="rests on, %", yticks=at, yticklabels=DIRECTIONS[: len(color)], xlim=(0, 100))
+    axes.invert_yaxis()
+    axes.legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False)
+
+
+def _seconds(run: RunFiles) -> NDArray[np.float64]:
+    """Times of the processed frames since the first, seconds."""
+    stamps = run.column("timestamp")
+    return stamps - stamps[0]
+
+
+def _limits(t: NDArray[np.float64]) -> tuple[float, float]:
+    return 0.0, max(float(t[-1]), 1e-3)
+
+
+def _binned(t: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Means of about ``POINTS`` equal groups of consecutive frames, so that a long run has no larger plot."""
+    starts = np.arange(0, len(t), max(1, len(t) // POINTS))
+    counts = np.diff(np.append(starts, len(t)))
+    return np.add.reduceat(t, starts) / counts, np.add.reduceat(y, starts) / counts
+
+
+@contextmanager
+def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
+    """Figure to draw into, and a list that holds its SVG text afterwards; the same data give the same text."""
+    import matplotlib
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+    from matplotlib.figure import Figure
+
+    picture: list[str] = []
+    style = {"svg.fonttype": "none", "svg.hashsalt": name, "font.size": 9, "font.family": "sans-serif"}
+    with matplotlib.rc_context(rc=cast("Any", style)):
+        figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+        FigureCanvasSVG(figure)
+        yield figure, picture
+        text = io.StringIO()
+        figure.savefig(text, format="svg", metadata={"Date": None, "Creator": None})
+    svg = text.getvalue()
+    svg = svg[svg.index("<svg") :]
+    svg = re.sub(r'\bid="((?:figure|axes|patch|line2d|text|xtick|ytick|matplotlib|legend|Fill)[^"]*)"', "", svg)
+    picture.append(re.sub(r'<svg ([^>]*?)width="[^"]*" ', r"<svg \1", re.sub(r' height="[^"]*pt"', "", svg, count=1)))

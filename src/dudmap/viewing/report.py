@@ -1,0 +1,204 @@
+"""The report of a run: one HTML page that needs neither network nor server."""
+
+import base64
+import json
+import re
+from html import escape
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap import __version__
+from dudmap.errors import DudmapError
+from dudmap.geometry import se3
+from dudmap.geometry.mesh_simplification import simplified
+from dudmap.viewing.packed_mesh import packed
+from dudmap.viewing.plots import plots
+from dudmap.viewing.run_files import RunFiles
+from dudmap.viewing.thumbnails import Thumbnails
+
+REPORT = "report.html"
+TRIANGLES = 200_000
+"""Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
+POSES = 5000
+"""Poses in the page; those of a longer run are thinned evenly."""
+LISTED = 200
+"""Lost or unreadable frames that are listed one by one."""
+CARDS = {
+    "frames": ("frames", 1, "{:.0f}"),
+    "lost": ("lost", 1, "{:.0f}"),
+    "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
+    "dynamic_share_mean": ("moves", 100, "{:.1f} %"),
+    "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
+    "ate_rmse_m": ("ATE RMSE", 100, "{:.2f} cm"),
+    "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
+}
+"""Key of metrics.json to label, factor and format of the figures at the top of the page."""
+
+
+def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
+    """Write the report of a run folder and return its path.
+
+    The page holds the mesh (at most ``TRIANGLES``, the full one stays in mesh.ply) with trajectory, camera and moving
+    objects in 3D, the thumbnails, plots, all figures, the configuration, and what was lost and why.
+
+    Args:
+        folder: The run folder.
+        out: The HTML file; None for report.html in the run folder.
+
+    Raises:
+        DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
+    """
+    path = Path(out) if out is not None else Path(folder) / REPORT
+    page = report_page(RunFiles.load(folder))
+    try:
+        path.write_text(page, encoding="utf-8")
+    except OSError as error:
+        raise DudmapError(f"cannot write the report {path}: {error.strerror or error}") from error
+    return path
+
+
+def report_page(run: RunFiles) -> str:
+    """HTML text of the report."""
+    about, mesh = (None, "") if run.mesh is None else packed(simplified(run.mesh, TRIANGLES))
+    parts = {
+        "version": __version__,
+        "title": escape(str(run.metrics.get("sequence") or run.folder.name)),
+        "verdict": escape(_verdict(run.metrics)),
+        "cards": _cards(run.metrics),
+        "strips": _strip(run),
+        "losses": _losses(run.metrics),
+        "plots": "".join(
+            f"<figure>{svg}<figcaption>{escape(t)}</figcaption></figure>" for t, svg in plots(run).items()
+        ),
+        "table": _table(run.metrics),
+        "config": escape(run.config or "The run folder has no config.toml."),
+        "run": json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c"),
+        "mesh": mesh,
+        "css": _asset("report.css"),
+        "three": _asset("three.min.js"),
+        "licence": _asset("three.LICENSE.txt"),
+        "script": _asset("report.js"),
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("report.html"))
+
+
+def scene_data(run: RunFiles) -> dict[str, Any]:
+    """Camera, and per shown pose its time, position with quaternion (x y z qx qy qz qw), and moving objects."""
+    chosen = np.unique(np.linspace(0, len(run.trajectory) - 1, min(POSES, len(run.trajectory))).astype(int))
+    Ts = run.trajectory.Ts_world_camera[chosen]
+    times = run.trajectory.timestamps[chosen]
+    poses = [[*T[:3, 3].round(4).tolist(), *np.round(se3.rotation_to_quat_xyzw(T[:3, :3]), 5).tolist()] for T in Ts]
+    camera = run.metrics.get("camera", {})
+    movers = [
+        [
+            {"id": m.id, "box": m.box.round(3).tolist(), "speed": round(m.speed, 3)}
+            for m in run.movers.get(f"{t:.6f}", [])
+        ]
+        for t in times
+    ]
+    return {
+        "camera": {key: camera[key] for key in ("fx", "fy", "cx", "cy", "width", "height") if key in camera},
+        "times": times.round(6).tolist(),
+        "poses": poses,
+        "movers": movers,
+    }
+
+
+class ReportObserver(Thumbnails):
+    """Keeps the thumbnails of a run and writes its report at the end."""
+
+    def finish(self, out: Path) -> None:
+        """Write report.html."""
+        write_report(out)
+
+
+def _asset(name: str) -> str:
+    return (files("dudmap.viewing") / "page" / name).read_text(encoding="utf-8")
+
+
+def _verdict(metrics: dict[str, Any]) -> str:
+    """Sentence on whether the run is complete."""
+    tracked = f"{metrics.get('tracked', 0)} of {metrics.get('frames', 0)} frames were tracked"
+    if metrics.get("complete"):
+        return f"Processed to the end; {tracked}."
+    return f"Incomplete: {metrics.get('stopped_by') or 'the run was stopped'}; {tracked}."
+
+
+def _cards(metrics: dict[str, Any]) -> str:
+    known = [
+        (label, form.format(factor * metrics[key]))
+        for key, (label, factor, form) in CARDS.items()
+        if isinstance(metrics.get(key), int | float)
+    ]
+    return "".join(f"<li><b>{escape(value)}</b><span>{escape(label)}</span></li>" for label, value in known)
+
+
+def _strip(run: RunFiles) -> str:
+    """Columns of colour image and mask; depth and residuals are kept for the frame at the slider."""
+    if not run.thumbnails:
+        return "<p>This run kept no images (it was made with --no-report).</p>"
+    start = float(next(iter(run.thumbnails)))
+    columns = []
+    for stamp, images in run.thumbnails.items():
+        data = {kind: "data:image/jpeg;base64," + base64.b64encode(jpg).decode() for kind, jpg in images.items()}
+        at = f"{float(stamp) - start:.1f} s"
+        hidden = "".join(f' data-{kind}="{data[kind]}"' for kind in ("depth", "residuals") if kind in data)
+        shown = "".join(
+            f'<img src="{data[kind]}" alt="{kind} at {at}" loading="lazy">'
+            for kind in ("color", "mask")
+            if kind in data
+        )
+        columns.append(f'<figure data-t="{stamp}"{hidden}>{shown}{at}</figure>')
+    return f'<div class="strip">{"".join(columns)}</div>'
+
+
+def _losses(metrics: dict[str, Any]) -> str:
+    """Lost frames by reason, unreadable frames, and frames that were left out of the map."""
+    lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
+    notes = [
+        (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
+        (metrics.get("blind"), "images without contrast were tracked by distances alone and are not in the map"),
+        (metrics.get("uncertain"), "frames with uncertain labels are not in the map"),
+        (metrics.get("dropped"), "frames arrived too fast and were dropped"),
+        ((metrics.get("maps") or 1) - 1, "submaps could not be joined with the main one"),
+    ]
+    out = "".join(f"<li>{count} {escape(text)}</li>" for count, text in notes if count)
+    reasons: dict[str, list[float]] = {}
+    for row in lost:
+        reasons.setdefault(str(row["reason"]), []).append(float(row["timestamp"]))
+    for reason, stamps in sorted(reasons.items(), key=lambda item: -len(item[1])):
+        times = ", ".join(f"{stamp:.3f}" for stamp in stamps[:LISTED])
+        more = f" and {len(stamps) - LISTED} more" if len(stamps) > LISTED else ""
+        out += (
+            f"<li>{len(stamps)} lost: {escape(reason)}<details><summary>times, s</summary>{times}{more}</details></li>"
+        )
+    out += "".join(f"<li>unreadable: {escape(str(text))}</li>" for text in unreadable[:LISTED])
+    if len(unreadable) > LISTED:
+        out += f"<li>{len(unreadable) - LISTED} more frames were unreadable</li>"
+    return (
+        f"<ul>{out}</ul>" if out else "<p>Nothing: every frame was read and tracked, and every view is in the map.</p>"
+    )
+
+
+def _table(metrics: dict[str, Any]) -> str:
+    left_out = ("lost_frames", "unreadable_frames")
+    rows = "".join(
+        f"<tr><td>{escape(key)}</td><td>{escape(_text(value))}</td></tr>"
+        for key, value in metrics.items()
+        if key not in left_out
+    )
+    return f"<table>{rows}</table>"
+
+
+def _text(value: object) -> str:
+    """Value of metrics.json as text; trees as one line of JSON."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "-" if value is None else str(value)

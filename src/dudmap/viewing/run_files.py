@@ -1,0 +1,129 @@
+"""A run folder as the viewers read it."""
+
+import csv
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap import __version__
+from dudmap.errors import DudmapError
+from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.viewing.snapshot import KINDS, MoverBox
+from dudmap.viewing.thumbnails import FOLDER
+
+NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency")
+"""Columns of timings.csv that are not the time of a stage."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunFiles:
+    """What a run folder holds for a viewer.
+
+    Attributes:
+        folder: The run folder.
+        metrics: Content of metrics.json.
+        config: Text of config.toml, empty if there is none.
+        trajectory: Poses of all tracked frames; without any if no frame was tracked.
+        mesh: The mesh, None if no frame was fused.
+        frames: Rows of timings.csv: timestamp, state, times; one per processed frame.
+        movers: Moving objects by the timestamp of the frame, as text with six decimals.
+        thumbnails: JPEG files by kind of image, by the timestamp of the frame as text.
+    """
+
+    folder: Path
+    metrics: dict[str, Any]
+    config: str
+    trajectory: Trajectory
+    mesh: Mesh | None
+    frames: list[dict[str, str]]
+    movers: dict[str, list[MoverBox]]
+    thumbnails: dict[str, dict[str, bytes]]
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "RunFiles":
+        """Read a run folder.
+
+        Raises:
+            DudmapError: The folder is none of a run, was written by a newer version, or a file in it is damaged.
+        """
+        folder = Path(folder)
+        metrics = _metrics(folder)
+        path = folder / "trajectory.txt"
+        tracked = metrics.get("tracked") and path.is_file()
+        mesh = folder / "mesh.ply"
+        config = folder / "config.toml"
+        return cls(
+            folder=folder,
+            metrics=metrics,
+            config=config.read_text(encoding="utf-8") if config.is_file() else "",
+            trajectory=Trajectory.load(path) if tracked else Trajectory.from_poses([]),
+            mesh=Mesh.load(mesh) if mesh.is_file() and metrics.get("mesh_triangles") else None,
+            frames=_frames(folder / "timings.csv"),
+            movers=_movers(folder / "movers.jsonl"),
+            thumbnails=_thumbnails(folder / FOLDER),
+        )
+
+    @property
+    def stages(self) -> list[str]:
+        """Names of the stages of processing, in the order of the columns of timings.csv."""
+        return [key for key in self.frames[0] if key not in NOT_STAGES] if self.frames else []
+
+    def column(self, name: str) -> np.ndarray:
+        """Column of timings.csv, one number per processed frame."""
+        return np.array([float(row[name] or 0) for row in self.frames])
+
+
+def _metrics(folder: Path) -> dict[str, Any]:
+    path = folder / "metrics.json"
+    if not folder.is_dir():
+        raise DudmapError(f"there is no run folder {folder}; `dudmap run RECORDING --out {folder}` would write it")
+    if not path.is_file():
+        raise DudmapError(f"{folder} is no complete run folder: it has no metrics.json; name one of `dudmap run`")
+    try:
+        metrics = json.loads(path.read_text(encoding="utf-8"))
+        version = str(metrics["versions"]["dudmap"])
+    except (ValueError, KeyError, TypeError) as error:
+        raise DudmapError(f"{path} is damaged or not of `dudmap run` ({error!r}); run again") from None
+    if _release(version) > _release(__version__):
+        raise DudmapError(f"{folder} was written by dudmap {version}, newer than this {__version__}; upgrade dudmap")
+    return metrics
+
+
+def _release(version: str) -> tuple[int, ...]:
+    """Major and minor number of a version."""
+    return tuple(int(number) for number in re.findall(r"\d+", version)[:2])
+
+
+def _frames(path: Path) -> list[dict[str, str]]:
+    if not path.is_file():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def _movers(path: Path) -> dict[str, list[MoverBox]]:
+    out: dict[str, list[MoverBox]] = {}
+    if not path.is_file():
+        return out
+    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        try:
+            row = json.loads(line)
+            boxes = [MoverBox(int(m["id"]), np.array(m["box"], dtype=float), float(m["speed"])) for m in row["movers"]]
+            out[f"{row['timestamp']:.6f}"] = boxes
+        except (ValueError, KeyError, TypeError) as error:
+            raise DudmapError(f"{path}, line {number} is damaged ({error!r}); run again") from None
+    return out
+
+
+def _thumbnails(folder: Path) -> dict[str, dict[str, bytes]]:
+    out: dict[str, dict[str, bytes]] = {}
+    for path in folder.glob("*.jpg"):
+        stamp, _, kind = path.stem.rpartition(".")
+        if kind in KINDS:
+            out.setdefault(stamp, {})[kind] = path.read_bytes()
+    return dict(sorted(out.items(), key=lambda item: float(item[0])))

@@ -1,0 +1,60 @@
+"""Small images of evenly spaced frames, kept in the run folder for the report."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dudmap.errors import FrameError
+from dudmap.pipeline.observer import RunObserver
+from dudmap.viewing.snapshot import FrameImages, jpeg
+
+if TYPE_CHECKING:
+    from dudmap.pipeline.frame_source import FrameRead
+    from dudmap.result import FrameResult
+    from dudmap.slam import Slam
+
+FOLDER = "thumbnails"
+NUMBER = 36
+"""Number of frames that are kept: about 1.5 MB of JPEG files, and a strip that can still be looked through."""
+
+
+class Thumbnails(RunObserver):
+    """Writes ``thumbnails/<timestamp>.<kind>.jpg`` for up to ``NUMBER`` evenly spaced frames.
+
+    Of a camera, whose number of frames is not known, up to ``2 NUMBER`` are kept: whenever there are more, every second
+    one is removed.
+    """
+
+    def __init__(self) -> None:
+        self._out, self._count, self._next, self._step = Path(), None, 0, 1
+        self._kept: list[list[Path]] = []
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """Remember where the images go and how many frames come."""
+        self._out, self._count, self._next, self._step, self._kept = out / FOLDER, count, 0, 1, []
+        self._out.mkdir(exist_ok=True)
+        for path in self._out.glob("*.jpg"):  # of the first pass, whose timestamps may differ in a live run
+            path.unlink()
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """Write the images of the frame if it is the first one of the next of equal parts."""
+        if index < self._next or isinstance(read.frame, FrameError):
+            return
+        paths = []
+        for kind, image in FrameImages.of(read.frame, result).pictures().items():
+            paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
+            paths[-1].write_bytes(jpeg(image))
+        self._kept.append(paths)
+        if self._count is None:
+            self._thin()
+            self._next = index + self._step
+        else:  # first frame of the next of NUMBER equal parts
+            self._next = -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
+
+    def _thin(self) -> None:
+        """Remove every second frame if there are too many, and keep half as many from now on."""
+        if len(self._kept) <= 2 * NUMBER:
+            return
+        for paths in self._kept[1::2]:
+            for path in paths:
+                path.unlink()
+        self._kept, self._step = self._kept[::2], 2 * self._step

@@ -1,0 +1,207 @@
+"""Both pages in a real browser: they load without errors, draw something, and react.
+
+Needs the program of a Chromium in DUDMAP_CHROMIUM, and the package playwright.
+"""
+
+import os
+import socket
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from dudmap.viewing.report import write_report
+from dudmap.viewing.run_files import RunFiles
+from run_folders import write_run
+
+playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
+CHROMIUM = os.environ.get("DUDMAP_CHROMIUM")
+pytestmark = [
+    pytest.mark.browser,
+    pytest.mark.skipif(not CHROMIUM, reason="DUDMAP_CHROMIUM does not name the program of a Chromium"),
+]
+SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+
+
+class Tab:
+    """A page with its errors and requests."""
+
+    def __init__(self, browser):
+        self.page = browser.new_page(viewport={"width": 1100, "height": 900})
+        self.errors, self.requests = [], []
+        self.page.on("pageerror", lambda error: self.errors.append(str(error)))
+        self.page.on("console", lambda line: self.errors.append(line.text) if line.type == "error" else None)
+        self.page.on("request", lambda request: self.requests.append(request.url))
+
+    def picture(self, selector="canvas"):
+        png = self.page.locator(selector).first.screenshot()
+        return cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_COLOR).astype(int)
+
+
+@pytest.fixture(scope="module")
+def driver():
+    with playwright.sync_playwright() as started:
+        yield started
+
+
+@pytest.fixture(scope="module")
+def browser(driver):
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=SOFTWARE)
+    yield browser
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return write_run(tmp_path_factory.mktemp("browser") / "run")
+
+
+@pytest.fixture(scope="module")
+def report(browser, folder):
+    tab = Tab(browser)
+    tab.page.context.set_offline(True)
+    tab.page.goto(write_report(folder).as_uri())
+    tab.page.wait_for_selector("html[data-ready=true]", timeout=30000)
+    return tab
+
+
+def set_time(tab, number):
+    script = "n => { const t = document.getElementById('time'); t.value = n; t.dispatchEvent(new Event('input')); }"
+    tab.page.evaluate(script, number)
+
+
+def test_the_report_loads_offline_without_errors(report):
+    assert report.errors == []
+    assert [url for url in report.requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert report.page.text_content("#notice") == ""
+
+
+def test_the_report_draws_the_map(report):
+    before = report.picture("#canvas")
+    assert before.std() > 10
+    report.page.uncheck("#show-mesh")
+    assert np.abs(report.picture("#canvas") - before).mean() > 5
+    report.page.check("#show-mesh")
+    report.page.check("#shape")
+    assert np.abs(report.picture("#canvas") - before).mean() > 5
+    report.page.uncheck("#shape")
+
+
+def test_the_slider_of_the_report_moves_the_camera(report):
+    set_time(report, 0)
+    before = report.picture("#canvas")
+    set_time(report, 10)  # the eleventh tracked frame: frame 11, at x = 0.55 m
+    at = "Array.from(window.dudmapView.body.matrix.elements).slice(12, 15)"
+    np.testing.assert_allclose(report.page.evaluate(at), [0.55, 0, 0], atol=1e-6)
+    assert np.abs(report.picture("#canvas") - before).max() > 50
+    report.page.check("#ride")
+    np.testing.assert_allclose(report.page.evaluate("window.dudmapView.camera.position.toArray()"), [0.55, 0, 0])
+    report.page.uncheck("#ride")
+
+
+def test_the_report_shows_what_moves_at_its_time(report):
+    set_time(report, 4)
+    assert "object 4: 0.50 m/s" in report.page.text_content("#clock")
+    assert report.page.evaluate("window.dudmapView.movers.children.length") == 1
+    set_time(report, 0)
+    assert report.page.evaluate("window.dudmapView.movers.children.length") == 0
+    assert report.page.locator("#now img").count() == 4
+
+
+def test_a_click_on_the_map_gives_a_point_and_two_a_distance(report):
+    report.page.check("#ride")
+    box = report.page.locator("#canvas").bounding_box()
+    x, y = box["x"] + box["width"] / 2, box["y"] + box["height"] / 2
+    report.page.mouse.click(x, y)
+    assert report.page.text_content("#point") == "x 0.000, y 0.000, z 2.000 m"
+    report.page.mouse.click(x + 60, y)
+    assert "m from the point before" in report.page.text_content("#point")
+    report.page.uncheck("#ride")
+
+
+def test_a_browser_without_webgl_is_told_so_and_sees_the_rest(driver, folder):
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    page = browser.new_page()
+    page.goto(write_report(folder).as_uri())
+    page.wait_for_selector("html[data-ready=true]", timeout=30000)
+    assert "no WebGL" in page.text_content("#notice")
+    assert page.locator("#now img").count() == 4
+    browser.close()
+
+
+@pytest.fixture(scope="module")
+def window(folder):
+    pytest.importorskip("viser", reason="the extra view is not installed")
+    from dudmap.viewing.stored_view import show_run
+    from dudmap.viewing.window import Window
+
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        port = free.getsockname()[1]
+    window = Window("127.0.0.1", port, "test")
+    show_run(window, RunFiles.load(folder))
+    yield window
+    window.stop()
+
+
+@pytest.fixture(scope="module")
+def live(browser, window):
+    tab = Tab(browser)
+    tab.page.goto(window.url)
+    tab.page.wait_for_selector("text=follow the run", timeout=30000)
+    until(lambda: tab.picture().std() > 5)
+    return tab
+
+
+def until(condition, seconds=20):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.2)
+
+
+def test_the_window_draws_the_map_without_errors(live):
+    # a picture that is replaced before the browser has decoded it is reported as a missing blob
+    assert [error for error in live.errors if "ERR_FILE_NOT_FOUND" not in error] == []
+    assert all("127.0.0.1" in url or "localhost" in url or url.startswith(("data:", "blob:")) for url in live.requests)
+
+
+def test_the_slider_of_the_window_moves_the_camera(live, window):
+    thumb = live.page.locator("[role=slider]").first
+    thumb.focus()
+    for _ in range(5):
+        thumb.press("ArrowRight")
+    until(lambda: window._shown == 5)
+    np.testing.assert_allclose(window._handles["/camera"].position, [0.25, 0, 0], atol=1e-6)
+    assert "/movers/4/box" in window._handles
+
+
+def test_the_map_of_the_window_can_be_hidden(live, window):
+    before = live.picture()
+    live.page.get_by_label("map", exact=True).uncheck()
+    until(lambda: np.abs(live.picture() - before).mean() > 3)
+    live.page.get_by_label("map", exact=True).check()
+    until(lambda: np.abs(live.picture() - before).mean() < 1)
+
+
+def test_clicks_in_the_window_measure(live, window):
+    box = live.page.locator("canvas").first.bounding_box()
+    x, y = box["x"] + box["width"] / 3, box["y"] + box["height"] / 2
+    live.page.mouse.click(x, y)
+    until(lambda: "z 2.0" in window._point.content)
+    live.page.mouse.click(x + 40, y)
+    until(lambda: "from the one before" in window._point.content)
+
+
+def test_a_live_window_grows(browser, window):
+    """New frames appear on an open page without a reload."""
+    from dudmap.viewing.snapshot import FrameFigures
+
+    window._follow.value = True
+    T = np.eye(4)
+    T[0, 3] = 1.5
+    window.add_frames([FrameFigures(110.0, T, "", (), 33.0, 0.002, 0.5)])
+    assert window._shown == 12
+    assert window._slider.max == 12
+    assert window._state.content.endswith("50% moves")

@@ -1,0 +1,238 @@
+"""The report holds what the run folder holds, needs nothing else, and says what is missing."""
+
+import base64
+import gzip
+import json
+import re
+from html.parser import HTMLParser
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dudmap.cli import app
+from dudmap.config import Config
+from dudmap.errors import DudmapError
+from dudmap.pipeline.run import run
+from dudmap.sequences import open_sequence
+from dudmap.viewing.report import ReportObserver, write_report
+from dudmap.viewing.thumbnails import NUMBER, Thumbnails
+from fake_slam import FakeResult
+from recordings import write_recording
+from run_folders import FRAMES, stamp, wall, write_run
+
+
+class Page(HTMLParser):
+    """Elements, attributes and texts of a page."""
+
+    VOID = ("meta", "img", "input", "br", "link")
+
+    def __init__(self, text):
+        super().__init__()
+        self.tags, self.by_id, self.texts, self._open = [], {}, [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.tags.append((tag, values))
+        if tag not in self.VOID:
+            self._open.append((tag, values.get("id")))
+
+    def handle_endtag(self, tag):
+        while self._open and self._open.pop()[0] != tag:
+            pass
+
+    def handle_data(self, data):
+        self.texts.append(data)
+        if self._open and self._open[-1][1]:
+            self.by_id[self._open[-1][1]] = self.by_id.get(self._open[-1][1], "") + data
+
+
+@pytest.fixture(scope="module")
+def text(tmp_path_factory):
+    folder = write_run(tmp_path_factory.mktemp("report") / "run")
+    assert write_report(folder) == folder / "report.html"
+    return (folder / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(text):
+    return Page(text)
+
+
+def test_the_page_loads_nothing(page):
+    for tag, values in page.tags:
+        for key in ("src", "href", "action", "poster"):
+            assert (values.get(key) or "data:").startswith(("data:", "#")), (tag, key)
+        assert tag not in ("link", "iframe", "object", "embed")
+        assert tag != "script" or "src" not in values
+
+
+def test_the_page_carries_the_licence_of_what_it_ships(text):
+    assert "Permission is hereby granted, free of charge" in text
+    assert "three.js authors" in text
+
+
+def test_the_mesh_is_that_of_the_run(page):
+    about = json.loads(page.by_id["run"])["mesh"]
+    data = gzip.decompress(base64.b64decode(page.by_id["mesh"]))
+    n, m = about["vertices"], about["triangles"]
+    whole = np.frombuffer(data, "<u2", 3 * n).reshape(-1, 3)
+    low, high = np.array(about["low"]), np.array(about["high"])
+    colors = np.frombuffer(data, np.uint8, 3 * n, 6 * n).reshape(-1, 3)
+    steps = np.frombuffer(data, "<i4", 3 * m, -(-9 * n // 4) * 4)
+    mesh = wall()
+    np.testing.assert_allclose(low + whole / 65535 * (high - low), mesh.vertices, atol=1e-4)
+    np.testing.assert_array_equal(colors, mesh.colors)
+    np.testing.assert_array_equal(np.cumsum(steps).reshape(-1, 3), mesh.faces)
+
+
+def test_the_scene_has_every_tracked_frame_and_what_moves(page):
+    scene = json.loads(page.by_id["run"])
+    tracked = [k for k in range(FRAMES) if k != 3]
+    np.testing.assert_allclose(scene["times"], [stamp(k) for k in tracked])
+    np.testing.assert_allclose([pose[0] for pose in scene["poses"]], 0.05 * np.array(tracked), atol=1e-6)
+    np.testing.assert_allclose([pose[3:] for pose in scene["poses"]], [[0, 0, 0, 1]] * len(tracked), atol=1e-6)
+    moving = {stamp(k): movers for k, movers in zip(tracked, scene["movers"], strict=True) if movers}
+    assert {t: [m["id"] for m in movers] for t, movers in moving.items()} == {stamp(5): [4]}
+    assert scene["camera"]["fx"] == 60
+
+
+def test_the_images_are_those_of_the_run(page):
+    images = [values for tag, values in page.tags if tag == "img"]
+    assert len(images) == 6  # colour and mask of frames 0, 4 and 8
+    for k, values in zip((0, 4, 8), images[::2], strict=True):
+        data = base64.b64decode(values["src"].removeprefix("data:image/jpeg;base64,"))
+        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+        assert image.shape == (48, 64, 3)
+        assert abs(image.mean() - k) < 3
+    figures = [values for tag, values in page.tags if tag == "figure" and "data-t" in values]
+    assert all(values["data-depth"].startswith("data:image/jpeg") for values in figures)
+
+
+def test_figures_configuration_plots_and_losses_are_there(page, text):
+    said = " ".join(page.texts)
+    assert "11 of 12 frames were tracked" in said
+    assert "1 lost: too few inliers <b>" in said  # escaped in the text of the page
+    assert "unreadable: frame 7: the image is cut off" in said
+    assert "2 redundant views" in said
+    assert 'preset = "default"' in said
+    assert "ms_per_frame_median" in said
+    assert "41.2" in said
+    assert text.count("<svg") == 4
+    for title in ("Time per stage", "Share of the readings", "Residuals", "Uncertainty of the pose"):
+        assert title in said
+
+
+def test_names_of_a_recording_are_no_markup(text):
+    assert "<chair>" not in text.replace("\\u003cchair>", "")
+    assert "desk &amp; &lt;chair&gt;" in text
+
+
+def test_the_same_run_gives_the_same_page(tmp_path, text):
+    write_report(write_run(tmp_path / "again"), tmp_path / "other.html")
+    assert (tmp_path / "other.html").read_text(encoding="utf-8") == text
+
+
+@pytest.mark.parametrize(
+    ("metrics", "sentence"),
+    [
+        ({"mesh_triangles": 0}, "mesh"),
+        ({"complete": False, "stopped_by": "interrupted after 3 frames"}, "Incomplete: interrupted after 3 frames"),
+        ({"tracked": 0, "mesh_triangles": 0}, "0 of 12 frames were tracked"),
+    ],
+)
+def test_a_run_without_mesh_or_poses_has_a_page(tmp_path, metrics, sentence):
+    page = Page(write_report(write_run(tmp_path / "run", **metrics)).read_text(encoding="utf-8"))
+    assert sentence in " ".join(page.texts)
+    assert (json.loads(page.by_id["run"])["mesh"] is None) == (metrics.get("mesh_triangles") == 0)
+
+
+def remove_metrics(folder):
+    (folder / "metrics.json").unlink()
+
+
+def damage_metrics(folder):
+    (folder / "metrics.json").write_text("{")
+
+
+def from_the_future(folder):
+    (folder / "metrics.json").write_text('{"versions": {"dudmap": "999.1.0"}}')
+
+
+def damage_movers(folder):
+    (folder / "movers.jsonl").write_text("{}\n")
+
+
+@pytest.mark.parametrize(
+    ("spoil", "sentence"),
+    [
+        (remove_metrics, "is no complete run folder: it has no metrics.json"),
+        (damage_metrics, r"metrics.json is damaged or not of `dudmap run`"),
+        (from_the_future, r"was written by dudmap 999.1.0, newer than this .*; upgrade dudmap"),
+        (damage_movers, "movers.jsonl, line 1 is damaged"),
+    ],
+)
+def test_folders_that_cannot_be_used(tmp_path, spoil, sentence):
+    folder = write_run(tmp_path / "run")
+    spoil(folder)
+    with pytest.raises(DudmapError, match=sentence):
+        write_report(folder)
+
+
+def test_the_command(tmp_path):
+    folder = write_run(tmp_path / "run")
+    done = CliRunner().invoke(app, ["report", str(folder), "--out", str(tmp_path / "page.html"), "--json"])
+    assert json.loads(done.stdout)["bytes"] == (tmp_path / "page.html").stat().st_size
+    done = CliRunner().invoke(app, ["report", str(tmp_path / "nowhere")])
+    assert done.exit_code == 1
+    assert done.stderr.startswith("dudmap: there is no run folder")
+    done = CliRunner().invoke(app, ["report", str(folder), "--out", "/proc/dudmap/page.html"])
+    assert "cannot write the report" in done.stderr
+
+
+def test_a_run_keeps_images_and_writes_its_report(slam, tmp_path):
+    slam.script = {2: "lost"}
+    out = tmp_path / "out"
+    recording = open_sequence(write_recording(tmp_path / "desk", 6))
+    for _ in range(2):  # the second run finds the files of the first
+        run(recording, Config(), out, progress=False, observers=(ReportObserver(),))
+    assert len(list((out / "thumbnails").iterdir())) == 6 * 4
+    said = " ".join(Page((out / "report.html").read_text(encoding="utf-8")).texts)
+    assert "5 of 6 frames were tracked" in said
+    run(recording, Config(), out, progress=False)
+    assert not (out / "report.html").exists()
+    assert not list((out / "thumbnails").iterdir())
+
+
+def test_an_interrupted_run_has_a_report(slam, tmp_path):
+    slam.script = {3: KeyboardInterrupt()}
+    with pytest.raises(KeyboardInterrupt):
+        run(
+            open_sequence(write_recording(tmp_path / "desk", 6)), Config(), tmp_path / "out", progress=False,
+            observers=(ReportObserver(),),
+        )  # fmt: skip
+    assert "Incomplete: interrupted after 3 frames" in (tmp_path / "out/report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("known", [True, False])
+@pytest.mark.parametrize("count", [1, 20, 36, 37, 500])
+def test_kept_frames_are_evenly_spaced(tmp_path, count, known):
+    number = count if known else None
+    observer = Thumbnails()
+    observer.start(None, tmp_path, number)
+    read = type(
+        "Read", (), {"frame": type("F", (), {"color": np.zeros((2, 2, 3), np.uint8), "depth": np.zeros((2, 2))})}
+    )
+    for index in range(count):
+        mask = np.zeros((2, 2), bool)
+        observer.frame(index, read, FakeResult(float(index), dynamic_mask=mask), 1.0)
+    kept = sorted(float(re.sub(r"\.color\.jpg$", "", p.name)) for p in (tmp_path / "thumbnails").glob("*.color.jpg"))
+    if number is None:
+        assert min(count, NUMBER) <= len(kept) <= 2 * NUMBER
+        assert len(set(np.diff(kept))) <= 1
+        return
+    assert len(kept) == min(count, NUMBER)
+    gaps = np.diff([*kept, count])
+    assert gaps.max() - gaps.min() <= 1
