@@ -43,7 +43,8 @@ def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
         return _unit(options.up)
     held = mean_camera_up(run)
     found = level_normal(run.surface, held)
-    return held if found is None else found
+    height = None if found is None else floor_height(run.surface, found)
+    return held if found is None or height is None else fitted(run.surface, Floor(found, height)).up
 
 
 def find_floor(run: RunContent, options: ExportOptions) -> Floor:
@@ -56,7 +57,7 @@ def find_floor(run: RunContent, options: ExportOptions) -> Floor:
     height = None if up is None else floor_height(run.surface, up)
     if up is None or height is None:
         raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
-    return Floor(up, height)
+    return Floor(up, height) if options.up is not None else fitted(run.surface, Floor(up, height))
 
 
 def mean_camera_up(run: RunContent) -> NDArray[np.float64]:
@@ -100,6 +101,21 @@ def floor_height(mesh: Mesh, up: NDArray[np.float64]) -> float | None:
     lowest = heights[np.argmax(layer >= FLOOR_SHARE * sums[-1])]
     inside = (heights >= lowest - LAYER) & (heights <= lowest + 2 * LAYER)
     return float(np.median(heights[inside]))
+
+
+def fitted(mesh: Mesh, floor: Floor) -> Floor:
+    """The plane through the vertices of the floor by least squares, in layers that get thinner to leave out what
+    stands on it: the mean of normals leans towards clutter."""
+    for half in (2 * LAYER, LAYER, LAYER / 2, LAYER / 2):
+        facing = mesh.normals @ floor.up > np.cos(np.radians(15))
+        points = mesh.vertices[facing & (np.abs(mesh.vertices @ floor.up - floor.height) < half)].astype(np.float64)
+        if len(points) < 10:
+            return floor
+        centre = points.mean(axis=0)
+        normal = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
+        normal = normal if normal @ floor.up > 0 else -normal
+        floor = Floor(normal, float(centre @ normal))
+    return floor
 
 
 def y_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
