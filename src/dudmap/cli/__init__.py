@@ -18,6 +18,8 @@ COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
     "merge": "Join the maps of two runs of one place.",
     "export": "Write the results of a run for another program.",
+    "render": "Render the map along a camera path, as a video or a recording.",
+    "clean": "Write a recording as it would have been without what moves.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",
     "demo": "Render a short recording with a walking person and run on it.",
     "synth": "Render a synthetic recording with exact ground truth.",
