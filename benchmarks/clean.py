@@ -2,11 +2,11 @@
 
 python benchmarks/clean.py [--data FOLDER] [--work FOLDER] [--passes N] [--pictures FOLDER] [--out FILE.json]
 
-Synthetic worlds are rendered with and without movers; of the recordings under --data those count that have a static twin
-(NAME_confusao and NAME_static). Each is run with its own labels, then cleaned as `dudmap clean` does. Scored are the pixels
-that show something that moves (true mask) and whose background another frame of the recording shows, judged by true poses
-and the depth of the twin: the share that was filled, PSNR of the colour (dB), and RMSE and median of the depth error (mm).
-For comparison the same of the recording as it is.
+Synthetic worlds are rendered with and without movers; of the recordings under --data those count that have a static
+twin (NAME_confusao and NAME_static). Each is run with its own labels, then cleaned as `dudmap clean` does. Scored are
+the pixels that show something that moves (true mask) and whose background another frame of the recording shows, judged
+by true poses and the depth of the twin: the share that was filled, PSNR of the colour (dB), and RMSE and median of the
+depth error (mm). For comparison the same of the recording as it is.
 """
 
 import argparse
@@ -151,6 +151,7 @@ def save_picture(path, frame, background, truth, moving):
 
 
 def main():
+    """Print one line for each recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with recordings NAME_confusao and NAME_static")
     parser.add_argument("--work", type=Path, help="keeps the run folders here, and uses those that are here already")

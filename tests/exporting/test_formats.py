@@ -13,7 +13,6 @@ import pye57
 import pygltflib
 import pytest
 import trimesh
-from exporting.run_folders import CAMERA, VOXEL, make_run
 from PIL import Image
 from pxr import Usd, UsdGeom
 from ruamel.yaml import YAML
@@ -27,9 +26,9 @@ from dudmap.exporting.gltf import linear_light
 from dudmap.exporting.gravity import find_floor
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
-from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from exporting.run_folders import CAMERA, VOXEL, make_run
 
 
 @pytest.fixture(scope="module")
@@ -229,7 +228,7 @@ def test_floor_is_found(made, run, true_up):
 
 
 def test_nav2_map(made, run, mesh, tmp_path):
-    _, sequence, T_map_true = made
+    T_map_true = made[2]
     path = exported(run, tmp_path / "map.yaml", heights=(0.2, 1.2))
     tree = YAML(typ="safe").load(path)
     assert {"image", "resolution", "origin", "negate", "occupied_thresh", "free_thresh"} <= set(tree)

@@ -77,7 +77,7 @@ def with_filled_holes(mesh: Mesh, longest: float) -> Mesh:
         normals.append((normal / max(np.linalg.norm(normal), 1e-9)).astype(np.float32)[None])
         colors.append(np.rint(mesh.colors[loop].mean(axis=0, keepdims=True)).astype(np.uint8))
         faces.append(np.stack([np.roll(loop, -1), loop, np.full(len(loop), number)], axis=1).astype(np.int32))
-    return Mesh(*(np.concatenate(part) for part in (vertices, faces, colors, normals)))
+    return Mesh(np.concatenate(vertices), np.concatenate(faces), np.concatenate(colors), np.concatenate(normals))
 
 
 def border_loops(faces: NDArray[np.int32]) -> list[NDArray[np.int32]]:
@@ -117,13 +117,11 @@ def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
         from fast_simplification import simplify
     except ImportError:
         raise ConfigError("--max-triangles needs fast-simplification; pip install 'dudmap[export]'") from None
-    from scipy.spatial import cKDTree
+    from scipy.spatial import KDTree
 
-    vertices, faces = simplify(mesh.vertices, mesh.faces, target_count=max_triangles)
-    _, nearest = cKDTree(mesh.vertices).query(vertices)
-    return Mesh(
-        vertices.astype(np.float32), faces.astype(np.int32), mesh.colors[nearest], mesh.normals[nearest]
-    )
+    vertices, faces, *_ = simplify(mesh.vertices.astype(np.float64), mesh.faces, target_count=max_triangles)
+    _, nearest = KDTree(mesh.vertices).query(vertices)
+    return Mesh(vertices.astype(np.float32), faces.astype(np.int32), mesh.colors[nearest], mesh.normals[nearest])
 
 
 def rotated(mesh: Mesh, R: NDArray[np.float64]) -> Mesh:

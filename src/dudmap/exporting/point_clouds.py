@@ -1,6 +1,7 @@
 """Point clouds: the vertices of the mesh, which lie on the surface at most one voxel apart, in the axes of the map."""
 
 from dataclasses import replace
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -72,8 +73,10 @@ def write_laz(run: RunContent, path: Path, options: ExportOptions) -> None:
     data = laspy.LasData(header)
     data.x, data.y, data.z = points.vertices.astype(np.float64).T
     data.red, data.green, data.blue = points.colors.astype(np.uint16).T * 257
+    content = BytesIO()
+    data.write(content, do_compress=True)
     with atomic_file(path) as file:
-        data.write(file, do_compress=True)
+        file.write(content.getbuffer())
 
 
 def write_e57(run: RunContent, path: Path, options: ExportOptions) -> None:

@@ -69,9 +69,7 @@ class SpaceGrid:
                 f"cells of {resolution:g} m in {size} m would be more than {LARGEST:,}; give a larger --resolution, or "
                 "a part of the map by --crop or --drop-pieces-below"
             )
-        grid = cls(
-            np.full(shape, UNKNOWN, np.int8), np.zeros(shape, bool), first * resolution, resolution, T_grid_map
-        )
+        grid = cls(np.full(shape, UNKNOWN, np.int8), np.zeros(shape, bool), first * resolution, resolution, T_grid_map)
         grid._observe(volume)
         grid.occupancy[tuple((np.floor(points / resolution).astype(int) - first).T)] = OCCUPIED
         return grid
@@ -98,9 +96,9 @@ class SpaceGrid:
 
         The vertices are at most a voxel v apart, so a distance d is at most v^2 / (4 d) too large.
         """
-        from scipy.spatial import cKDTree
+        from scipy.spatial import KDTree
 
-        tree = cKDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
+        tree = KDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
         out = np.empty(self.occupancy.size, np.float32)
         for start in range(0, len(out), CHUNK):
             cells = np.arange(start, min(start + CHUNK, len(out)))

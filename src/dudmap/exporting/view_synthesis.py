@@ -116,7 +116,7 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def _colmap_camera(camera: Camera) -> str:
-    """Model, size and parameters: PINHOLE fx fy cx cy, OPENCV with k1 k2 p1 p2, FULL_OPENCV with k3 k4 k5 k6 as well."""
+    """Model, size and parameters: PINHOLE fx fy cx cy, OPENCV with k1 k2 p1 p2, FULL_OPENCV with k3 to k6."""
     numbers = [camera.fx, camera.fy, camera.cx + PIXEL, camera.cy + PIXEL, *camera.distortion]
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV"}[len(camera.distortion)]
     numbers += [0.0] * 3 if model == "FULL_OPENCV" else []

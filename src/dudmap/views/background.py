@@ -173,10 +173,12 @@ def continued(color: NDArray[np.uint8], known: NDArray[np.bool_]) -> NDArray[np.
         return color
     import cv2
 
-    levels = [np.dstack([color * known[..., None].astype(np.float32), known.astype(np.float32)])]
+    first: NDArray = np.dstack([color * known[..., None].astype(np.float32), known.astype(np.float32)])
+    levels = [first]
     while min(levels[-1].shape[:2]) > 1:
         h, w = levels[-1].shape[:2]
-        levels.append(cv2.resize(levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA))
+        half = cv2.resize(levels[-1], ((w + 1) // 2, (h + 1) // 2), interpolation=cv2.INTER_AREA)
+        levels.append(np.asarray(half))
     filled = levels[-1][..., :3] / np.maximum(levels[-1][..., 3:], 1e-6)
     for level in reversed(levels[:-1]):
         h, w = level.shape[:2]

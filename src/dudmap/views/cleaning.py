@@ -70,7 +70,9 @@ class Cleaner:
                 self._masks[index] = masks[float(stamps[mask])]
         self.indices = tuple(self._poses)
         if not self.indices:
-            raise DatasetError(f"no frame of {sequence.name} has a pose in {run.folder}; name the run of this recording")
+            raise DatasetError(
+                f"no frame of {sequence.name} has a pose in {run.folder}; name the run of this recording"
+            )
         color_camera = sequence.camera if run.calibration is None else run.calibration.camera
         self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera)
         self._is_prepared = False

@@ -54,7 +54,9 @@ class Lens:
             import cv2
 
             none = np.zeros(3)
-            uv = cv2.projectPoints(points, none, none, self.camera.K, np.array(self.camera.distortion))[0].reshape(-1, 2)
+            uv = cv2.projectPoints(points, none, none, self.camera.K, np.array(self.camera.distortion))[0].reshape(
+                -1, 2
+            )
         else:
             uv = self.camera.project(points)
         uv = np.where((z > 0)[:, None] & np.isfinite(uv), uv, -1)

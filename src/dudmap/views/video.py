@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dudmap.errors import ConfigError
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
-"""Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 plays in desktop players and takes 3 ms."""
+"""Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
 
 
 class VideoWriter:
