@@ -28,7 +28,7 @@ from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
-from exporting.run_folders import CAMERA, VOXEL, make_run
+from run_folders import CAMERA, VOXEL, make_run
 
 
 @pytest.fixture(scope="module")

@@ -117,7 +117,7 @@ class BackgroundRenderer:
         T_world_color: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
         """Colours (n, 3) of pixels in other frames, with the map's exposure, and which were found (n,)."""
-        import cv2
+        from scipy.ndimage import map_coordinates
 
         points = self.color_lens.points(rows, columns, distances.astype(np.float64))
         points = points @ T_world_color[:3, :3].T + T_world_color[:3, 3]
@@ -129,12 +129,11 @@ class BackgroundRenderer:
                 break
             T = se3.inverse(source.T_world_color)
             uv, z = self.color_lens.project(points[open_] @ T[:3, :3].T + T[:3, 3])
-            u, v = np.ascontiguousarray(uv[:, 0])[None], np.ascontiguousarray(uv[:, 1])[None]
-            there = cv2.remap(source.depth, u, v, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT).reshape(-1)
-            same = np.abs(there - z) < TOLERANCE * z
-            taken = open_[same]
-            colors = cv2.remap(source.color, u[:, same], v[:, same], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-            samples[counts[taken], taken] = colors.reshape(-1, 3) / source.gain
+            same = np.abs(_nearest_pixels(source.depth, uv) - z) < TOLERANCE * z
+            taken, at = open_[same], uv[same, ::-1].T
+            for channel in range(3):
+                values = map_coordinates(source.color[..., channel], at, np.float32, order=1, mode="nearest")
+                samples[counts[taken], taken, channel] = values / source.gain[channel]
             counts[taken] += 1
         out = np.zeros((len(points), 3))
         for count in range(1, SAMPLES + 1):
@@ -150,6 +149,13 @@ class BackgroundRenderer:
             return float(np.linalg.norm(T[:3, 3])) + ANGLE_LENGTH * se3.rotation_angle(T)
 
         return sorted(self.sources, key=distance)
+
+
+def _nearest_pixels(image: NDArray[np.float32], uv: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Values (n,) of the pixels nearest to (n, 2) column and row; 0 outside of the image (H, W)."""
+    u, v = np.rint(uv).astype(np.intp).T
+    inside = (u >= 0) & (v >= 0) & (u < image.shape[1]) & (v < image.shape[0])
+    return np.where(inside, image[np.where(inside, v, 0), np.where(inside, u, 0)], np.float32(0))
 
 
 def exposure_gain(
