@@ -91,8 +91,7 @@ class BackgroundRenderer:
             T_world_camera: (4, 4) pose of the depth image.
             T_world_color: (4, 4) pose of the colour image.
         """
-        rendered = self.volume.raycast(T_world_camera, self.depth_lens.straight).depth
-        depth = np.where(moving, self.depth_lens.distorted(rendered, nearest=True), frame.depth).astype(np.float32)
+        depth = np.where(moving, self.map_depth(T_world_camera), frame.depth).astype(np.float32)
         of_map, distances = self._map_in_color(T_world_color)
         gain = exposure_gain(frame.color, of_map, (distances > 0) & ~moving)
         rows, columns = np.nonzero(moving & (distances > 0))
@@ -103,6 +102,11 @@ class BackgroundRenderer:
         color[rows, columns] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
         known[rows, columns] = True
         return Background(continued(color, known), depth, known)
+
+    def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Depth (H, W) of the map as the depth camera sees it, metres, 0 where nothing is known."""
+        rendered = self.volume.raycast(T_world_camera, self.depth_lens.straight).depth
+        return self.depth_lens.distorted(rendered, nearest=True)
 
     def _map_in_color(self, T_world_color: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
         """Colour (H, W, 3) and depth (H, W) of the map as the colour camera sees it."""
