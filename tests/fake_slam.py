@@ -32,6 +32,8 @@ class FakeResult:
     corrected: bool = False
     blind: bool = False
     uncertain: str = ""
+    balance: None = None
+    calibrated: bool = False
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     labels: None = None
@@ -64,12 +66,19 @@ class FakeSlam:
     saved_map = SimpleNamespace(save_keyframes=lambda path: path.write_bytes(b"keyframes"))
 
     def __init__(
-        self, camera, config, first_pass=None, depth_model=None, calibration=None, saved_map=None, localize=False
+        self,
+        camera,
+        config,
+        first_pass=None,
+        depth_model=None,
+        calibration=None,
+        live=False,
+        saved_map=None,
+        localize=False,
     ):
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
-        self.front_end = SimpleNamespace(time_offset=SimpleNamespace(seconds=-0.015))
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
 
     @property

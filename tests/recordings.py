@@ -45,7 +45,8 @@ def write_recording(
     return folder
 
 
-def cut(path: Path, share: float = 0.6) -> None:
+def cut(path: Path, share: float = 0.6) -> Path:
     """Truncate a file to a share of its size."""
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
+    return path

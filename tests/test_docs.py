@@ -15,6 +15,7 @@ import typer
 
 from dudmap.cli import COMMANDS
 from dudmap.config import Config, keys
+from dudmap.sequences import readers
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
@@ -65,6 +66,11 @@ def test_every_page_is_in_the_index():
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
     for page in PAGES[2:]:
         assert page.name == "README.md" or f"({page.name})" in index
+
+
+def test_every_format_is_in_the_table_of_formats():
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    assert [reader.format for reader in readers() if f"| {reader.format}" not in text] == []
 
 
 @pytest.mark.parametrize("line", shown_commands())

@@ -38,6 +38,10 @@ class SensorConfig(ConfigSection):
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
     row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""
 
+    self_calibration: bool = True
+    """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
+    before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
+
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
         return self.sigma_base + self.sigma_scale * z**2
@@ -391,7 +395,7 @@ class Config(ConfigSection):
 PRESETS: dict[str, dict[str, Any]] = {
     "default": {},
     "thesis": {
-        "sensor": {"color_time_sigma": 0.0},
+        "sensor": {"color_time_sigma": 0.0, "self_calibration": False},
         "volume": {
             "voxel_size": 0.01,
             # The thesis gives no value for its fixed band. 10 cm is the published value of the system it is built on

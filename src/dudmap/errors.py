@@ -20,5 +20,9 @@ class FrameError(DatasetError):
     """One frame of a recording cannot be read; the other frames may be valid."""
 
 
+class CameraError(DudmapError):
+    """A camera or its driver is missing, or the camera stopped to deliver frames."""
+
+
 class MapError(DudmapError):
     """A map or mesh is invalid, or cannot be loaded or saved."""

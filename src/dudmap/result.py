@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.dynamics.masks import Labels
 from dudmap.objects.object_tracker import Mover
+from dudmap.tracking.term_balance import TermBalance
 from dudmap.tracking.tracker import TrackingResult
 
 
@@ -34,7 +35,10 @@ class FrameResult:
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
+        calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
+        balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
+            frame, else None.
     """
 
     timestamp: float
@@ -55,3 +59,5 @@ class FrameResult:
     corrected: bool = False
     blind: bool = False
     uncertain: str = ""
+    balance: TermBalance | None = None
+    calibrated: bool = False

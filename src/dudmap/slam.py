@@ -7,11 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.bootstrap import Bootstrap
+from dudmap.color_calibration import ColorCalibration
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.exposure import exposed, exposed_color
+from dudmap.frames.exposure import exposed
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
@@ -42,6 +43,7 @@ from dudmap.tracking.front_end import FrontEnd
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
+from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
 from dudmap.tracking.tracker import Tracker
 
 
@@ -56,7 +58,9 @@ class Slam:
             static before it moved or before it was seen through.
         depth_model: What is known of the distortion of the depth from earlier runs with the same camera. It is applied
             as it is, and with ``sensor.distortion`` learnt further for the next run.
-        calibration: Of the colour camera; None for colour that is registered to depth.
+        calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
+            as it is; another is where the estimation begins, with ``sensor.self_calibration``.
+        live: A calibration is used as soon as it is found, and not at a fixed frame.
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
@@ -69,13 +73,13 @@ class Slam:
         first_pass: "Slam | None" = None,
         depth_model: DepthDistortion | None = None,
         calibration: Calibration | None = None,
+        live: bool = False,
         saved_map: SavedMap | None = None,
         localize: bool = False,
     ) -> None:
         self.config = config = config or Config()
-        given = (
-            None if calibration is None or calibration.is_registered(replace(camera, distortion=())) else calibration
-        )
+        start = calibration if first_pass is None else first_pass.calibration
+        given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         self.preprocess = Preprocessor(camera, config.preprocess, calibration=given)
         self.camera = self.preprocess.camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
@@ -88,13 +92,14 @@ class Slam:
         known_poses = {}
         keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
         if self.prior_map is None:
-            frame_store = None if localize else self._make_frame_store()
+            frame_store = None if localize else FrameStore.of(config, self.camera)
         else:
             known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
             submap = self.prior_map.submap
             self.detector.import_from(self.prior_map.detector, known_poses)
         self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
         self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
+        self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         self.bootstrap = Bootstrap()
         self._first_mask = np.zeros(self.camera.shape, dtype=bool)
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
@@ -102,6 +107,7 @@ class Slam:
         self.depth_distortion = depth_model or DepthDistortion()
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
+        self.balance = BalanceEstimator(config.sensor, config.preprocess)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
@@ -133,14 +139,12 @@ class Slam:
     @property
     def saved_map(self) -> SavedMap:
         """The main map as a later run goes on in it."""
-        main = self.atlas.by_size()[0]
-        keyframes = [keyframe for keyframe in self.atlas.keyframes.keyframes if keyframe.submap == main]
-        return SavedMap(self.atlas.volumes[main], keyframes, self.monitor.history)
+        return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
 
     @property
     def calibration(self) -> Calibration:
         """Calibration of the colour camera in use."""
-        return self.color_motion.calibration or Calibration.registered(self.camera)
+        return self.color_calibration.current
 
     @property
     def rigid_objects(self) -> list[RigidObject]:
@@ -169,7 +173,7 @@ class Slam:
             start = time.perf_counter()
             observation = self._known_distortion.observation(self.preprocess(frame))
             pyramid = Pyramid.of(observation, self.camera, self.config)
-            if self.predictor.ego_motion.active:
+            if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
@@ -199,26 +203,24 @@ class Slam:
         reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
-        view = self.color_motion.registered(view, estimate.T_world_camera)
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
-            fuse = not (
-                view.blind or uncertain or self.localize or self.redundancy.is_redundant(self.volume, view, estimate)
-            )
+            fuse = not (view.blind or uncertain or self.localize)
+            fuse = fuse and not self.redundancy.is_redundant(self.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
-        self._learn_noise(view, estimate, mask)
+        balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
-        self._add_keyframe(view, estimate, mask)
-        if fuse:
-            self._integrate(view, estimate, mask)
+        self._extend_map(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
+        calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain,
+            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -232,9 +234,9 @@ class Slam:
             return self._result(view, None, mask, reason=reason)
         estimate = PoseEstimate.at_origin()
         self.motion.restart(view.timestamp, estimate.T_world_camera)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
-        self._add_keyframe(view, estimate, mask)
-        self._integrate(view, estimate, mask)
+        self._extend_map(view, estimate, mask, fuse=True)
         self._first_mask = mask
         self.color_motion.start(view)
         if self.config.dynamics.method == "em":
@@ -263,6 +265,7 @@ class Slam:
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
         self.monitor.lose()
+        view = self.color_motion.registered(view, prediction.T_world_camera)
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
@@ -278,6 +281,7 @@ class Slam:
         """Report a lost frame, or start a new submap with it after a while."""
         self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
         self.front_end.lose(view.timestamp)
+        self.color_calibration.interrupt()
         if self.relocalizer.wants_new_submap(view):
             self.atlas.start_submap()
             self.monitor.reset()
@@ -288,7 +292,7 @@ class Slam:
 
     def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Take over the pose and the labels of a frame."""
-        self.front_end.update(self.reference, view, estimate)
+        self.front_end.update(view, estimate)
         self._learn_sensor(view, estimate)
         self.relocalizer.found()
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
@@ -304,10 +308,13 @@ class Slam:
             T_world_camera, known = estimate.T_world_camera, self._known_distortion
             self.depth_distortion.update(self.tracker, self.reference, level, T_world_camera, weights, known)
 
-    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Compare the static readings with the map for the noise of the sensor."""
+    def _learn_noise(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
+    ) -> TermBalance | None:
+        """Compare the static readings with the map for the noise of the sensor and for what the pose rests on."""
         with view.timer("noise"):
             self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
+            return self.balance.update(self.tracker, self.reference, view.pyramid, estimate, self.motion.velocity)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
@@ -318,21 +325,25 @@ class Slam:
                 mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
             return mask if view.known_dynamic is None else mask | view.known_dynamic
 
-    def _add_keyframe(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Keep a frame for relocalization if the camera has been nowhere near."""
+    def _extend_map(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool
+    ) -> None:
+        """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
         if self.config.relocalization.enabled and not (view.blind or self.localize):
             with view.timer("keyframe"):
                 T_world_camera = estimate.T_world_camera
                 self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
+        if fuse:
+            self._integrate(view, estimate, dynamic_mask)
 
     def _integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
         """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
         observation = view.observation
         with view.timer("integrate"):
             static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
-            color = exposed_color(observation.rgb, estimate.exposure)
-            frame = Frame(observation.timestamp, observation.depth, color)
-            self.atlas.integrate(frame, static, estimate.T_world_camera)
+            frame = Frame(observation.timestamp, observation.depth, observation.rgb)
+            recorded = observation.as_recorded
+            self.atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
             self.redundancy.update(self.volume, view, estimate)
 
     def _close_loop(
@@ -366,36 +377,23 @@ class Slam:
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
         uncertain: str = "",
+        balance: TermBalance | None = None,
+        calibrated: bool = False,
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
         readings = view.observation.depth > 0
         return FrameResult(
-            timestamp=view.timestamp,
-            state="lost" if reason else "tracked",
-            lost_reason=reason,
-            T_world_camera=T_world_camera,
-            fused=fused,
+            timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
+            T_world_camera=T_world_camera, fused=fused,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels,
-            tracking=None if estimate is None else estimate.tracking,
-            timings=view.timer.timings,
-            relocalized=relocalized,
-            movers=movers,
-            submap=self.atlas.current,
-            corrected=corrected,
-            blind=view.blind,
-            uncertain=uncertain,
-        )
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
+            relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
+            uncertain=uncertain, balance=balance, calibrated=calibrated,
+        )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
         return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
-
-    def _make_frame_store(self) -> FrameStore | None:
-        loops = self.config.loops
-        if not self.config.relocalization.enabled or not (loops.enabled or self.config.submaps.enabled):
-            return None
-        return FrameStore(self.camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)

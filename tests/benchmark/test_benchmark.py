@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 
 import numpy as np
 import pytest
@@ -19,6 +20,7 @@ from dudmap.cli import app
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
+from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
 
 PUBLIC = ("thesis", "tum-dynamic", "bonn", "icl-nuim")
@@ -58,6 +60,22 @@ def test_recordings_are_found_one_folder_down(data):
     assert len(suite.missing) == 11
     assert len(find_suite("local", data / "tum").entries) == 1
     assert find_suite("tum-dynamic", data, quick=True).entries[0].max_frames == 60
+
+
+def test_recordings_are_found_as_downloaded(tmp_path, monkeypatch):
+    """The data sets of the thesis: folders and archives with the names that their pages give them."""
+    monkeypatch.setenv("DUDMAP_CACHE", str(tmp_path / "cache"))
+    data = tmp_path / "data"
+    write(corbs, data)  # D1_pre_registereddata
+    folder, _ = write(volume_deform, tmp_path / "a")
+    shutil.make_archive(str(data / "boxing"), "zip", folder)
+    folder, _ = write(icl_nuim, tmp_path / "b")
+    shutil.make_archive(str(data / "living_room_traj2n_frei_png"), "gztar", folder)
+    suite = find_suite("thesis", data)
+    assert [entry.name for entry in suite.entries] == ["living_room_traj2n_frei_png", "D1", "boxing"]
+    assert len(suite.missing) == 9
+    for entry in suite.entries:
+        np.testing.assert_allclose(entry.open().ground_truth.Ts_world_camera[-1], pose(2), atol=1e-6)
 
 
 def test_published_figures_belong_to_recordings_of_the_suites_and_name_their_source(tmp_path):

@@ -1,10 +1,14 @@
 """Recovery of the calibration from analytic images of three textured walls, taken by a moving camera."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from dudmap.calibration.adjustment import Adjustment, _State
 from dudmap.calibration.collector import KeyframeCollector
-from dudmap.calibration.estimator import CalibrationEstimator
+from dudmap.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
+from dudmap.calibration.pairs import Pair
 from dudmap.config import PreprocessConfig, SensorConfig
 from dudmap.frames.color_registration import color_projection
 from dudmap.frames.frame import Frame
@@ -85,7 +89,8 @@ def displacement(one: Calibration, other: Calibration) -> float:
     """Root mean square distance of the pixels at which two colour cameras see the first depth image, pixels."""
     depth, backend = record(Calibration.registered(CAMERA), 0).depth, CpuBackend()
     (u, v), (p, q) = (
-        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0) for c in (one, other)
+        backend.color_pixels(depth, CAMERA.intrinsics, color_projection(c, np.zeros(6), 0.0), 1.0, 0, CAMERA.height)
+        for c in (one, other)
     )
     return float(np.sqrt(np.mean((u - p) ** 2 + (v - q) ** 2)))
 
@@ -119,3 +124,67 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
         assert not result.calibration.estimated
         assert result.calibration.is_registered(CAMERA)
     assert np.all(np.isfinite(result.calibration.sigma))
+
+
+class Explained:
+    """Stands for the adjustment: a cost per set of groups that are free, in both halves of the time."""
+
+    levels = (0,)
+
+    def __init__(self, costs: dict[frozenset[str], float]) -> None:
+        self.table, self.asked = costs, []
+
+    def solve(self, pairs, start, free, levels=()):
+        names = frozenset(name for name, members in GROUPS.items() if free[mask_of(members)].all())
+        return replace(start, estimated=tuple(sorted(names))), np.eye(13)
+
+    def costs(self, pairs, calibration):
+        self.asked.append(frozenset(calibration.estimated))
+        wobble = 0.01 * np.cos(np.arange(40.0))
+        return self.table.get(frozenset(calibration.estimated), 1.0) * (1 + wobble)
+
+
+def proven(costs: dict[str, float]) -> set[str]:
+    """Groups that leave their given values, by the cost that every set of groups leaves."""
+    estimator = CalibrationEstimator(Calibration.registered(CAMERA), SensorConfig())
+    table = {frozenset(key.split()): value for key, value in costs.items()}
+    estimator.adjustment = Explained(table)
+    start = _Trial(np.zeros(13, bool), [estimator.given] * 2, [estimator.adjustment.costs([], estimator.given)] * 2)
+    trial, evidence = estimator._proven([[], []], start)
+    assert set(evidence) == set(GROUPS)
+    return {name for name, members in GROUPS.items() if trial.free[mask_of(members)].all()}
+
+
+def test_groups_that_explain_nothing_without_each_other_are_found_together():
+    both = {"geometry timing": 0.5, "geometry timing lens": 0.5, "geometry lens": 1.1, "timing lens": 1.2}
+    alone = {"geometry": 1.1, "timing": 1.05, "lens": 1.02}
+    assert proven(both | alone) == {"geometry", "timing"}  # and not the lens, which adds nothing
+    assert proven(alone | {"geometry timing lens": 0.995}) == set()  # too little to leave the given values
+    assert proven({"timing": 0.8, "timing lens": 0.799, "geometry timing": 0.81}) == {"timing"}
+    everything = {"geometry timing lens": 0.3, "geometry timing": 0.5, "geometry lens": 0.6, "timing lens": 0.7}
+    assert proven(alone | everything) == {"geometry", "timing", "lens"}
+
+
+def test_relative_poses_follow_the_poses_of_both_frames():
+    """A step of the frames' poses in the normal equations of a pair against differences of its depth residuals."""
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    for index in range(30):
+        frame = record(Calibration.registered(CAMERA), index)
+        collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
+    given = Calibration.registered(CAMERA)
+    adjustment = Adjustment(given, SensorConfig())
+    pair = Pair(collector.keyframes[0], collector.keyframes[-1])
+    rng, level, scales = np.random.default_rng(2), adjustment.levels[-1], (1e6, 1.0)  # colour counts for nothing
+
+    def cost_and_gradient(steps):
+        state = _State([pair], given)
+        state.move(np.concatenate([np.zeros(13), *steps]), [])
+        part = adjustment._linearize_pair(pair, state, 0, level, scales)
+        return part.b[13:], part.H[13:, 13:]
+
+    start = [rng.normal(0, 2e-3, 6), rng.normal(0, 2e-3, 6)]
+    step = [rng.normal(0, 2e-4, 6), rng.normal(0, 2e-4, 6)]
+    before, H = cost_and_gradient(start)
+    after, _ = cost_and_gradient([a + b for a, b in zip(start, step, strict=True)])
+    predicted = H @ np.concatenate(step)  # the change of the gradient
+    assert np.linalg.norm(after - before - predicted) < 0.15 * np.linalg.norm(predicted)

@@ -150,6 +150,15 @@ def test_parameters_come_from_file_preset_and_single_assignments(slam, recording
     assert "are mutually exclusive" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
 
 
+def test_a_calibration_that_is_given_is_not_estimated(slam, recording):
+    call("run", recording, "--out", "a")
+    assert Config.load("a/config.toml").sensor.self_calibration
+    call("run", recording, "--out", "b", "--calibration", "given")
+    assert not Config.load("b/config.toml").sensor.self_calibration
+    call("run", recording, "--out", "c", "--calibration", "a/calibration.toml")
+    assert not Config.load("c/config.toml").sensor.self_calibration
+
+
 @pytest.mark.parametrize(
     ("arguments", "sentence"),
     [
@@ -209,7 +218,7 @@ def spoil_all_truncated(folder):
     ("spoil", "sentence"),
     [
         (spoil_missing, "there is no folder"),
-        (spoil_empty, "is empty; expected a recording with rgb.txt and depth.txt"),
+        (spoil_empty, "is empty; expected a recording"),
         (spoil_times, "no colour image lies within 20 ms of a depth image"),
         (spoil_nan, "depth.txt, line 1: the timestamp 'nan' is not a finite number of seconds"),
         (spoil_order, "depth.txt, line 2: the timestamp 1.000000 comes after 2.000000"),
@@ -232,6 +241,13 @@ def test_a_truncated_image_in_the_middle_is_skipped_and_counted(slam, recording)
     assert "skipped: frame 2" in result.stderr
     metrics = json.loads(result.stdout)
     assert (metrics["frames"], metrics["tracked"], metrics["unreadable"]) == (6, 5, 1)
+
+
+def test_what_looks_wrong_is_said_before_the_run(slam, recording):
+    result = call("run", recording, "--camera", "60,90,31.5,23.5", "--json")
+    assert result.exit_code == 0
+    assert "warning: the intrinsics of the depth camera look wrong: focal lengths of 60 and 90" in result.stderr
+    assert json.loads(result.stdout)["frames"] == 6
 
 
 def test_ctrl_c_saves_and_says_so(slam, recording):

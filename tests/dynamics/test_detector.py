@@ -1,7 +1,6 @@
 """Labels: the mixture against EM on raw samples, the label kernels against plain Python, whole frames."""
 
 from collections import deque
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +9,6 @@ from dudmap import synthetic
 from dudmap.benchmark.systems import systems
 from dudmap.config import Config
 from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture
-from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling
 from dudmap.slam import Slam
@@ -124,20 +122,6 @@ def test_the_threshold_rule_leaves_an_empty_room_alone():
     results = [slam.process(sequence[index]) for index in range(20)]
     assert all(result.state == "tracked" for result in results)
     assert max(result.dynamic_share for result in results) < 0.05
-
-
-def test_the_depth_is_compared_from_where_it_was_taken(monkeypatch):
-    """A depth image taken 0.36 degrees after its colour image, which decides the pose; the delay says so."""
-    camera = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
-    sequence = synthetic.sequence("room", movers=(), frames=4, camera=camera, noise="none", seed=4)
-    (first, second), slam = [sequence[index] for index in range(2)], Slam(sequence.camera)
-    for index in range(5):  # too few for what is usual, since exact depth makes that tiny
-        slam.process(replace(first, timestamp=index / 30))
-    Ts = sequence.ground_truth.Ts_world_camera
-    monkeypatch.setattr(slam.front_end.time_offset, "depth_pose", lambda *_: se3.inverse(Ts[0]) @ Ts[1])
-    late = slam.process(replace(first, timestamp=0.2, depth=second.depth))
-    assert late.state == "tracked"
-    assert np.nanmedian(np.abs(late.residuals)) < 0.004  # 8 mm from where the colour was taken
 
 
 def test_every_method_runs_and_none_labels_nothing(recording):

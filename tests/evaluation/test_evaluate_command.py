@@ -8,9 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.cli import app
+from dudmap.evaluation.files import find_reference, load_reference, tracked_share
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from layouts import bonn, pose, replica, tum_line, write
 
 
 def evaluate(*arguments):
@@ -165,3 +167,15 @@ def test_help_names_all_three():
     for name in ("trajectory", "mesh", "masks"):
         assert name in evaluate("--help").stdout
         assert "--json" in evaluate(name, "--help").stdout
+
+
+def test_the_truth_of_a_recording_is_read_as_its_format_stores_it(tmp_path):
+
+    for layout, stamps in ((bonn, [100, 100.1, 100.2]), (replica, [0, 1 / 30, 2 / 30])):
+        folder, _ = write(layout, tmp_path / layout.__name__)
+        found = find_reference(folder, None)
+        np.testing.assert_allclose(load_reference(found).Ts_world_camera, [pose(k) for k in range(3)], atol=1e-6)
+        assert tracked_share(2, None, found) == pytest.approx(2 / 3, abs=1e-6)
+        estimate = tmp_path / f"{layout.__name__}.txt"
+        estimate.write_text("".join(tum_line(f"{t:.6f}", pose(k)) for k, t in enumerate(stamps)))
+        assert figures(estimate, "--reference", folder)["ate_rmse_m"] == pytest.approx(0, abs=1e-5)

@@ -1,6 +1,7 @@
 """Preprocessing against slow oracles that follow the equations literally."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,6 +11,8 @@ from dudmap.errors import DatasetError
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import halved
+from dudmap.geometry import se3
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
@@ -322,3 +325,20 @@ def test_a_mask_goes_back_into_the_recorded_image():
 def test_without_distortion_a_mask_stays_as_it_is():
     mask = np.random.default_rng(5).random(CAMERA.shape) < 0.3
     assert Preprocessor(CAMERA).distorted(mask) is mask
+
+
+def test_colours_of_another_time_are_left_to_those_who_know_the_motion():
+    camera = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
+    rng = np.random.default_rng(5)
+    depth, color = np.full((120, 160), 2.0, np.float32), rng.integers(0, 256, (120, 160, 3), dtype=np.uint8)
+    late = replace(Calibration.registered(camera), delay=0.02)
+    seen = Preprocessor(camera, calibration=late)(Frame(1.0, depth, color))
+    assert np.array_equal(seen.rgb, color)
+    assert np.array_equal(seen.recorded_rgb, color)
+    moved = replace(Calibration.registered(camera), T_color_depth=se3.exp(np.array([0.1, 0, 0, 0, 0, 0])))
+    seen = Preprocessor(camera, calibration=moved)(Frame(1.0, depth, color))  # taken together: registered at once
+    assert not np.array_equal(seen.rgb, color)
+    small = replace(late, camera=camera.resized(80, 60))
+    seen = Preprocessor(camera, calibration=small)(Frame(1.0, depth, color[::2, ::2].copy()))
+    assert seen.rgb.shape == (120, 160, 3)
+    assert seen.recorded_rgb.shape == (60, 80, 3)

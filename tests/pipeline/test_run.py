@@ -15,6 +15,7 @@ from dudmap.pipeline.frame_source import read_ahead
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from fake_slam import SECOND, FakeVolume
+from layouts import corbs, replica, write
 from recordings import HEIGHT, WIDTH, cut, write_recording
 
 
@@ -44,7 +45,7 @@ def test_the_run_folder(slam, recording, tmp_path):
     expected = {
         "sequence": "desk", "complete": True, "frames": 8, "tracked": 7, "fused": 6, "skipped_similar": 1, "lost": 1,
         "unreadable": 0, "map_blocks": 3, "map_bytes": 12345, "mesh_vertices": 3, "mesh_triangles": 1,
-        "depth_delay_ms": -15.0, "depth_noise": {"base": 0.001, "scale": 0.002},
+        "depth_noise": {"base": 0.001, "scale": 0.002},
         "lost_frames": [{"timestamp": 100.2, "reason": "too few inliers"}],
     }  # fmt: skip
     assert {key: metrics[key] for key in expected} == expected
@@ -197,6 +198,10 @@ def test_neither_the_recording_nor_the_masks_given_are_overwritten(slam, recordi
     folder = write_recording(tmp_path / "recording", 3)
     (folder / "masks").mkdir()
     (folder / "masks" / "0.png").write_bytes(b"truth")
+    for layout in (replica, corbs):
+        other, _ = write(layout, tmp_path / layout.__name__)
+        with pytest.raises(DudmapError, match="holds a recording"):
+            go(recording, other)
     with pytest.raises(DudmapError, match="holds a recording"):
         go(recording, folder)
     assert (folder / "masks" / "0.png").exists()

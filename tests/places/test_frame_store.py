@@ -121,3 +121,21 @@ def test_poses_and_masks_replace_the_stored_ones(room):
     assert known.any()
     np.testing.assert_array_equal(weights[1][known], np.minimum(3 * weights[0][known].astype(int), 255))
     assert not (once.raycast(Ts[0]).depth > 0)[:, 90:].any()
+
+
+def test_colours_are_stored_as_recorded_and_registered_when_they_are_read():
+    frame = smooth_frame(np.random.default_rng(4), 1.0)
+    recorded = Frame(1.0, frame.depth, np.ascontiguousarray(frame.color[:60, :80]), 1.02)  # another camera's size
+    history, asked = FrameStore(CAMERA, gap=1), []
+
+    def registered(stored):
+        asked.append(stored)
+        return Frame(stored.timestamp, stored.depth, frame.color, stored.color_timestamp)
+
+    history.add(recorded, np.ones((120, 160), dtype=bool), shifted(0), exposure=(0.5, 0.0))
+    assert history[0].frame.color.shape == (60, 80, 3)  # as they are
+    assert np.abs(history[0].frame.color - 0.5 * recorded.color).mean() < 2
+    history.registered = registered
+    assert np.array_equal(history[0].frame.color, frame.color)
+    assert asked[0].color_timestamp == 1.02
+    assert asked[0].color.shape == (60, 80, 3)

@@ -174,15 +174,21 @@ def test_association_agrees_with_all_pairs():
 
 
 def test_missing_empty_or_other_folders(tmp_path):
-    with pytest.raises(DatasetError, match="there is no folder"):
+    with pytest.raises(DatasetError, match="there is no folder or file"):
         open_sequence(tmp_path / "nowhere")
     with pytest.raises(DatasetError, match="is empty"):
         open_sequence(tmp_path)
     (tmp_path / "rgb.txt").write_text("0 a.png\n")
     with pytest.raises(DatasetError, match=r"not a recording in TUM layout: depth\.txt not found"):
         open_sequence(tmp_path)
-    with pytest.raises(DatasetError, match="is a file"):
+    with pytest.raises(DatasetError, match=r"is a file in no known format; dudmap reads .*TUM RGB-D"):
         open_sequence(tmp_path / "rgb.txt")
+
+
+def test_an_option_of_another_format(recording):
+    with pytest.raises(DatasetError, match="in the format TUM RGB-D, which has no --topics"):
+        open_sequence(recording, topics=["/camera"])
+    assert len(open_sequence(recording, topics=None)) == 5
 
 
 def test_unknown_camera(tmp_path):
@@ -317,19 +323,6 @@ def test_a_bad_mask_and_a_bad_ground_truth(recording):
     (recording / "groundtruth.txt").write_text("100 1 2 3\n")
     with pytest.raises(DatasetError, match="expected eight finite numbers"):
         open_sequence(recording)
-
-
-def test_an_icl_nuim_folder_has_its_camera_and_its_own_name_of_the_true_trajectory(tmp_path):
-    folder = write_recording(tmp_path / "living_room_traj2n_frei_png", 3, intrinsics=None)
-    for path in [*folder.glob("rgb/*.png"), *folder.glob("depth/*.png")]:
-        image = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(path), cv2.resize(image, (640, 480), interpolation=cv2.INTER_NEAREST))
-    (folder / "livingRoom2n.gt.freiburg").write_text("100 0 0 0 0 0 0 1\n100.1 1 0 0 0 0 0 1\n")
-    sequence = open_sequence(folder)
-    assert (sequence.camera.fx, sequence.camera.fy) == (481.2, 480.0)
-    assert len(sequence.ground_truth) == 2
-    (folder / "second.gt.freiburg").write_text("100 0 0 0 0 0 0 1\n")
-    assert open_sequence(folder).ground_truth is None
 
 
 SECOND = "fx 60\nfy 60\ncx 31.5\ncy 23.5\ncolor_fx 80\ncolor_fy 81\ncolor_cx 39.5\ncolor_cy 29.5\ncolor_width 80\n"

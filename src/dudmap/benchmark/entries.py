@@ -18,7 +18,7 @@ class Entry:
 
     Attributes:
         name: Name in tables, folders and published figures.
-        path: Folder of a recording on disk; None for a synthetic one.
+        path: Folder, file or archive of a recording on disk; None for a synthetic one.
         parameters: Arguments of ``dudmap.synthetic.sequence``; ``camera`` is a (width, height) in pixels, ``faults`` a
             mapping of the fields of ``SensorFaults`` that differ from those of the sensor.
         address: Public page it can be downloaded from, empty if there is none.
@@ -79,5 +79,5 @@ def local_entries(data: Path) -> list[Entry]:
     folders = [data, *sorted(child for child in data.iterdir() if child.is_dir())]
     found = [Entry(folder.resolve().name, folder) for folder in folders if is_recording(folder)]
     if not found:
-        raise DatasetError(f"no recording found in {data}; expected folders with rgb.txt and depth.txt")
+        raise DatasetError(f"no recording found in {data}; `dudmap info` says what it finds in a folder")
     return found

@@ -76,7 +76,8 @@ def measure_sequence(
         max_frames: Use only the first frames.
         samples: Number of points sampled on each surface.
         passes: See ``dudmap.pipeline.run.run``.
-        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does.
+        calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the recording
+            is taken as given.
 
     Raises:
         DudmapError: The recording cannot be used, or no frame could be tracked.
@@ -88,6 +89,8 @@ def measure_sequence(
     from dudmap.synthetic.recording import SyntheticSequence
 
     ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
+    if not calibrate:
+        config = config.override(["sensor.self_calibration=false"])
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = out or Path(temporary)
         report = run(

@@ -5,6 +5,7 @@ from pathlib import Path
 
 from dudmap.benchmark.entries import Entry, local_entries
 from dudmap.errors import ConfigError, DatasetError
+from dudmap.sequences.archive import is_archive, stem
 
 TUM = "https://cvg.cit.tum.de/data/datasets/rgbd-dataset/download"
 BONN = "https://www.ipb.uni-bonn.de/data/rgbd-dynamic-dataset/"
@@ -169,7 +170,13 @@ def _entries(suite: str) -> list[Entry]:
 
 
 def _located(entries: list[Entry], data: Path) -> tuple[list[Entry], list[Entry]]:
-    """Entries whose folder is found in ``data`` or one level below, and the others."""
-    folders = {path.name: path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern)) if path.is_dir()}
-    found = [replace(entry, path=folders[entry.name]) for entry in entries if entry.name in folders]
-    return found, [entry for entry in entries if entry.name not in folders]
+    """Entries whose folder or archive is found in ``data`` or one level below, and the others.
+
+    The images of a CoRBS scene are in ``<name>_pre_registereddata``, as downloaded.
+    """
+    places = [path for pattern in ("*/*", "*") for path in sorted(data.glob(pattern))]
+    found = {stem(path): path for path in places if is_archive(path)} | {p.name: p for p in places if p.is_dir()}
+    for name in list(found):
+        found.setdefault(name.removesuffix("_pre_registereddata"), found[name])
+    located = [replace(entry, path=found[entry.name]) for entry in entries if entry.name in found]
+    return located, [entry for entry in entries if entry.name not in found]

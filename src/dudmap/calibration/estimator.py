@@ -6,11 +6,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.calibration.keyframes import SAME_SURFACE, ColorKeyframe, color_levels
+from dudmap.calibration.adjustment import Adjustment
+from dudmap.calibration.keyframes import ColorKeyframe
+from dudmap.calibration.pairs import Pair, select_across, select_pairs
 from dudmap.config import SensorConfig
-from dudmap.geometry import se3
 from dudmap.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
-from dudmap.kernels.color_pairs import UNKNOWNS, linearize_pair
 
 GROUPS: dict[str, tuple[str, ...]] = {
     "timing": ("delay", "readout"),
@@ -20,37 +20,6 @@ GROUPS: dict[str, tuple[str, ...]] = {
 """Parameters that leave their given values together. The translation follows the rest of the geometry: most of it looks
 like a rotation, which alone proves that the cameras are not where they are said to be."""
 TRANSLATION = ("translation_x", "translation_y", "translation_z")
-PRIOR_SIGMA = np.array([0.03] * 3 + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
-"""Standard deviations of a camera about which nothing is known but what is given, in the units of ``PARAMETERS``; that
-of the principal point is a share of the width. Colour cameras lie 15 to 32 mm from their depth cameras; uncorrected
-focal lengths differ by up to 10 %; a lens that is not corrected bends by some per cent; a frame at 30 Hz takes
-33 ms."""
-POSE_SIGMA = np.array([0.02] * 3 + [np.radians(1)] * 3)
-"""Standard deviation of the tracked relative pose of two frames, metres and radians: it binds only directions in which
-the depth images of a pair say nothing."""
-LIGHT_SIGMA = np.array([0.3, 0.1])
-"""Standard deviations of gain and offset between two images."""
-CORRELATED = 50.0
-"""Neighbouring points whose errors are correlated and which together count as one against the priors."""
-COST_SCALES = (0.01, 1.0)
-"""The same for the cost of a pair, fixed so that costs are comparable; 0.01 is the noise of common colour cameras."""
-HUBER = 1.345
-"""Constant of the robust weight, standard deviations: 95 % efficiency for Gaussian errors."""
-ITERATIONS = 8
-"""Largest number of Gauss-Newton steps per image size."""
-FIT_ITERATIONS = 3
-"""Steps per image size by which the pose of a pair is fitted with a known calibration."""
-SETTLED = 0.01
-"""A step below this many prior standard deviations in every parameter ends an image size."""
-FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
-"""Standard deviations of the intensity difference (0..1) and of the depth difference over sigma(z) at the start, and
-the least."""
-MAX_ANGLE, MIN_ANGLE = np.radians(30), np.radians(2)
-"""Rotation between the frames of a pair: enough to tell the cameras apart, little enough to see the same."""
-MIN_FASTER = 0.2
-"""Difference of velocity (m/s, rad/s) with which two views at no angle also make a pair."""
-MAX_SHIFT = 0.35
-"""Largest translation between the frames of a pair over the median depth."""
 MIN_PAIRS = 14
 """Pairs of either half of the time without which nothing is estimated: one more than parameters."""
 PAIRS = 80
@@ -63,24 +32,6 @@ recording with such a depth (TUM fr1_xyz) the geometry gained 2 to 4 % and its u
 EVIDENCE = 2.0
 """Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
 pairs of the other half. Chance does so in both halves once in 2000 times."""
-
-
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """Two frames that see the same surfaces, with what they do not share with other pairs.
-
-    Attributes:
-        first, second: The frames.
-        T_second_first: (4, 4) current estimate.
-        T_tracked: (4, 4) as tracked.
-        light: (2,) gain and offset of the second image over the first.
-    """
-
-    first: ColorKeyframe
-    second: ColorKeyframe
-    T_second_first: NDArray[np.float64]
-    T_tracked: NDArray[np.float64]
-    light: NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,61 +59,19 @@ class _Trial:
     free: NDArray[np.bool_]
     known: list[Calibration]
     costs: list[NDArray[np.float64]]
-    evidence: float
-    gain: float
 
+    def improvement(self, other: "_Trial") -> tuple[float, float]:
+        """Decrease of the cost from another trial on, in standard errors and as a share; the smaller one of both
+        halves."""
+        gains = [before - after for before, after in zip(other.costs, self.costs, strict=True)]
+        errors = [float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-12)) for gain in gains]
+        shares = [float(gain.mean() / before.mean()) for gain, before in zip(gains, other.costs, strict=True)]
+        return min(errors), min(shares)
 
-@dataclass(frozen=True, eq=False)
-class _PairSystem:
-    """Normal equations of a pair in the parameters alone (``H``, ``score``), and what gives its own unknowns."""
-
-    H: NDArray[np.float64]
-    score: NDArray[np.float64]
-    inverse: NDArray[np.float64]
-    across: NDArray[np.float64]
-    own_b: NDArray[np.float64]
-    residuals: NDArray[np.float32]
-    misfit: float
-
-    def moved(self, pair: Pair, step: NDArray[np.float64]) -> Pair:
-        """The pair after a step (13,) of the parameters."""
-        own = -self.inverse @ (self.own_b + self.across.T @ step)
-        return replace(pair, T_second_first=se3.exp(own[:6]) @ pair.T_second_first, light=pair.light + own[6:])
-
-
-@dataclass(frozen=True, eq=False)
-class _System:
-    """Normal equations of all pairs in the parameters alone, and the scales of both residuals."""
-
-    H: NDArray[np.float64]
-    b: NDArray[np.float64]
-    parts: list[_PairSystem]
-    scales: tuple[float, float]
-
-
-def select_pairs(keyframes: Sequence[ColorKeyframe], count: int) -> list[Pair]:
-    """Up to ``count`` pairs of overlapping views at an angle or at different velocities, drawn evenly."""
-    return _drawn([(a, b) for n, b in enumerate(keyframes) for a in keyframes[:n]], count)
-
-
-def select_across(before: Sequence[ColorKeyframe], after: Sequence[ColorKeyframe], count: int) -> list[Pair]:
-    """The same of one frame each of two groups."""
-    return _drawn([(a, b) for b in after for a in before], count)
-
-
-def _drawn(candidates: list[tuple[ColorKeyframe, ColorKeyframe]], count: int) -> list[Pair]:
-    found = []
-    for first, second in candidates:
-        T = se3.inverse(second.T_world_camera) @ first.T_world_camera
-        reach = float(np.median(first.points[:, 2])) if len(first.points) else 0.0
-        angle, shift = se3.rotation_angle(T), float(np.linalg.norm(T[:3, 3]))
-        if angle > MAX_ANGLE or shift > MAX_SHIFT * reach:
-            continue
-        faster = float(np.abs(first.velocity - second.velocity).max())
-        if angle > MIN_ANGLE or shift > np.sin(MIN_ANGLE) * reach or faster > MIN_FASTER:
-            found.append(Pair(first, second, T, T, np.array([1.0, 0.0])))
-    order = np.random.default_rng(0).permutation(len(found))[:count]
-    return [found[n] for n in sorted(order)]
+    def proves(self, other: "_Trial", group: str) -> bool:
+        """Whether it explains so much more than another trial that a group may leave its given values."""
+        evidence, share = self.improvement(other)
+        return evidence >= EVIDENCE and share >= MATERIAL[group]
 
 
 def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
@@ -179,10 +88,11 @@ class CalibrationEstimator:
         r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
 
     An error of theta moves the colours of both frames, but not alike: by a turn of the camera it is turned along, with
-    the velocities it changes. theta is common to all pairs; T, g and o are unknowns of each pair and eliminated by
-    the Schur complement. Robust Gauss-Newton, coarse to fine, with priors at the given values. The covariance is a
-    sandwich with one score per frame, the sum of those of its pairs: it admits that the pixels of a pair, and the pairs
-    of a frame, err together (Aronow, Samii and Assenova 2015, without the correction for pairs counted twice).
+    the velocities it changes. theta is common to all pairs, T follows from the poses of both frames, which are unknowns
+    too, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given
+    values. The covariance is a sandwich with one score per frame, the sum of those of its pairs: it admits that the
+    pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
+    for pairs counted twice).
 
     Args:
         given: The calibration as given.
@@ -191,11 +101,7 @@ class CalibrationEstimator:
 
     def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
         self.given = given
-        self.sensor = sensor
-        self.levels = color_levels(given.camera)
-        sigma = PRIOR_SIGMA.copy()
-        sigma[7:9] *= given.camera.width
-        self.prior = CORRELATED * sigma**-2
+        self.adjustment = Adjustment(given, sensor)
 
     def estimate(self, keyframes: Sequence[ColorKeyframe], count: int = PAIRS) -> Estimate:
         """Calibration that explains pairs of frames, as far as they prove it.
@@ -213,140 +119,69 @@ class CalibrationEstimator:
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
         if min(len(pairs) for pairs in halves) < MIN_PAIRS:
             return Estimate(self.given, dict.fromkeys(GROUPS, float("nan")), 0.0, sum(map(len, halves)))
-        free, evidence = ~everything, {}
         known = [self.given, self.given]  # from the first and from the second half
-        costs = [self._explained(halves[1 - n], known[n]) for n in (0, 1)]
-        first_costs = costs
-        while len(rest := [name for name in GROUPS if not free[mask_of(GROUPS[name])].all()]) > 0:
-            trials = {name: self._trial(halves, known, costs, free | mask_of(GROUPS[name])) for name in rest}
-            evidence |= {name: trial.evidence for name, trial in trials.items()}
-            best = max(rest, key=lambda name: trials[name].evidence)
-            if evidence[best] < EVIDENCE or trials[best].gain < MATERIAL[best]:
-                break
-            chosen = trials[best]
-            if best == "geometry":
-                chosen = self._trial(halves, chosen.known, costs, chosen.free | mask_of(TRANSLATION))
-            free, known, costs = chosen.free, chosen.known, chosen.costs
+        start = _Trial(~everything, known, [self.adjustment.costs(halves[1 - n], known[n]) for n in (0, 1)])
+        proven, evidence = self._proven(halves, start)
         pairs = [*halves[0], *halves[1], *select_across(keyframes[:middle], keyframes[middle:], count // 2)]
-        found, covariance = self._solve(pairs, known[1], free) if free.any() else (self.given, None)
-        _, uncertain = self._solve(pairs, found, everything, self.levels[-1:])
+        free = proven.free
+        found, covariance = self.adjustment.solve(pairs, proven.known[1], free) if free.any() else (self.given, None)
+        _, uncertain = self.adjustment.solve(pairs, found, everything, self.adjustment.levels[-1:])
         sigma = np.sqrt(np.diag(uncertain))
         if covariance is not None:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
         estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
-        gain = 1 - float(np.concatenate(costs).mean() / np.concatenate(first_costs).mean())
+        gain = 1 - float(np.concatenate(proven.costs).mean() / np.concatenate(start.costs).mean())
         return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
 
-    def _trial(
-        self,
-        halves: list[list[Pair]],
-        known: list[Calibration],
-        costs: list[NDArray[np.float64]],
-        free: NDArray[np.bool_],
-    ) -> "_Trial":
-        """What the parameters that are free would explain."""
+    def _proven(self, halves: list[list[Pair]], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
+        """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
+        trial, evidence, rest = start, dict[str, float](), list(GROUPS)
+        while rest:
+            trials = {name: self._trial(halves, trial, [name]) for name in rest}
+            evidence |= {name: other.improvement(trial)[0] for name, other in trials.items()}
+            best = max(rest, key=lambda name: evidence[name])
+            if not trials[best].proves(trial, best):
+                break
+            trial = self._with_translation(halves, trial, trials[best])
+            rest.remove(best)
+        if len(rest) > 1:
+            together, names = self._together(halves, trial, rest)
+            evidence |= names
+            trial = self._with_translation(halves, trial, together)
+        return trial, evidence
+
+    def _together(
+        self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]
+    ) -> tuple["_Trial", dict[str, float]]:
+        """Groups none of which explains anything without the others, and the evidence of each beside the others.
+
+        While the focal length is wrong, no delay explains what a delay does, and the other way round. All groups are
+        freed; those without which the others do as well are given up one by one.
+        """
+        trial, names = self._trial(halves, before, names), list(names)
+        while len(names) > 1 and all(trial.proves(before, name) for name in names):
+            fewer = {name: self._trial(halves, before, [n for n in names if n != name]) for name in names}
+            evidence = {name: trial.improvement(other)[0] for name, other in fewer.items()}
+            weakest = min(names, key=lambda name: evidence[name])
+            needless = [name for name in (weakest, *names) if not trial.proves(fewer[name], name)]
+            if not needless:
+                return trial, evidence
+            names.remove(needless[0])
+            trial = fewer[needless[0]]
+        return before, {}
+
+    def _trial(self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]) -> "_Trial":
+        """What groups of parameters would explain in addition to those that are free."""
+        return self._freed(halves, before, before.free | mask_of([member for name in names for member in GROUPS[name]]))
+
+    def _with_translation(self, halves: list[list[Pair]], before: "_Trial", trial: "_Trial") -> "_Trial":
+        """The same with the translation, if the rest of the geometry has just left its given values."""
+        if not (trial.free & ~before.free)[mask_of(GROUPS["geometry"])].any():
+            return trial
+        return self._freed(halves, trial, trial.free | mask_of(TRANSLATION))
+
+    def _freed(self, halves: list[list[Pair]], before: "_Trial", free: NDArray[np.bool_]) -> "_Trial":
         # only the geometry can displace the colours by so much that the smallest images have to begin
-        levels = self.levels if (free & mask_of(GROUPS["geometry"])).any() else self.levels[-2:]
-        found = [self._solve(halves[n], known[n], free, levels)[0] for n in (0, 1)]
-        new = [self._explained(halves[1 - n], found[n]) for n in (0, 1)]
-        gains = [before - after for before, after in zip(costs, new, strict=True)]
-        errors = [float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-12)) for gain in gains]
-        shares = [float(gain.mean() / before.mean()) for gain, before in zip(gains, costs, strict=True)]
-        return _Trial(free, found, new, min(errors), min(shares))
-
-    def _solve(
-        self,
-        pairs: Sequence[Pair],
-        start: Calibration,
-        free: NDArray[np.bool_],
-        levels: Sequence[int] = (),
-    ) -> tuple[Calibration, NDArray[np.float64]]:
-        """Robust Gauss-Newton from coarse to fine over the free parameters; calibration and covariance (13, 11)."""
-        calibration, scales, system = start, FIRST_SCALES, None
-        pairs = [replace(pair, T_second_first=pair.T_tracked, light=np.array([1.0, 0.0])) for pair in pairs]
-        for level in levels or self.levels:
-            for _ in range(ITERATIONS):
-                system = self._linearize(pairs, calibration, level, scales)
-                deviation = self.given.step_to(calibration)
-                step = np.zeros(NUM_PARAMETERS)
-                H = system.H + np.diag(self.prior)
-                b = system.b + self.prior * deviation
-                step[free] = -np.linalg.solve(H[np.ix_(free, free)], b[free])
-                calibration, scales = calibration.retract(step), system.scales
-                pairs = [part.moved(pair, step) for pair, part in zip(pairs, system.parts, strict=True)]
-                if np.all(np.abs(step) * np.sqrt(self.prior / CORRELATED) < SETTLED):
-                    break
-        assert system is not None
-        bread = np.linalg.inv(system.H + np.diag(self.prior))
-        scores: dict[float, NDArray[np.float64]] = {}
-        for pair, part in zip(pairs, system.parts, strict=True):
-            for frame in (pair.first, pair.second):
-                scores[frame.timestamp] = scores.get(frame.timestamp, 0.0) + part.score
-        by_frame = np.array(list(scores.values()))
-        few = len(by_frame) / max(len(by_frame) - np.count_nonzero(free), 1)
-        meat = few * by_frame.T @ by_frame + CORRELATED * np.diag(self.prior)
-        return calibration, bread @ meat @ bread
-
-    def _explained(self, pairs: Sequence[Pair], calibration: Calibration) -> NDArray[np.float64]:
-        """Mean robust cost (P,) of pairs whose poses are fitted with a calibration."""
-        fitted = [replace(pair, T_second_first=pair.T_tracked, light=np.array([1.0, 0.0])) for pair in pairs]
-        still, system = np.zeros(NUM_PARAMETERS), None
-        for level in self.levels[-2:]:
-            for _ in range(FIT_ITERATIONS):
-                system = self._linearize(fitted, calibration, level, COST_SCALES)
-                fitted = [part.moved(pair, still) for pair, part in zip(fitted, system.parts, strict=True)]
-        assert system is not None
-        return np.array([part.misfit for part in system.parts])
-
-    def _linearize(
-        self, pairs: Sequence[Pair], calibration: Calibration, level: int, scales: tuple[float, float]
-    ) -> _System:
-        parts = [self._linearize_pair(pair, calibration, level, scales) for pair in pairs]
-        color = np.concatenate([part.residuals[0] for part in parts])
-        depth = np.concatenate([part.residuals[1] for part in parts])
-        new = tuple(1.4826 * _median_abs(values, old) for values, old in zip((color, depth), scales, strict=True))
-        H, b = sum(part.H for part in parts), sum(part.score for part in parts)
-        return _System(np.asarray(H), np.asarray(b), parts, (max(new[0], LEAST_SCALE), max(new[1], LEAST_SCALE)))
-
-    def _linearize_pair(
-        self, pair: Pair, calibration: Calibration, level: int, scales: tuple[float, float]
-    ) -> "_PairSystem":
-        """Normal equations of a pair with its own unknowns eliminated."""
-        first, second = pair.first, pair.second
-        camera = calibration.camera.scaled(level)
-        number = self.levels.index(level)
-        H, b = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-        residuals = np.empty((2, len(first.points)), np.float32)
-        linearize_pair(
-            first.points, first.tangents, pair.T_second_first[:3].astype(np.float32),
-            second.depth, second.camera.intrinsics,
-            first.intensities[number], second.intensities[number],
-            first.velocity.astype(np.float32), second.velocity.astype(np.float32),
-            np.float32(first.color_offset + calibration.delay), np.float32(second.color_offset + calibration.delay),
-            calibration.T_color_depth[:3].astype(np.float32), camera.intrinsics, calibration.lens.astype(np.float32),
-            np.float32(1 / (1 << level)), np.float32(calibration.readout),
-            np.float32(pair.light[0]), np.float32(pair.light[1]), np.float32(SAME_SURFACE),
-            np.array([self.sensor.sigma_base, self.sensor.sigma_scale], np.float32),
-            np.float32(1 / scales[0]), np.float32(1 / scales[1]), np.float32(HUBER), residuals, H, b,
-        )  # fmt: skip
-        own = slice(NUM_PARAMETERS, UNKNOWNS)
-        prior = CORRELATED * np.concatenate([POSE_SIGMA, LIGHT_SIGMA]) ** -2
-        away = np.concatenate([se3.log(pair.T_second_first @ se3.inverse(pair.T_tracked)), pair.light - [1.0, 0.0]])
-        inverse = np.asarray(np.linalg.inv(H[own, own] + np.diag(prior)), np.float64)
-        own_b = b[own] + prior * away
-        across = H[:NUM_PARAMETERS, own]
-        score = b[:NUM_PARAMETERS] - across @ inverse @ own_b
-        reduced = H[:NUM_PARAMETERS, :NUM_PARAMETERS] - across @ inverse @ across.T
-        misfit = sum(_robust_mean(r / scale) for r, scale in zip(residuals, scales, strict=True))
-        return _PairSystem(reduced, score, inverse, across, own_b, residuals, misfit)
-
-
-def _robust_mean(values: NDArray[np.float32]) -> float:
-    """Mean Huber cost of the known values."""
-    r = np.abs(values[np.isfinite(values)])
-    return float(np.mean(np.where(r < HUBER, r * r, HUBER * (2 * r - HUBER)))) if len(r) else 0.0
-
-
-def _median_abs(values: NDArray[np.float32], otherwise: float) -> float:
-    known = np.abs(values[np.isfinite(values)])
-    return float(np.median(known)) if len(known) else otherwise
+        levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
+        known = [self.adjustment.solve(halves[n], before.known[n], free, levels)[0] for n in (0, 1)]
+        return _Trial(free, known, [self.adjustment.costs(halves[1 - n], known[n]) for n in (0, 1)])

@@ -20,6 +20,8 @@ COMMANDS = {
     "export": "Write the results of a run for another program.",
     "render": "Render the map along a camera path, as a video or a recording.",
     "clean": "Write a recording as it would have been without what moves.",
+    "live": "Run on a camera, or on a recording as if it were one.",
+    "info": "Say what a recording holds, and what looks wrong in it.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",
     "demo": "Render a short recording with a walking person and run on it.",
     "synth": "Render a synthetic recording with exact ground truth.",

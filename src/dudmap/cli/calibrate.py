@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, read_config
+from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, TopicsOption, read_config
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -18,12 +18,13 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def calibrate(
-    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder in TUM layout.")],
+    sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder, file or archive.")],
     out: Annotated[Path | None, typer.Option("--out", help="Write the calibration to this TOML file.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    topics: TopicsOption = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
     ] = None,
@@ -43,7 +44,7 @@ def calibrate(
     from dudmap.pipeline.calibration import calibrate_sequence
     from dudmap.sequences import open_sequence
 
-    recording = open_sequence(sequence, camera)
+    recording = open_sequence(sequence, camera, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
     estimate = calibrate_sequence(recording, read_config(config, preset, assignments or []), given, max_frames)

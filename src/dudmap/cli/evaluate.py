@@ -54,9 +54,7 @@ def trajectory(
     ],
     reference: Annotated[
         Path | None,
-        typer.Option(
-            "--reference", help="True trajectory in TUM format, or the recording's folder with groundtruth.txt."
-        ),
+        typer.Option("--reference", help="True trajectory in TUM format, or the recording."),
     ] = None,
     align: Annotated[
         str,
@@ -71,7 +69,7 @@ def trajectory(
 
     The default reference is groundtruth.txt in the run folder. Without one, only path length and duration are given.
     """
-    from dudmap.evaluation.files import find_reference, find_trajectory, tracked_share
+    from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
     from dudmap.evaluation.trajectory import trajectory_figures
     from dudmap.geometry.trajectory import Trajectory
 
@@ -84,7 +82,7 @@ def trajectory(
     pictures: list[Path] = []
     target = _output_folder(out, folder if folder is not None else file.parent)
     if truth is not None:
-        true = Trajectory.load(truth)
+        true = load_reference(truth)
         errors = trajectory_figures(found, true, alignment, max_difference)
         figures |= {key: _rounded(value) if isinstance(value, float) else value for key, value in errors.items()}
         if plots:

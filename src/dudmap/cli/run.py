@@ -16,14 +16,20 @@ app = typer.Typer(add_completion=False)
 CameraOption = Annotated[
     str | None, typer.Option("--camera", help="Intrinsics: fx,fy,cx,cy[,w,h[,depth_scale]].", metavar="NUMBERS")
 ]
+TopicsOption = Annotated[
+    str | None,
+    typer.Option(
+        "--topics", help="Of a bag: color=/a,depth=/b,color_info=/c,depth_info=/d,world=frame.", metavar="KEY=TOPIC,..."
+    ),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
 CalibrationOption = Annotated[
     str,
     typer.Option(
         "--calibration",
-        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay takes it "
-        "as given); given takes what the recording says; or calibration.toml of another run or of calibrate.",
+        help="Calibration of the colour camera: auto estimates it from the first ten seconds (a live replay while it "
+        "runs); given takes what the recording says; or calibration.toml of another run or of calibrate.",
         metavar="auto|given|FILE",
     ),
 ]
@@ -37,12 +43,15 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as o
 
 @app.command()
 def run(
-    sequence: Annotated[Path, typer.Argument(help="Recording: folder in TUM layout (rgb.txt, depth.txt).")],
+    sequence: Annotated[
+        Path, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+    ],
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    topics: TopicsOption = None,
     calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
@@ -81,6 +90,7 @@ def run(
     object.
     """
     from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
 
@@ -88,7 +98,9 @@ def run(
         config = saved / "config.toml"
     parameters = read_config(config, preset, assignments or [])
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
-    recording = open_sequence(sequence, camera)
+    recording = open_sequence(sequence, camera, topics=topics)
+    for warning in inspect(recording).warnings:
+        _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
     if calibration == "auto" and not live:
         from dudmap.pipeline.calibration import calibrate_start
@@ -96,6 +108,8 @@ def run(
         given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
     else:
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
+    if calibration != "auto":
+        parameters = parameters.override(["sensor.self_calibration=false"])
     report = run_sequence(
         recording, parameters, out,
         max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,

@@ -12,6 +12,8 @@ from dudmap.evaluation.trajectory import ate
 from dudmap.geometry.association import read_list, read_pairs
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.sequences import is_recording, open_sequence, reader_of
+from dudmap.sequences.tum import TumSequence
 
 
 class TrajectoryFile(NamedTuple):
@@ -36,18 +38,42 @@ def find_trajectory(estimate: Path) -> TrajectoryFile:
 
 
 def find_reference(reference: Path | None, run: Path | None) -> Path | None:
-    """True trajectory: a file, the groundtruth.txt of a folder, or without ``reference`` that of the run folder.
+    """True trajectory: a file, a recording, or without ``reference`` the groundtruth.txt of the run folder.
+
+    Returns:
+        A file, or the folder or archive of a recording whose format knows its truth by other files.
 
     Raises:
         DatasetError: ``reference`` is given and there is no such file.
     """
     if reference is not None:
         path = reference / "groundtruth.txt" if reference.is_dir() else reference
+        if not path.is_file() and is_recording(reference):
+            return reference
         if not path.is_file():
             raise DatasetError(f"there is no true trajectory {path}; name a file in TUM format or a recording's folder")
         return path
     path = None if run is None else run / "groundtruth.txt"
     return path if path is not None and path.is_file() else None
+
+
+def load_reference(path: Path) -> Trajectory:
+    """True camera poses of a path that ``find_reference`` returned.
+
+    The groundtruth.txt of a recording is read as its format wants it: some data sets store the poses of markers, of a
+    robot, or with other axes.
+
+    Raises:
+        DatasetError: The file is malformed, or the recording has no true poses.
+    """
+    inside = path.name == "groundtruth.txt" and reader_of(path.parent) not in (None, TumSequence)
+    if path.is_file() and not inside and not is_recording(path):
+        return Trajectory.load(path)
+    recording = path.parent if inside else path
+    truth = open_sequence(recording).ground_truth
+    if truth is None:
+        raise DatasetError(f"the recording {recording} has no true poses; name a file in TUM format")
+    return truth
 
 
 def load_mesh(path: Path) -> Mesh:
@@ -70,7 +96,7 @@ def first_pose_alignment(run: Path, recording: Path) -> NDArray[np.float64] | No
     estimate, reference = run / "trajectory.txt", recording / "groundtruth.txt"
     if not (estimate.is_file() and reference.is_file()):
         return None
-    return ate(Trajectory.load(estimate), Trajectory.load(reference), "origin").T_reference_estimate
+    return ate(Trajectory.load(estimate), load_reference(reference), "origin").T_reference_estimate
 
 
 def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float | None:
@@ -93,6 +119,8 @@ def _num_frames(run: Path | None, reference: Path | None) -> int | None:
             raise DatasetError(f"{run / 'metrics.json'} does not tell the number of frames: {error}") from error
     if reference is None:
         return None
+    if reference.is_dir():
+        return len(open_sequence(reference))
     recording = reference.parent
     if (recording / "associations.txt").is_file():
         return len(read_pairs(recording / "associations.txt"))

@@ -12,10 +12,13 @@ from dudmap.geometry.se3 import hat
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import ColorProjection
+from dudmap.kernels.threads import bands, run_bands
 
 Pixel = TypeVar("Pixel", np.uint8, np.float32)
 MEDIAN_STRIDE = 8
 """Every so many pixels, across and down, enter the median depth."""
+BAND_ROWS = 60
+"""Rows that are registered at a time: few enough for their coordinates to stay in a core's cache."""
 
 
 def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:
@@ -81,5 +84,11 @@ def register_color(
     readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
     readings = readings[readings > 0]
     fallback = float(median(readings)) if len(readings) else 1.0
-    us, vs = backend.color_pixels(depth, camera.intrinsics, projection, fallback)
-    return np.asarray(cv2.remap(color, us, vs, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE), color.dtype)
+    out = np.empty(depth.shape + color.shape[2:], color.dtype)
+
+    def fill(start: int, stop: int) -> None:
+        us, vs = backend.color_pixels(depth, camera.intrinsics, projection, fallback, start, stop)
+        cv2.remap(color, us, vs, cv2.INTER_LINEAR, dst=out[start:stop], borderMode=cv2.BORDER_REPLICATE)
+
+    run_bands(fill, bands(len(depth), BAND_ROWS))
+    return out

@@ -36,8 +36,9 @@ class Preprocessor:
         camera: Camera of the depth images, and of the colour images without ``calibration``.
         config: Limits and filter parameters.
         backend: Compute device, of this preprocessor alone; None takes the CPU.
-        calibration: Of the colour camera; None for colour that is registered to depth. The motion during the delay is
-            left to those who know it.
+        calibration: Of the colour camera; None for colour that is registered to depth. Colours that were not taken
+            together with the depth are left as they were recorded, scaled to the size of the depth image, to those who
+            know the motion.
     """
 
     def __init__(
@@ -81,10 +82,22 @@ class Preprocessor:
         offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
         recorded = None
         if self.calibration is not None:
-            recorded, projection = rgb, color_projection(self.calibration, np.zeros(6), offset)
-            rgb = register_color(recorded, depth, self.camera, projection, self._backend)
+            recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
         intensity = self._backend.intensity(rgb)
         return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
+
+    def _colors(
+        self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
+    ) -> NDArray[np.uint8]:
+        """Colours (H, W, 3) registered to the depth as far as is possible without the camera's motion."""
+        if calibration.is_instant(offset):
+            projection = color_projection(calibration, np.zeros(6), offset)
+            return register_color(recorded, depth, self.camera, projection, self._backend)
+        if recorded.shape[:2] == depth.shape:
+            return recorded
+        import cv2
+
+        return np.asarray(cv2.resize(recorded, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
 
     def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
         """Undistorted mask (H, W) bool of a frame.

@@ -65,6 +65,10 @@ class Calibration:
         still = self.delay == 0 and self.readout == 0
         return same and still and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
 
+    def is_instant(self, offset: float) -> bool:
+        """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
+        return self.delay + offset == 0 and self.readout == 0
+
     @property
     def lens(self) -> NDArray[np.float64]:
         """Coefficients (5,) k1, k2, p1, p2, k3 of the lens distortion."""

@@ -51,14 +51,19 @@ class Backend(Protocol):
         intrinsics: NDArray[np.float32],
         projection: ColorProjection,
         fallback: float,
+        start: int,
+        stop: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Coordinates u, v (H, W) in the colour image of each pixel of a depth image.
+        """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
+
+        Calls may run at the same time.
 
         Args:
             depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
             intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
             projection: Of the colour camera.
             fallback: Depth of rows without a reading, metres.
+            start, stop: First row, and that after the last.
         """
         ...
 

@@ -32,8 +32,9 @@ def color_pixels_rows(
     """Colour pixel of each depth pixel of rows ``row_start`` to ``row_stop``.
 
     A point X of the depth camera lies at place X - tau speed X + tau^2 / 2 bend X in the colour camera, the
-    second-order expansion of T_color_depth exp(-tau xi) X. The row gives tau, and tau the row: two steps of a fixed
-    point, which contracts by readout times the image speed over the height. Pixels without a reading take the depth of
+    second-order expansion of T_color_depth exp(-tau xi) X. The row gives tau, and tau the row: a step of a fixed point
+    from the row of the depth image on, which contracts by readout times the image speed over the height: with 20 rows
+    between the images, 30 ms and 1 rad/s at 480 rows, 0.02 pixels are left. Pixels without a reading take the depth of
     a neighbour in their row.
 
     Args:
@@ -47,31 +48,31 @@ def color_pixels_rows(
         readout: Time from the first to the last row of the colour image, s.
         height: Rows of the colour image.
         fallback: Depth of rows without a reading, metres.
-        us, vs: (h, w) float32 out, pixel coordinates in the colour image.
+        us, vs: (row_stop - row_start, w) float32 out, pixel coordinates in the colour image.
     """
     p, s, b = elements(place), elements(speed), elements(bend)
     w = depth.shape[1]
     filled = np.empty(w, np.float32)
-    half, one, two = np.float32(0.5), np.float32(1), np.float32(2)
+    zero, half, one, two = np.float32(0), np.float32(0.5), np.float32(1), np.float32(2)
     fx, fy, cx, cy = color_intrinsics[0], color_intrinsics[1], color_intrinsics[2], color_intrinsics[3]
     k1, k2, p1, p2, k3 = distortion[0], distortion[1], distortion[2], distortion[3], distortion[4]
-    by_height = one / height
+    by_height, by_fx = one / height, one / intrinsics[0]
     for v in range(row_start, row_stop):
         _filled(depth[v], fallback, filled)
-        to_u, to_v = us[v], vs[v]
+        to_u, to_v = us[v - row_start], vs[v - row_start]
         y_ray = ray(v, intrinsics[3], intrinsics[1])
+        guess = offset + readout * ((np.float32(v) + half) / np.float32(depth.shape[0]) - half)
+        c_guess = half * guess * guess
         for u in range(w):
             z = filled[u]
-            x, y = ray(u, intrinsics[2], intrinsics[0]) * z, y_ray * z
+            x, y = (np.float32(u) - intrinsics[2]) * by_fx * z, y_ray * z
             x0, y0, z0 = transform(p, x, y, z)
             x1, y1, z1 = transform(s, x, y, z)
             x2, y2, z2 = transform(b, x, y, z)
-            tau, by_z = offset, one / max(z0 - offset * z1 + half * offset * offset * z2, NEAREST)
-            for _ in range(2):
-                row = project(y0 - tau * y1 + half * tau * tau * y2, by_z, fy, cy)
-                tau = offset + readout * ((min(max(row, np.float32(0)), height) + half) * by_height - half)
-                by_z = one / max(z0 - tau * z1 + half * tau * tau * z2, NEAREST)
+            row = project(y0 - guess * y1 + c_guess * y2, one / max(z0 - guess * z1 + c_guess * z2, NEAREST), fy, cy)
+            tau = offset + readout * ((min(max(row, zero), height) + half) * by_height - half)
             c = half * tau * tau
+            by_z = one / max(z0 - tau * z1 + c * z2, NEAREST)
             a, d = (x0 - tau * x1 + c * x2) * by_z, (y0 - tau * y1 + c * y2) * by_z
             r2 = a * a + d * d
             radial = one + r2 * (k1 + r2 * (k2 + r2 * k3))

@@ -103,16 +103,13 @@ class CpuBackend:
         intrinsics: NDArray[np.float32],
         projection: ColorProjection,
         fallback: float,
+        start: int,
+        stop: int,
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Backend.color_pixels``."""
-        us, vs = np.empty((2, *depth.shape), dtype=np.float32)
+        us, vs = np.empty((2, stop - start, depth.shape[1]), dtype=np.float32)
         arrays, numbers = projection[:5], [np.float32(value) for value in (*projection[5:], fallback)]
-        run_bands(
-            lambda start, stop: color_registration.color_pixels_rows(
-                start, stop, depth, intrinsics, *arrays, *numbers, us, vs
-            ),
-            bands(depth.shape[0], PIXEL_ROWS),
-        )
+        color_registration.color_pixels_rows(start, stop, depth, intrinsics, *arrays, *numbers, us, vs)
         return us, vs
 
     def _limited_buffer(self, shape: tuple[int, ...]) -> NDArray[np.float32]:

@@ -32,6 +32,8 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 FORMAT = "dudmap map 1"
+INTENSITY = 0xFF
+"""Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -186,6 +188,23 @@ class TsdfVolume:
         other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
         other.blocks, other._frame_number = self.blocks, self._frame_number
         return other
+
+    def take_colors(self, other: "TsdfVolume") -> None:
+        """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
+
+        A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
+        """
+        assert other.config == self.config
+        slots = self.active_slots
+        there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
+        known = there >= 0
+        intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
+        intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
+        colors[known] = other.blocks.colors[there[known]]
+        self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
+        self.blocks.colors[slots] = colors
+        self._frame_number += 1
+        self.blocks.written[slots] = self._frame_number
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""

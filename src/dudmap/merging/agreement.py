@@ -8,10 +8,8 @@ from scipy.spatial import KDTree
 
 from dudmap.geometry import se3
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_samples import EMPTY, OBSERVED, SurfacePoints, sample_map, transformed
+from dudmap.merging.map_samples import EMPTY, IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
-IN_BAND = 0.9
-"""Share of the truncation distance from which on a voxel is in free space (``kernels/voxel.py``, SURFACE_SHARE)."""
 CELL = 0.25
 """Edge of the cells in which the mean colours of the surfaces are compared, metres."""
 MIN_CELL_POINTS = 8

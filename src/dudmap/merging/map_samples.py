@@ -11,6 +11,9 @@ from dudmap.mapping.volume import TsdfVolume
 
 __all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
 
+IN_BAND = 0.9
+"""Share of the truncation distance within which a voxel holds a distance to a surface; beyond, it is in free space
+(``SURFACE_SHARE`` in ``kernels/voxel.py``)."""
 NOISE_IN_BAND = 2.0
 """Standard deviations of a reading that fit into the truncation distance where a surface is reliable enough to be
 contradicted by free space: 95 % of its readings were not farther off."""

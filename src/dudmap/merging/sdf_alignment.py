@@ -11,15 +11,13 @@ from numpy.typing import NDArray
 
 from dudmap.geometry import se3
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_samples import OBSERVED, SurfacePoints, sample_map, transformed
+from dudmap.merging.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
 
 MAX_ITERATIONS = 40
 STOP = 1e-5
 """Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
 COLOR_WEIGHT = 0.1325
 """Weight of the squared intensity difference (0..1) against the squared distance (m): thesis table 6.2."""
-IN_BAND = 0.9
-"""Share of the truncation distance within which a voxel holds a distance to a surface (``SURFACE_SHARE``)."""
 COLOR_HUBER = 0.07
 """Huber threshold of the intensity difference, as in the tracker."""
 MIN_POINTS = 500

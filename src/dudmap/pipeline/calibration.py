@@ -22,7 +22,7 @@ estimator compares pairs of keyframes from both halves of the time."""
 def calibrate_start(
     sequence: "Sequence", config: Config, max_frames: int | None = None, notice: "Callable[[str], None] | None" = None
 ) -> Calibration | None:
-    """Calibration estimated from the start of a recording; None takes what the recording says.
+    """Calibration estimated from the start of a recording; None where none was made.
 
     Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated.
 
@@ -45,7 +45,7 @@ def calibrate_start(
         return None
     names = ", ".join(found.estimated)
     notice(f"colour camera: estimated {names}" if names else "colour camera: as given, the images show no fault")
-    return found if found.estimated else None
+    return found
 
 
 def calibrate_sequence(
@@ -64,7 +64,7 @@ def calibrate_sequence(
     """
     from dudmap.slam import Slam
 
-    slam = Slam(sequence.camera, config, calibration=given)
+    slam = Slam(sequence.camera, config.override(["sensor.self_calibration=false"]), calibration=given)
     collector, submap = KeyframeCollector(given.camera), 0
     for index in range(len(sequence) if max_frames is None else min(max_frames, len(sequence))):
         try:

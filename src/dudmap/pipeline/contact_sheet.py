@@ -1,4 +1,4 @@
-"""Overview image of one processed frame: input, dynamic mask, residuals and rendered map."""
+"""Overview images: of one processed frame with mask, residuals and map, or of the frames of a recording."""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -64,6 +64,42 @@ def save_sheet(
     figure.colorbar(distance, ax=axes[1, 0], label="m", shrink=0.7)
     _show(axes[1, 1], "rendered map: colour", np.where(view.depth[..., None] > 0, view.color, 255))
     _show(axes[1, 2], "rendered map: shape", shaded(view, T_world_camera))
+    try:
+        figure.savefig(path, dpi=80, format="png")
+    except OSError as error:
+        raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
+
+
+def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
+    """Write a PNG file with colour and depth of frames of a recording, one frame a column, six in a row.
+
+    Args:
+        path: The PNG file.
+        frames: Numbers and frames, at least one.
+
+    Raises:
+        DudmapError: There is no frame, or the file cannot be written.
+    """
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    if not frames:
+        raise DudmapError(f"no frame can be read, so there is nothing to draw in {path}")
+    columns, rows = min(6, len(frames)), -(-len(frames) // 6)
+    figure = Figure(figsize=(3 * columns, 4.8 * rows), layout="constrained")
+    FigureCanvasAgg(figure)
+    axes = figure.subplots(2 * rows, columns, squeeze=False)
+    readings = np.concatenate([frame.depth[frame.depth > 0] for _, frame in frames])
+    far = float(np.percentile(readings, 99)) if len(readings) else 1.0
+    for axis in axes.ravel():
+        axis.set_axis_off()
+    drawn = []
+    for place, (number, frame) in enumerate(frames):
+        row, column = divmod(place, columns)
+        _show(axes[2 * row, column], f"{number}: {frame.timestamp:.2f} s", frame.color)
+        shown = np.ma.masked_equal(frame.depth, 0)
+        drawn.append(_show(axes[2 * row + 1, column], "", shown, cmap="viridis", limits=(0, far)))
+    figure.colorbar(drawn[0], ax=axes.ravel().tolist(), label="m", shrink=0.5)
     try:
         figure.savefig(path, dpi=80, format="png")
     except OSError as error:

@@ -19,11 +19,11 @@ class RunProgress:
     Losses of tracking and unreadable frames are reported, once per gap, even without the bar.
 
     Args:
-        total: Number of frames.
+        total: Number of frames, None if it is not known.
         bar: Show the bar if stderr is a terminal.
     """
 
-    def __init__(self, total: int, *, bar: bool = True) -> None:
+    def __init__(self, total: int | None, *, bar: bool = True) -> None:
         self.console = Console(stderr=True)
         self._bar = Progress(
             TextColumn("frame"),

@@ -1,4 +1,4 @@
-"""Replay of a recording at the rate of the sensor, with frames dropped where processing is too slow."""
+"""Frames of a sensor or of a replay at its rate; frames are dropped where processing is too slow."""
 
 import threading
 import time
@@ -91,12 +91,26 @@ def live(timestamps: NDArray[np.float64], read: Callable[[int], T]) -> Generator
     A frame that is not consumed before the next one has been read is dropped, which leaves a gap in
     ``Arrival.number``. The last frame is always yielded.
     """
+    return newest(lambda put, wait: replay(timestamps, read, put, wait))
+
+
+def newest(
+    deliver: Callable[[Callable[[Arrival[T]], None], Callable[[float], bool]], None],
+    stop: Callable[[], None] | None = None,
+) -> Generator[Arrival[T]]:
+    """Latest item that a sensor has delivered, at each step; older ones that were not consumed are dropped.
+
+    Args:
+        deliver: Runs in a thread of its own and passes every item to its first argument. Its second argument waits for
+            at most the given number of seconds and returns True to stop.
+        stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
+    """
     latest: LatestSlot[Arrival[T]] = LatestSlot()
-    stop = threading.Event()
+    stopping = threading.Event()
 
     def sensor() -> None:
         try:
-            replay(timestamps, read, latest.put, stop.wait)
+            deliver(latest.put, stopping.wait)
         finally:
             latest.close()
 
@@ -107,4 +121,6 @@ def live(timestamps: NDArray[np.float64], read: Callable[[int], T]) -> Generator
                 yield arrival
             future.result()
         finally:
-            stop.set()
+            stopping.set()
+            if stop is not None:
+                stop()

@@ -103,8 +103,9 @@ def run(
     models = [None if depth_model is None else DepthDistortion.load(Path(depth_model)) for _ in range(passes)]
     calibration = calibration or sequence.calibration
     slam = Slam(
-        sequence.camera, config, depth_model=models[0], calibration=calibration, saved_map=saved_map, localize=localize
-    )
+        sequence.camera, config, depth_model=models[0], calibration=calibration, live=live, saved_map=saved_map,
+        localize=localize,
+    )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
@@ -128,7 +129,7 @@ def run(
                     else in_order(sequence, count, ahead, given_masks, slam)
                 ) as frames:
                     for frame in frames:
-                        _process(
+                        process_source(
                             frame,
                             slam,
                             record,
@@ -183,7 +184,7 @@ def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
     return MaskFolder(folder, sequence.timestamps, sequence.camera)
 
 
-def _process(
+def process_source(
     source: SourceFrame,
     slam: "Slam",
     record: RunRecord,
@@ -219,4 +220,6 @@ def _process(
         save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
     if observe is not None:
         observe(index, read, result)
+    if result.calibrated:
+        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

@@ -16,8 +16,10 @@ from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.sequences import is_recording
 
 if TYPE_CHECKING:
+    from dudmap.cameras import LiveCamera
     from dudmap.objects.object_map import RigidObject
     from dudmap.sequences import Sequence
     from dudmap.slam import Slam
@@ -61,7 +63,7 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
     Raises:
         DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
     """
-    if (out / "rgb.txt").exists() or (out / "depth.txt").exists():
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or (out.is_dir() and is_recording(out)):
         raise DudmapError(
             f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
         )
@@ -89,7 +91,7 @@ def write_run_folder(
     out: Path,
     slam: "Slam",
     record: RunRecord,
-    sequence: "Sequence",
+    sequence: "Sequence | LiveCamera",
     config: Config,
     stopped: str,
     *,
@@ -106,7 +108,6 @@ def write_run_folder(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
-    metrics["depth_delay_ms"] = 1000 * slam.front_end.time_offset.seconds
     noise = slam.depth_noise.fitted()
     metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
     calibration = slam.calibration

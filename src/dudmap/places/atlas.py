@@ -3,12 +3,14 @@
 Submaps are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
 """
 
+from bisect import bisect_left
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
@@ -17,6 +19,7 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.saved_map import SavedMap
+from dudmap.tracking.motion_model import VELOCITY_LIFETIME
 
 
 @dataclass(eq=False)
@@ -71,11 +74,58 @@ class Atlas:
         """The map of the current submap."""
         return self.volumes[self.current]
 
-    def integrate(self, frame: Frame, static_mask: NDArray[np.bool_], T_world_camera: NDArray[np.float64]) -> None:
-        """Fuse the static pixels (H, W) of a frame into the current map, and keep the frame for later corrections."""
-        self.volume.integrate(frame, T_world_camera, static_mask)
+    def integrate(
+        self,
+        frame: Frame,
+        static_mask: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float] = (1.0, 0.0),
+        recorded: Frame | None = None,
+    ) -> None:
+        """Fuse the static pixels of a frame into the current map, and keep the frame for later corrections.
+
+        Args:
+            frame: Depth and registered colour.
+            static_mask: (H, W) bool.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset to the colours of the map.
+            recorded: The frame with its colour as it was recorded, which is kept; None for the same.
+        """
+        color = exposed_color(frame.color, exposure)
+        self.volume.integrate(replace(frame, color=color), T_world_camera, static_mask)
         if self.history is not None:
-            self.history.add(frame, static_mask, T_world_camera, self.current)
+            self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
+
+    def recolor(self) -> None:
+        """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
+
+        A saved map keeps its colours: not all its frames are stored.
+        """
+        assert self.history is not None
+        for number, volume in self.volumes.items():
+            if number == self.saved:
+                continue
+            painted = self.make_volume()
+            self.history.reintegrate(painted, self.nodes(number))
+            volume.take_colors(painted)
+
+    def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
+        number = min(bisect_left(self.poses, timestamp, key=lambda pose: pose.timestamp), len(self.poses) - 1)
+        near = [
+            pose
+            for pose in self.poses[max(number - 1, 0) : number + 2]
+            if abs(pose.timestamp - timestamp) <= VELOCITY_LIFETIME and pose.submap == self.poses[number].submap
+        ]
+        if len(near) < 2:
+            return np.zeros(6)
+        motion = se3.log(se3.inverse(near[0].T_world_camera) @ near[-1].T_world_camera)
+        return motion / (near[-1].timestamp - near[0].timestamp)
+
+    def as_saved_map(self) -> SavedMap:
+        """The main map and its keyframes; how well frames fit it is left to the caller."""
+        main = self.by_size()[0]
+        return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
     def clear_first_frame(self) -> None:
         """Empty the current map, which holds a single frame."""

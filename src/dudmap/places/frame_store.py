@@ -3,7 +3,7 @@
 import tempfile
 import weakref
 from collections import deque
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import IO
@@ -11,7 +11,9 @@ from typing import IO
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import Config
 from dudmap.errors import MapError
+from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.geometry.alignment import agree
 from dudmap.geometry.camera import Camera
@@ -29,7 +31,8 @@ class StoredFrame:
     """A frame as it was fused.
 
     Attributes:
-        frame: Depth in steps of ``DEPTH_UNIT``, and colour (JPEG) with the exposure of the map.
+        frame: Depth in steps of ``DEPTH_UNIT``, and colour (JPEG) with the exposure of the map, registered to the depth
+            with the calibration now in use.
         static: (H, W) bool, pixels that were fused.
         T_world_camera: (4, 4).
         count: Number of fused frames that it represents.
@@ -54,6 +57,8 @@ class FrameStore:
         distance: Distance from the last stored frame from which on a frame is stored, metres.
         angle_deg: Angle to the last stored frame from which on a frame is stored, degrees.
         gap: Largest count of a stored frame; 1 stores every frame.
+        registered: Registers the colour of a frame that was stored as it was recorded; None for colours that are
+            registered as they are.
 
     Attributes:
         timestamps: Of the stored frames, seconds.
@@ -62,8 +67,17 @@ class FrameStore:
         submaps: Numbers of their submaps.
     """
 
-    def __init__(self, camera: Camera, distance: float = 0.08, angle_deg: float = 5.0, gap: int = 15) -> None:
+    def __init__(
+        self,
+        camera: Camera,
+        distance: float = 0.08,
+        angle_deg: float = 5.0,
+        gap: int = 15,
+        registered: Callable[[Frame], Frame] | None = None,
+    ) -> None:
         self.camera = camera
+        self.registered = registered
+        self.color_timestamps: list[float | None] = []
         self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
         self.timestamps: list[float] = []
         self.Ts_world_camera: list[NDArray[np.float64]] = []
@@ -74,19 +88,33 @@ class FrameStore:
         self._encoder: ThreadPoolExecutor | None = None
         self._pending: deque[Future[tuple[bytes, bytes, bytes]]] = deque()
 
+    @classmethod
+    def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
+        """The store that a configuration asks for; None if neither loops nor submaps need one."""
+        loops = config.loops
+        if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
+            return None
+        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
+
     def __len__(self) -> int:
         return len(self.timestamps)
 
     def add(
-        self, frame: Frame, static: NDArray[np.bool_], T_world_camera: NDArray[np.float64], submap: int = 0
+        self,
+        frame: Frame,
+        static: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        submap: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
     ) -> bool:
         """Store a fused frame, or increase the count of the last stored one.
 
         Args:
-            frame: Depth and colour as they were fused; the arrays must not change afterwards.
+            frame: Depth as it was fused, and colour as it was recorded; the arrays must not change afterwards.
             static: (H, W) bool, pixels that were fused. The others are stored too, for corrected masks.
             T_world_camera: (4, 4).
             submap: Number of the submap it was fused into.
+            exposure: Gain and offset to the colours of the map.
 
         Returns:
             Whether the frame was stored.
@@ -105,14 +133,16 @@ class FrameStore:
         self.Ts_world_camera.append(T_world_camera.copy())
         self.counts.append(1)
         self.submaps.append(submap)
-        self._pending.append(self._encoder.submit(_encoded, frame, static))
+        self.color_timestamps.append(frame.color_timestamp)
+        self._pending.append(self._encoder.submit(_encoded, frame, static, exposure))
         self._write(MAX_PENDING)
         return True
 
     def drop_last(self) -> None:
         """Remove the frame stored last."""
         self._write(0)
-        for column in (self.timestamps, self.Ts_world_camera, self.counts, self.submaps, self._offsets):
+        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self._offsets
+        for column in columns:
             column.pop()
 
     def __getitem__(self, number: int) -> StoredFrame:
@@ -130,7 +160,8 @@ class FrameStore:
         steps, bgr, mask = (np.asarray(image) for image in images)
         depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
-        frame = Frame(self.timestamps[number], depth, rgb)
+        frame = Frame(self.timestamps[number], depth, rgb, self.color_timestamps[number])
+        frame = frame if self.registered is None else self.registered(frame)
         return StoredFrame(frame, mask > 0, self.Ts_world_camera[number], self.counts[number])
 
     def __iter__(self) -> Iterator[StoredFrame]:
@@ -176,13 +207,13 @@ class FrameStore:
             self._offsets.append((start, len(parts[0]), len(parts[1]), len(parts[2])))
 
 
-def _encoded(frame: Frame, static: NDArray[np.bool_]) -> tuple[bytes, bytes, bytes]:
-    """Depth as 16-bit PNG, colour as JPEG, static mask as 1-bit PNG."""
+def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> tuple[bytes, bytes, bytes]:
+    """Depth as 16-bit PNG, exposed colour as JPEG, static mask as 1-bit PNG."""
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
     steps = np.minimum(frame.depth * np.float32(1 / DEPTH_UNIT) + np.float32(0.5), 65535).astype(np.uint16)
-    bgr = cv2.cvtColor(frame.color, cv2.COLOR_RGB2BGR)
+    bgr = cv2.cvtColor(exposed_color(frame.color, exposure), cv2.COLOR_RGB2BGR)
     depth = cv2.imencode(".png", steps, png)[1]
     color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]

@@ -131,9 +131,11 @@ class LoopCloser:
 
     def _features(self, query: LoopQuery) -> PlacedFeatures:
         """Features of a frame; those of the newest keyframe if the frame has just become one."""
-        keyframes = self.atlas.keyframes.keyframes
-        if keyframes and keyframes[-1].timestamp == query.observation.timestamp:
-            return keyframes[-1].features
+        keyframes, T = self.atlas.keyframes.keyframes, query.tracking.T_world_camera
+        newest = keyframes[-1] if keyframes else None
+        # a keyframe of a saved map may have the same time, but not the same pose
+        if newest and newest.timestamp == query.observation.timestamp and np.array_equal(newest.T_world_camera, T):
+            return newest.features
         return self.atlas.keyframes.extract(query.observation, query.static_mask)
 
     def _near(self, T_world_camera: NDArray[np.float64]) -> list[Keyframe]:

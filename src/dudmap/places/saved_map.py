@@ -2,7 +2,7 @@
 
 import zipfile
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -32,7 +32,7 @@ class SavedMap:
 
     volume: TsdfVolume
     keyframes: list[Keyframe]
-    registrations: RegistrationHistory
+    registrations: RegistrationHistory = field(default_factory=RegistrationHistory)
 
     @classmethod
     def load(cls, folder: str | Path, voxel_size: float | None = None) -> "SavedMap":

@@ -1,7 +1,8 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
+from importlib import import_module
 from pathlib import Path
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ if TYPE_CHECKING:
     from dudmap.geometry.camera import Camera
     from dudmap.geometry.trajectory import Trajectory
 
-__all__ = ["Sequence", "is_recording", "open_sequence"]
+__all__ = ["Reader", "Recording", "Sequence", "is_recording", "open_sequence", "reader_of", "readers"]
 
 
 @runtime_checkable
@@ -57,53 +58,170 @@ class Sequence(Protocol):
         ...
 
 
-class Reader(Protocol):
-    """Class of a sequence on disk: can recognise its format and open a folder of it."""
+@runtime_checkable
+class Recording(Sequence, Protocol):
+    """A sequence on disk.
 
-    def __call__(self, path: Path, camera: "Camera | str | None" = None) -> Sequence:
+    Attributes:
+        format: Name of its format, for people.
+        intrinsics_source: Where the intrinsics come from, e.g. ``intrinsics.txt`` or ``the --camera option``.
+    """
+
+    @property
+    def format(self) -> str: ...  # noqa: D102
+    @property
+    def intrinsics_source(self) -> str: ...  # noqa: D102
+
+
+class Reader(Protocol):
+    """Class of a recording: recognises its format and opens a folder or file of it.
+
+    Attributes:
+        format: Name of the format, for people.
+        options: Names of the keyword arguments that its constructor takes beside path and camera.
+    """
+
+    @property
+    def format(self) -> str: ...  # noqa: D102
+    @property
+    def options(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    def __call__(self, path: Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
         """Open a recording."""
         ...
 
     def recognises(self, path: Path) -> bool:
-        """Whether a folder has this format."""
+        """Whether an existing folder or file has this format, judged by names and first bytes only."""
         ...
 
 
-def readers() -> "tuple[Reader, ...]":
-    """Readers of all known formats, in the order in which they are tried."""
-    from dudmap.sequences.tum import TumSequence
+READERS = (
+    "bonn:BonnSequence",
+    "corbs:CorbsSequence",
+    "openloris:OpenLorisSequence",
+    "icl_nuim:IclNuimSequence",
+    "icl_nuim:IclNuimLoopSequence",
+    "tum:TumSequence",
+    "nerfstudio:NerfstudioSequence",
+    "frame_files:VolumeDeformSequence",
+    "frame_files:SevenScenesSequence",
+    "scannet:ScanNetSequence",
+    "replica:ReplicaSequence",
+    "redwood:RedwoodSequence",
+    "epfl:EpflSequence",
+    "numbered:NumberedSequence",
+    "sens:SensRecording",
+    "klg:KlgRecording",
+    "record3d:Record3DRecording",
+    "realsense:RealSenseRecording",
+    "bag:RosBag",
+)
+"""Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
+DEPTH_OF_SEARCH = 3
+"""Levels of folders below the given one in which a recording is looked for."""
 
-    return (TumSequence,)
+
+def readers() -> tuple[Reader, ...]:
+    """Readers of all formats, in the order in which they are tried."""
+    names = (reader.split(":") for reader in READERS)
+    return tuple(getattr(import_module(f"dudmap.sequences.{module}"), name) for module, name in names)
+
+
+def reader_of(path: Path) -> Reader | None:
+    """The first reader that recognises an existing folder or file, None if there is none."""
+    return next((reader for reader in readers() if reader.recognises(path)), None)
 
 
 def is_recording(path: Path) -> bool:
-    """Whether a folder is a recording of a known format."""
-    return any(reader.recognises(path) for reader in readers())
+    """Whether a folder or file is a recording of a known format, or an archive."""
+    from dudmap.sequences.archive import is_archive
+
+    return path.exists() and (reader_of(path) is not None or is_archive(path))
 
 
-def open_sequence(path: str | Path, camera: "Camera | str | None" = None) -> Sequence:
+def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
     """Open a recording with the first reader of ``readers()`` that recognises it.
 
+    A folder that is no recording itself may contain one. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is
+    unpacked into a cache first; ``archive.zip/folder`` names one of several recordings in it.
+
     Args:
-        path: Folder in the layout of the TUM RGB-D benchmark.
+        path: Folder, file or archive.
         camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
-            (default: the size of the images and 5000 depth units per metre).
+            (default: the size of the images, and the depth scale that is usual in the format).
+        options: Of one format, e.g. ``topics`` of bags; None stands for an option that is not given.
 
     Raises:
-        DatasetError: The folder is missing or not a recording of a known format.
+        DatasetError: There is nothing at the path, no known format, several recordings, a defect, or an option that the
+            format lacks.
     """
     path = Path(path)
+    place, reader = _find(path)
+    given = {name: value for name, value in options.items() if value is not None}
+    foreign = [f"--{name}" for name in given if name not in reader.options]
+    if foreign:
+        raise DatasetError(
+            f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
+        )
+    return reader(place, camera, **given)
+
+
+def _find(path: Path) -> tuple[Path, Reader]:
+    """The recording at a path, in it, or in the archive at it, and its reader.
+
+    Raises:
+        DatasetError: There is none, or more than one.
+    """
+    from dudmap.sequences.archive import split, unpack
+
+    reader = reader_of(path) if path.exists() else None
+    if reader is not None:
+        return path, reader
+    packed = split(path)
+    if packed is not None:
+        return _find(unpack(packed[0]) / packed[1])
     if not path.exists():
-        raise DatasetError(f"there is no folder {path}; expected a recording with rgb.txt and depth.txt")
-    if not path.is_dir():
-        raise DatasetError(f"{path} is a file; expected a folder with rgb.txt and depth.txt")
-    if not any(path.iterdir()):
-        raise DatasetError(f"the folder {path} is empty; expected a recording with rgb.txt and depth.txt")
-    for reader in readers():
-        if reader.recognises(path):
-            return reader(path, camera)
-    missing = [name for name in ("rgb.txt", "depth.txt") if not (path / name).is_file()]
-    raise DatasetError(
-        f"{path} is not a recording in TUM layout: {' and '.join(missing)} not found "
-        "(an associations.txt would do instead)"
-    )
+        raise DatasetError(f"there is no folder or file {path}; expected a recording")
+    if path.is_dir() and not any(path.iterdir()):
+        raise DatasetError(f"the folder {path} is empty; expected a recording")
+    found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
+    if len(found) > 1:
+        names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
+        more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+        raise DatasetError(f"{path} contains {len(found)} recordings; name one of {names}{more}")
+    if not found:
+        raise DatasetError(_unknown(path))
+    place, reader = found[0]
+    return (place, reader) if reader is not None else _find(place)
+
+
+def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, Reader | None]]":
+    """Recordings below a folder with their readers, and archives with None; not those inside of other recordings."""
+    from dudmap.sequences.archive import is_archive
+
+    found: list[tuple[Path, Reader | None]] = []
+    for place in sorted(path.iterdir()):
+        reader = reader_of(place)
+        if reader is not None:
+            found.append((place, reader))
+        elif is_archive(place):
+            found.append((place, None))
+        elif place.is_dir() and levels > 1:
+            found += _recordings_in(place, levels - 1)
+    return found
+
+
+def _unknown(path: Path) -> str:
+    """Sentence on a folder or file that no reader recognises."""
+    listed = [name for name in ("rgb.txt", "depth.txt") if (path / name).is_file()]
+    if listed:
+        other = "depth.txt" if listed == ["rgb.txt"] else "rgb.txt"
+        return f"{path} is not a recording in TUM layout: {other} not found (an associations.txt would do instead)"
+    if path.suffix.lower() == ".mkv":
+        return (
+            f"{path} is a video; recordings of an Azure Kinect are not read, since its library pyk4a has no wheel for "
+            "Python 3.13: export images and intrinsics with Open3D's azure_kinect_mkv_reader and read that folder"
+        )
+    kind = "folder" if path.is_dir() else "file"
+    formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
+    return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"

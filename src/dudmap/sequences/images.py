@@ -3,6 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,20 @@ def read_color(path: Path) -> NDArray[np.uint8]:
     Raises:
         FrameError: The file is missing, truncated, damaged or not an image.
     """
+    return decode_color(_bytes(path), str(path))
+
+
+def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Colour image (H, W, 3) in RGB order from the content of an image file; ``name`` is used in messages.
+
+    Raises:
+        FrameError: The data are truncated, damaged or not an image.
+    """
     import cv2
 
-    image = cv2.imdecode(_bytes(path), cv2.IMREAD_COLOR)
+    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_COLOR)
     if image is None:
-        raise FrameError(f"{path} is not an image that can be decoded")
+        raise FrameError(f"{name} is not an image that can be decoded")
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
@@ -32,20 +42,55 @@ def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
     Raises:
         FrameError: The file is missing, truncated, damaged, has several channels, or is neither 16 bit nor float.
     """
+    return decode_depth(_bytes(path), depth_scale, str(path))
+
+
+def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages.
+
+    Raises:
+        FrameError: The data are truncated, damaged, have several channels, or are neither 16 bit nor float.
+    """
     import cv2
 
-    image = cv2.imdecode(_bytes(path), cv2.IMREAD_UNCHANGED)
+    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_UNCHANGED)
     if image is None:
-        raise FrameError(f"{path} is not an image that can be decoded")
+        raise FrameError(f"{name} is not an image that can be decoded")
     if image.ndim != 2:
-        raise FrameError(f"the depth image {path} has {image.shape[2]} channels; expected one with 16 bit or float")
+        raise FrameError(f"the depth image {name} has {image.shape[2]} channels; expected one with 16 bit or float")
+    return metres(image, depth_scale, name)
+
+
+def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = no reading.
+
+    Raises:
+        FrameError: The values are neither 16 bit nor float.
+    """
     if image.dtype == np.uint16:
         return image.astype(np.float32) / np.float32(depth_scale)
     if image.dtype.kind == "f":
-        metres = image.astype(np.float32)
-        metres[~(np.isfinite(metres) & (metres > 0))] = 0
-        return metres
-    raise FrameError(f"the depth image {path} holds {image.dtype} values; expected 16 bit or float")
+        depth = image.astype(np.float32)
+        depth[~(np.isfinite(depth) & (depth > 0))] = 0
+        return depth
+    raise FrameError(f"the depth image {name} holds {image.dtype} values; expected 16 bit or float")
+
+
+def read_depth_array(path: Path) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too.
+
+    Raises:
+        FrameError: The file is missing, damaged, or holds something else.
+    """
+    try:
+        metres = np.squeeze(np.load(path, allow_pickle=False))
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"cannot read the array {path}: {error}") from error
+    if metres.ndim != 2 or metres.dtype.kind != "f":
+        raise FrameError(f"the array {path} holds {metres.dtype} of shape {metres.shape}; expected floats (H, W)")
+    metres = metres.astype(np.float32)
+    metres[~(np.isfinite(metres) & (metres > 0))] = 0
+    return metres
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
@@ -56,30 +101,34 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """
     import cv2
 
-    image = cv2.imdecode(_bytes(path), cv2.IMREAD_GRAYSCALE)
+    image = cv2.imdecode(_checked(_bytes(path), str(path)), cv2.IMREAD_GRAYSCALE)
     if image is None:
         raise FrameError(f"{path} is not an image that can be decoded")
     return image > 127
 
 
-def _bytes(path: Path) -> NDArray[np.uint8]:
-    """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
+def _bytes(path: Path) -> bytes:
     try:
-        data = path.read_bytes()
+        return path.read_bytes()
     except FileNotFoundError:
         raise FrameError(f"the listed file {path} does not exist") from None
     except OSError as error:
         raise FrameError(f"cannot read {path}: {error.strerror}") from error
-    if data.startswith(PNG):
-        _check_png(path, data)
-    elif data.startswith(JPEG) and b"\xff\xd9" not in data[-1024:]:
-        raise FrameError(f"{path} is cut off: the JPEG end marker is missing")
-    if not data:
-        raise FrameError(f"{path} is an empty file")
-    return np.frombuffer(data, dtype=np.uint8)
 
 
-def _check_png(path: Path, data: bytes) -> None:
+def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
+    raw = bytes(data)
+    if raw.startswith(PNG):
+        _check_png(name, raw)
+    elif raw.startswith(JPEG) and b"\xff\xd9" not in raw[-1024:]:
+        raise FrameError(f"{name} is cut off: the JPEG end marker is missing")
+    if not raw:
+        raise FrameError(f"{name} is an empty file")
+    return np.frombuffer(raw, dtype=np.uint8)
+
+
+def _check_png(name: str, data: bytes) -> None:
     """Check all chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
     at = len(PNG)
     while at + 12 <= len(data):
@@ -88,8 +137,8 @@ def _check_png(path: Path, data: bytes) -> None:
         if end + 4 > len(data):
             break
         if zlib.crc32(data[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise FrameError(f"{path} is damaged: a PNG checksum does not match")
+            raise FrameError(f"{name} is damaged: a PNG checksum does not match")
         if data[at + 4 : at + 8] == b"IEND":
             return
         at = end + 4
-    raise FrameError(f"{path} is cut off: the PNG end is missing")
+    raise FrameError(f"{name} is cut off: the PNG end is missing")

@@ -1,7 +1,7 @@
 """Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
@@ -93,7 +93,6 @@ KNOWN = (
     (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _by_key(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
     (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", _by_key(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
     (r"rgbd_bonn", "Bonn", _by_key(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)),
-    (r"(living|office)_room_traj", "ICL-NUIM", _by_key(481.2, 480.0, 319.5, 239.5, 640, 480, 5000)),
 )
 """Pattern of the folder name, name and published intrinsics of the data sets."""
 
@@ -111,24 +110,56 @@ def of_folder(path: Path) -> Intrinsics:
         if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
             return Intrinsics(values, f"the {name} camera")
     raise DatasetError(
-        f"the camera of {path} is not known: there is no intrinsics.txt and the folder is not named like a TUM, Bonn "
-        "or ICL-NUIM recording; give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+        f"the camera of {path} is not known: there is no intrinsics.txt and the folder is not named like a TUM or "
+        "Bonn recording; give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
     )
 
 
-def from_text(text: str) -> Intrinsics:
-    """Parse ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+def own(path: Path, depth_scale: float) -> Intrinsics | None:
+    """Intrinsics of a folder's intrinsics.txt, None if there is no such file.
+
+    Args:
+        path: The folder.
+        depth_scale: Depth units per metre where the file gives none.
+
+    Raises:
+        DatasetError: The file cannot be parsed.
+    """
+    file = path / "intrinsics.txt"
+    if not file.is_file():
+        return None
+    found = from_file(file)
+    return replace(found, values={"depth_scale": depth_scale} | found.values)
+
+
+def own_or(path: Path, values: dict[str, float], source: str) -> Intrinsics:
+    """Intrinsics of a folder's intrinsics.txt, else the published ones of its data set.
+
+    Raises:
+        DatasetError: The file cannot be parsed.
+    """
+    return own(path, values["depth_scale"]) or Intrinsics(dict(values), source)
+
+
+def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
+    """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+
+    Args:
+        camera: Camera or text.
+        depth_scale: Depth units per metre where the text gives none.
 
     Raises:
         DatasetError: The text does not hold 4, 6 or 7 numbers.
     """
+    if isinstance(camera, Camera):
+        return from_camera(camera)
     try:
-        numbers = [float(field) for field in text.split(",")]
+        numbers = [float(field) for field in camera.split(",")]
     except ValueError:
         numbers = []
     if len(numbers) not in (4, 6, 7):
-        raise DatasetError(f"cannot understand the camera {text!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
-    return Intrinsics(_by_key(*numbers), f"the camera {text!r}")
+        raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
+    return Intrinsics({"depth_scale": depth_scale} | _by_key(*numbers), f"the camera {camera!r}")
 
 
 def from_camera(camera: Camera) -> Intrinsics:

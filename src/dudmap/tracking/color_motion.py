@@ -1,19 +1,42 @@
 """Registration of the colour image with the camera's motion between depth and colour."""
 
+from collections.abc import Callable
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.dynamics.segments import Segmentation, intensity_gradient
 from dudmap.frames.color_registration import color_projection, recorded_intensity, register_color
+from dudmap.frames.frame import Frame
 from dudmap.frames.observation import Level, Observation
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
+from dudmap.geometry.camera import Camera
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
+
+
+class RegisteredLevel(Level):
+    """A level whose intensities are registered when they are first asked for, since few frames need all levels.
+
+    Args:
+        camera, depth: Of the level.
+        register: Gives the intensities (h, w).
+    """
+
+    def __init__(self, camera: Camera, depth: NDArray[np.float32], register: Callable[[], NDArray[np.float32]]) -> None:
+        object.__setattr__(self, "camera", camera)
+        object.__setattr__(self, "depth", depth)
+        self.__dict__["_register"] = register
+
+    def __getattr__(self, name: str) -> NDArray[np.float32]:
+        if name != "intensity":
+            raise AttributeError(f"a level has no {name}")
+        self.__dict__["intensity"] = self.__dict__.pop("_register")()
+        return self.intensity
 
 
 class ColorMotion:
@@ -46,7 +69,7 @@ class ColorMotion:
 
     def start(self, view: FrameView) -> None:
         """Remember the frame that a map was made of, until its velocity is known."""
-        self._first = None if self._is_prepared(view.observation, np.ones(6)) else view
+        self._first = None if self.is_prepared(view.observation) else view
 
     def first_frame(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> FrameView | None:
         """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
@@ -72,23 +95,33 @@ class ColorMotion:
         """The frame with its colours registered, once its pose (4, 4) is known."""
         return self._with_colors(view, self._velocity(view, T_world_camera))
 
-    def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
-        calibration, observation = self.calibration, view.observation
-        if calibration is None or self._is_prepared(observation, velocity):
-            return view
-        with view.timer("color"):
-            projection = color_projection(calibration, velocity, observation.color_offset)
-            recorded = observation.recorded_rgb if observation.recorded_rgb is not None else observation.rgb
-            rgb = register_color(recorded, observation.depth, observation.camera, projection, self._backend)
-            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded))
+    def frame_with_colors(self, frame: Frame, camera: Camera, velocity: NDArray[np.float64]) -> Frame:
+        """A frame with its recorded colour registered to the depth.
 
-    def _is_prepared(self, observation: Observation, velocity: NDArray[np.float64]) -> bool:
+        Args:
+            frame: Preprocessed depth, and colour as it was recorded.
+            camera: Of the depth image, without distortion.
+            velocity: (6,) twist of the camera per second, its own axes.
+        """
+        if self.calibration is None:
+            return frame
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        projection = color_projection(self.calibration, velocity, offset)
+        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection, self._backend))
+
+    def is_prepared(self, observation: Observation) -> bool:
         """Whether the frame was prepared with all that is known."""
         calibration = self.calibration
-        if calibration is None:
-            return True
-        instant = calibration.delay + observation.color_offset == 0 and calibration.readout == 0
-        return calibration is self.given and (instant or not velocity.any())
+        return calibration is None or (calibration is self.given and calibration.is_instant(observation.color_offset))
+
+    def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        observation = view.observation
+        if self.is_prepared(observation):
+            return view
+        with view.timer("color"):
+            recorded = observation.as_recorded
+            rgb = self.frame_with_colors(recorded, observation.camera, velocity).color
+            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded.color))
 
     def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Twist per second (6,) after a frame was registered with that of the motion model."""
@@ -101,27 +134,31 @@ class ColorMotion:
         return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)
 
     def _with_levels(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
-        calibration, observation = self.calibration, view.observation
-        if calibration is None or self._is_prepared(observation, velocity):
+        calibration = self.calibration
+        if calibration is None or self.is_prepared(view.observation):
             return view
-        with view.timer("color"):
-            done: dict[int, Level] = {}
+        levels: dict[int, Level] = {}
 
-            def registered(level: Level) -> Level:
-                halvings = round(np.log2(observation.camera.width / level.camera.width))
-                if halvings not in done:
-                    scaled = replace(calibration, camera=calibration.camera.scaled(halvings))
-                    projection = color_projection(scaled, velocity, observation.color_offset)
-                    recorded = recorded_intensity(observation, halvings)
-                    intensity = register_color(recorded, level.depth, level.camera, projection, self._backend)
-                    done[halvings] = Level(level.camera, level.depth, intensity)
-                return done[halvings]
+        def registered(level: Level) -> Level:
+            halvings = round(np.log2(view.observation.camera.width / level.camera.width))
+            if halvings not in levels:
+                register = partial(self._intensity, view, calibration, level, halvings, velocity)
+                levels[halvings] = RegisteredLevel(level.camera, level.depth, register)
+            return levels[halvings]
 
-            tracked = [registered(level) for level in view.pyramid.tracked]
-            pyramid = Pyramid(tracked, registered(view.pyramid.labelled))
+        pyramid = Pyramid([registered(level) for level in view.pyramid.tracked], registered(view.pyramid.labelled))
 
         @cache
         def segmentation() -> Segmentation:
             return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
 
         return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)
+
+    def _intensity(
+        self, view: FrameView, calibration: Calibration, level: Level, halvings: int, velocity: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Registered intensities (h, w) of a level."""
+        scaled = replace(calibration, camera=calibration.camera.scaled(halvings))
+        projection = color_projection(scaled, velocity, view.observation.color_offset)
+        recorded = recorded_intensity(view.observation, halvings)
+        return register_color(recorded, level.depth, level.camera, projection, self._backend)

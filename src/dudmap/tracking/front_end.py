@@ -18,7 +18,6 @@ from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.time_offset import DepthTimeOffset
 from dudmap.tracking.tracker import Tracker, TrackingResult
 
 UNCHANGED_SHARE = 0.02
@@ -41,7 +40,6 @@ class FrontEnd:
 
     Attributes:
         last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
-        time_offset: Delay between depth and colour.
     """
 
     def __init__(
@@ -61,7 +59,6 @@ class FrontEnd:
         self.motion = motion
         self.monitor = monitor
         self.color_motion = color_motion
-        self.time_offset = DepthTimeOffset()
         self.last_dynamic: NDArray[np.bool_] | None = None
 
     def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
@@ -119,18 +116,15 @@ class FrontEnd:
             tracking = replace(tracking, color_residual=np.nan)
         return PoseEstimate(tracking, labels, unverified)
 
-    def update(self, volume: TsdfVolume, view: FrameView, estimate: PoseEstimate) -> None:
-        """Accept the pose and labels of a frame: velocity, time offset and the memory of the detector follow them."""
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""
         tracking, labels = estimate.tracking, estimate.labels
-        velocity = self.motion.update(view.timestamp, tracking.T_world_camera)
+        self.motion.update(view.timestamp, tracking.T_world_camera)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
         self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
-        coarse = view.pyramid.coarse
-        weights = static_weights(labels, [coarse], estimate.unverified_mask)[0]
-        self.time_offset.learn(self.tracker, volume, coarse, tracking.T_world_camera, velocity, weights)
         self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
     def lose(self, timestamp: float) -> None:
@@ -156,14 +150,16 @@ class FrontEnd:
     def _label(
         self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult
     ) -> Labels:
-        """Labels of a registered frame, seen from where the depth image was taken."""
+        """Labels of a registered frame."""
         with view.timer("label"):
-            T_depth = tracking.T_world_camera
-            if not view.blind:
-                velocity = self.motion.velocity_to(view.timestamp, T_depth)
-                T_depth = self.time_offset.depth_pose(view.pyramid.coarse, T_depth, velocity)
             labels = self.detector.detect(
-                volume, view.labelled, T_depth, view.timestamp, view.segmentation, prediction.moving, tracking.exposure
+                volume,
+                view.labelled,
+                tracking.T_world_camera,
+                view.timestamp,
+                view.segmentation,
+                prediction.moving,
+                tracking.exposure,
             )
             if view.blind:
                 labels = replace(labels, hidden=None)

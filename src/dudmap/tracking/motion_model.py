@@ -35,13 +35,11 @@ class MotionModel:
             return self.T_world_camera
         return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
-    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Accept the pose of a tracked frame; returns ``velocity_to`` it."""
-        velocity = self.velocity_to(timestamp, T_world_camera)
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
+        """Accept the pose of a tracked frame."""
         if self._initialized:
-            self._velocity = velocity
+            self._velocity = self.velocity_to(timestamp, T_world_camera)
         self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
-        return velocity
 
     def velocity_to(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
         """Twist per second (6,), camera axes, from the last accepted pose to this one; 0 before the first."""

@@ -1,0 +1,94 @@
+"""``dudmap info``: say what a recording holds, and what looks wrong in it."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from dudmap.cli.run import CameraOption, TopicsOption
+
+if TYPE_CHECKING:
+    from dudmap.pipeline.inspection import Inspection
+
+app = typer.Typer(add_completion=False)
+
+SHOWN_GAPS = 5
+"""Number of gaps in the times that are printed one by one."""
+
+
+@app.command()
+def info(
+    path: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="PATH")],
+    camera: CameraOption = None,
+    topics: TopicsOption = None,
+    sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a list.")] = False,
+) -> None:
+    """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
+
+    Warnings name what looks wrong: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are
+    read.
+    """
+    from rich.console import Console
+    from rich.table import Table
+
+    from dudmap.pipeline.contact_sheet import save_overview
+    from dudmap.pipeline.inspection import inspect, sample
+    from dudmap.sequences import open_sequence
+
+    recording = open_sequence(path, camera, topics=topics)
+    frames, unreadable = sample(recording)
+    found = inspect(recording, frames, unreadable)
+    if sheet is not None:
+        save_overview(sheet, frames)
+    if as_json:
+        typer.echo(json.dumps(found.tree()))
+        return
+    console = Console()
+    table = Table.grid(padding=(0, 2))
+    for row in rows(found):
+        table.add_row(*row)
+    console.print(table, highlight=False)
+    for warning in found.warnings:
+        console.print(f"warning: {warning}", highlight=False, soft_wrap=True, markup=False)
+    if sheet is not None:
+        console.print(f"written to {sheet}", highlight=False, soft_wrap=True)
+
+
+def rows(found: "Inspection") -> list[tuple[str, str]]:
+    """Names and values of what was found, as text."""
+    color = found.color_rate
+    rates = [] if found.rate is None else [f"{found.rate:.4g} Hz depth"] + ([f"{color:.4g} Hz colour"] if color else [])
+    registered = found.T_color_depth is None
+    shift = None if registered else [1000 * row[3] for row in found.T_color_depth or []]
+    return [
+        ("recording", found.name),
+        ("format", found.format),
+        ("frames", f"{found.frames} in {found.duration:.2f} s" + (f", {', '.join(rates)}" if rates else "")),
+        ("depth camera", _camera(found.camera)),
+        ("colour camera", "the same, registered" if registered else _camera(found.color_camera)),
+        *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
+        ("intrinsics from", found.intrinsics_source),
+        ("depth", _depth(found)),
+        ("ground truth", f"{found.ground_truth} poses" if found.ground_truth else "none"),
+        ("gaps", _gaps(found)),
+    ]
+
+
+def _camera(camera: dict[str, Any]) -> str:
+    numbers = "fx {fx:.6g}, fy {fy:.6g}, cx {cx:.6g}, cy {cy:.6g}".format(**camera)
+    lens = ", distortion " + " ".join(f"{value:g}" for value in camera["distortion"]) if camera["distortion"] else ""
+    return f"{camera['width']}x{camera['height']}, {numbers}{lens}"
+
+
+def _depth(found: "Inspection") -> str:
+    median = "no reading" if found.median_depth is None else f"median {found.median_depth:.3g} m"
+    return f"{found.depth_scale:g} units per metre, {median}, {found.valid_depth:.0%} of the pixels valid"
+
+
+def _gaps(found: "Inspection") -> str:
+    if not found.gaps:
+        return "none"
+    shown = ", ".join(f"{length:.2f} s after {stamp:.2f}" for stamp, length in found.gaps[:SHOWN_GAPS])
+    return f"{len(found.gaps)}: {shown}" + (" ..." if len(found.gaps) > SHOWN_GAPS else "")

@@ -1,0 +1,64 @@
+"""``dudmap live``: process the frames of a camera while they arrive."""
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dudmap.cli.run import (
+    ConfigOption,
+    JsonOption,
+    PresetOption,
+    QuietOption,
+    SetOption,
+    free_folder,
+    print_report,
+    read_config,
+)
+
+app = typer.Typer(add_completion=False)
+
+
+@app.command()
+def live(
+    camera: Annotated[
+        str | None,
+        typer.Option(
+            "--camera",
+            help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
+            "(a recording of the driver); default: the first camera that is connected.",
+            metavar="NAME",
+        ),
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option("--record", help="MCAP file for all frames that arrive.", metavar="FILE.mcap")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<camera>.")] = None,
+    config: ConfigOption = None,
+    assignments: SetOption = None,
+    preset: PresetOption = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option("--calibration", help="calibration.toml of an earlier run with this camera; default: its own."),
+    ] = None,
+    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
+    save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
+    quiet: QuietOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Estimate the trajectory and a mesh of the static scene while a camera moves; Ctrl-C ends and writes the results.
+
+    The newest frame is processed; frames that arrive meanwhile are counted as dropped, but recorded with --record.
+    """
+    from dudmap.cameras import open_camera
+    from dudmap.geometry.calibration import Calibration
+    from dudmap.pipeline.live import run_live
+
+    parameters = read_config(config, preset, assignments or [])
+    given = None if calibration is None else Calibration.load(calibration)
+    source = open_camera(camera)
+    report = run_live(
+        source, parameters, out or free_folder(Path("runs") / source.name),
+        max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,
+    )  # fmt: skip
+    print_report(report.metrics, report.out, quiet=quiet, as_json=as_json)

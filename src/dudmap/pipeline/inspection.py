@@ -1,0 +1,218 @@
+"""What a recording holds, and what looks wrong in it, from its lists and a few of its frames."""
+
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import FrameError
+
+if TYPE_CHECKING:
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.geometry.trajectory import Trajectory
+    from dudmap.sequences import Sequence
+
+SAMPLES = 12
+"""Number of evenly spread frames that are read."""
+NEAR, FAR = 0.1, 30.0
+"""Plausible medians of the depth readings, metres: no depth camera measures nearer or farther most of the time."""
+FEW_READINGS = 0.2
+"""Share of pixels with a reading below which the depth is called sparse."""
+FIELD_OF_VIEW = (20.0, 130.0)
+"""Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
+OFF_CENTER = 0.25
+"""Largest plausible distance of the principal point from the middle of the image, share of its size."""
+UNEQUAL_FOCAL = 0.1
+"""Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
+GAP = 3.0
+"""Time between frames that counts as a gap, as a multiple of the median."""
+SLOW, FAST = 1.0, 0.001
+"""Median time between frames, seconds, beyond which the times are in another unit, or not of one camera."""
+LATE = 0.015
+"""Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
+SCALES = (1.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
+"""Depth scales in use, units per metre, of which one is proposed where the given one is implausible."""
+USUAL = (0.4, 8.0)
+"""Median depth, metres, that a proposed scale must give."""
+
+
+@dataclass
+class Inspection:
+    """What a recording holds.
+
+    Attributes:
+        name, format: Of the recording.
+        frames: Number of frames.
+        duration: From the first to the last depth image, seconds.
+        rate: Depth images per second (of the median time between two).
+        color_rate: The same for the colour images; None where their times are not known.
+        gaps: (time of the last frame before it, length) of every gap, seconds.
+        camera, color_camera: Intrinsics of the depth and of the colour camera; the same where they are registered.
+        T_color_depth: 4x4 motion between them, row by row; None where they are registered.
+        intrinsics_source: Where the intrinsics come from.
+        depth_scale: Units of a 16-bit depth image per metre.
+        median_depth: Of all readings of the sampled frames, metres; None without any.
+        valid_depth: Share of pixels with a reading.
+        unreadable: Reasons of the sampled frames that cannot be read.
+        ground_truth: Number of true poses, 0 without.
+        warnings: Sentences on what looks wrong.
+    """
+
+    name: str
+    format: str
+    frames: int
+    duration: float
+    rate: float | None
+    color_rate: float | None
+    gaps: list[tuple[float, float]]
+    camera: dict[str, Any]
+    color_camera: dict[str, Any]
+    T_color_depth: list[list[float]] | None
+    intrinsics_source: str
+    depth_scale: float
+    median_depth: float | None
+    valid_depth: float
+    ground_truth: int
+    unreadable: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+
+    def tree(self) -> dict[str, Any]:
+        """Nested dictionary of numbers, lists and words, for JSON."""
+        return asdict(self)
+
+
+def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int, Frame]], list[str]]":
+    """Numbers and frames of an evenly spread selection, and the reasons of those that cannot be read."""
+    frames, unreadable = [], []
+    for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)):
+        try:
+            frames.append((int(index), sequence[int(index)]))
+        except FrameError as error:
+            unreadable.append(str(error))
+    return frames, unreadable
+
+
+def inspect(
+    sequence: "Sequence", frames: "list[tuple[int, Frame]] | None" = None, unreadable: list[str] | None = None
+) -> Inspection:
+    """Describe a recording and name what looks wrong.
+
+    Args:
+        sequence: The recording.
+        frames: Numbers and frames as ``sample`` returns them; None samples.
+        unreadable: Reasons of the sampled frames that cannot be read.
+    """
+    if frames is None:
+        frames, unreadable = sample(sequence)
+    depths = [frame.depth[frame.depth > 0] for _, frame in frames]
+    readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
+    pixels = sum(frame.depth.size for _, frame in frames)
+    camera, calibration = sequence.camera, sequence.calibration
+    colors = getattr(sequence, "color_timestamps", None)
+    truth = sequence.ground_truth
+    found = Inspection(
+        name=sequence.name,
+        format=getattr(sequence, "format", type(sequence).__name__),
+        frames=len(sequence),
+        duration=float(sequence.timestamps[-1] - sequence.timestamps[0]),
+        rate=_rate(sequence.timestamps),
+        color_rate=None if colors is None else _rate(np.unique(colors)),
+        gaps=_gaps(sequence.timestamps),
+        camera=_numbers(camera),
+        color_camera=_numbers(camera if calibration is None else calibration.camera),
+        T_color_depth=None if calibration is None else calibration.T_color_depth.tolist(),
+        intrinsics_source=getattr(sequence, "intrinsics_source", "the recording"),
+        depth_scale=camera.depth_scale,
+        median_depth=float(np.median(readings)) if len(readings) else None,
+        valid_depth=len(readings) / pixels if pixels else 0.0,
+        ground_truth=0 if truth is None else len(truth),
+        unreadable=list(unreadable or []),
+    )
+    found.warnings = [
+        *_depth_warnings(found),
+        *_camera_warnings("depth camera", camera),
+        *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
+        *_time_warnings(sequence.timestamps, colors),
+        *_truth_warnings(sequence.timestamps, truth),
+    ]
+    return found
+
+
+def _numbers(camera: "Camera") -> dict[str, Any]:
+    out = asdict(camera) | {"distortion": list(camera.distortion)}
+    del out["depth_scale"]
+    return out
+
+
+def _rate(times: NDArray[np.float64]) -> float | None:
+    return float(1.0 / np.median(np.diff(times))) if len(times) > 1 else None
+
+
+def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
+    steps = np.diff(times)
+    if not len(steps):
+        return []
+    return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
+
+
+def _depth_warnings(found: Inspection) -> list[str]:
+    out = []
+    if found.unreadable:
+        out.append(
+            f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
+        )
+    if found.median_depth is None:
+        return [*out, "the sampled frames hold no depth reading"]
+    if not NEAR <= found.median_depth <= FAR:
+        units = found.median_depth * found.depth_scale
+        fitting = [f"{scale:g}" for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1]]
+        proposal = f"; {' or '.join(fitting)} would be plausible" if fitting else ""
+        out.append(
+            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre the median depth is "
+            f"{found.median_depth:.3g} m{proposal}: give it as the last number of --camera fx,fy,cx,cy,w,h,depth_scale"
+        )
+    if found.valid_depth < FEW_READINGS:
+        out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")
+    return out
+
+
+def _camera_warnings(name: str, camera: "Camera") -> list[str]:
+    out = []
+    angles = [
+        np.degrees(2 * np.arctan(size / 2 / f)) for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
+    ]
+    if not all(FIELD_OF_VIEW[0] <= angle <= FIELD_OF_VIEW[1] for angle in angles):
+        out.append(f"a field of view of {angles[0]:.0f} x {angles[1]:.0f} degrees")
+    for axis, center, size in (("x", camera.cx, camera.width), ("y", camera.cy, camera.height)):
+        if abs(center + 0.5 - size / 2) > OFF_CENTER * size:
+            out.append(f"a principal point c{axis} of {center:g} in an image of {size} pixels")
+    if abs(camera.fx - camera.fy) > UNEQUAL_FOCAL * max(camera.fx, camera.fy):
+        out.append(f"focal lengths of {camera.fx:g} and {camera.fy:g}")
+    return [f"the intrinsics of the {name} look wrong: {what}; give the right ones with --camera" for what in out]
+
+
+def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | None) -> list[str]:
+    out = []
+    if len(times) > 1:
+        step = float(np.median(np.diff(times)))
+        if not FAST <= step <= SLOW:
+            out.append(f"the times look wrong: {step:.3g} s from frame to frame; expected seconds, of one camera")
+    if colors is None:
+        return out
+    late = float(np.median(np.abs(colors - times)))
+    if late > LATE:
+        out.append(f"colour and depth are {1000 * late:.0f} ms apart in most frames: the lists may be paired wrongly")
+    if np.any(np.diff(colors) < 0):
+        out.append("the colour images are not in the order of the depth images: the times of the lists are mixed up")
+    return out
+
+
+def _truth_warnings(times: NDArray[np.float64], truth: "Trajectory | None") -> list[str]:
+    if truth is None or (truth.timestamps[0] <= times[-1] and times[0] <= truth.timestamps[-1]):
+        return []
+    return [
+        f"the ground truth ({truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s) is of another time than the "
+        f"images ({times[0]:.3f} to {times[-1]:.3f} s)"
+    ]

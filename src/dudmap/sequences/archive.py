@@ -1,0 +1,177 @@
+"""Recordings in archives: unpacked once into a cache, with everything refused that an image sequence does not need."""
+
+import hashlib
+import os
+import shutil
+import stat
+import tarfile
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Generator
+from contextlib import closing
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import IO, NamedTuple
+
+from dudmap.errors import DatasetError
+
+SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
+LARGEST_BYTES = 256 * 2**30
+"""Largest unpacked size. The largest recording of the data sets that are read (a CoRBS scene) has less than 30 GB."""
+LARGEST_RATIO = 100
+"""Largest unpacked over packed size. Images hardly shrink, depth as text shrinks to a tenth; deflate reaches 1000."""
+RATIO_FREE_BYTES = 64 * 2**20
+"""Unpacked size below which the ratio does not matter."""
+LARGEST_COUNT = 1_000_000
+"""Largest number of members, 4.6 hours of colour and depth files at 30 frames a second."""
+CHUNK = 2**20
+ORIGIN = "origin.txt"
+"""File beside the unpacked folder that names the archive."""
+
+
+class Member(NamedTuple):
+    """Member of an archive: its name, what it is, and how it is opened."""
+
+    name: str
+    kind: str
+    open: Callable[[], IO[bytes] | None]
+
+
+def is_archive(path: Path) -> bool:
+    """Whether a file is an archive by its name."""
+    return path.name.lower().endswith(SUFFIXES) and path.is_file()
+
+
+def split(path: Path) -> tuple[Path, PurePosixPath] | None:
+    """Archive and member of a path such as ``chess.zip/chess/seq-01``; None if no part of it is an archive."""
+    for parent in (path, *path.parents):
+        if is_archive(parent):
+            return parent, PurePosixPath(*path.parts[len(parent.parts) :])
+    return None
+
+
+def cache_folder() -> Path:
+    """Folder of unpacked archives: DUDMAP_CACHE, else XDG_CACHE_HOME/dudmap, else ~/.cache/dudmap."""
+    given = os.environ.get("DUDMAP_CACHE")
+    if given:
+        return Path(given)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "dudmap"
+
+
+def unpack(path: Path) -> Path:
+    """Folder with the content of an archive; unpacked when it is opened first or has changed since.
+
+    Raises:
+        DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths that lead out of it,
+            or the disk is full.
+    """
+    status = path.stat()
+    key = f"{path.resolve()} {status.st_size} {status.st_mtime_ns}"
+    place = cache_folder() / f"{stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"
+    folder = place / stem(path)
+    if folder.is_dir():
+        return folder
+    cache_folder().mkdir(parents=True, exist_ok=True)
+    try:
+        with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="unfinished-") as unfinished:
+            content = Path(unfinished) / "place" / stem(path)
+            _unpack_into(path, content, status.st_size)
+            (content.parent / ORIGIN).write_text(str(path.resolve()), encoding="utf-8")
+            _publish(content.parent, place)
+    except (zipfile.BadZipFile, tarfile.TarError, EOFError, RuntimeError, NotImplementedError, zlib.error) as error:
+        raise DatasetError(f"cannot unpack {path}: {error}") from error
+    return folder
+
+
+def _publish(finished: Path, place: Path) -> None:
+    """Give an unpacked archive its place, unless another process did so in the meantime."""
+    try:
+        finished.rename(place)
+    except OSError:
+        if not place.is_dir():
+            raise
+
+
+def origin(path: Path) -> Path | None:
+    """Archive that a folder was unpacked from; None if it was not."""
+    for parent in path.resolve().parents:
+        if (parent / ORIGIN).is_file() and cache_folder().resolve() == parent.parent:
+            return Path((parent / ORIGIN).read_text(encoding="utf-8"))
+    return None
+
+
+def stem(path: Path) -> str:
+    """Name of an archive without its suffix."""
+    suffix = max((suffix for suffix in SUFFIXES if path.name.lower().endswith(suffix)), key=len)
+    return path.name[: -len(suffix)]
+
+
+def _unpack_into(path: Path, folder: Path, packed: int) -> None:
+    """Write all files of an archive below a new folder, counting what really comes out of it."""
+    folder.mkdir(parents=True)
+    limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
+    written = 0
+    with closing(_members(path)) as members:
+        for count, member in enumerate(members, start=1):
+            if count > LARGEST_COUNT:
+                raise DatasetError(f"{path} has more than {LARGEST_COUNT} members; expected a recording")
+            target = folder.joinpath(*_inside(path, member).parts)
+            if member.kind == "folder":
+                target.mkdir(parents=True, exist_ok=True)
+                continue
+            target.parent.mkdir(parents=True, exist_ok=True)
+            source = None if target.exists() else member.open()
+            if source is None:
+                raise DatasetError(f"{path} holds {member.name} twice; expected every file once")
+            with source, target.open("wb") as out:
+                while chunk := source.read(CHUNK):
+                    written += len(chunk)
+                    if written > limit:
+                        raise DatasetError(_too_large(path, packed, limit))
+                    out.write(chunk)
+
+
+def _too_large(path: Path, packed: int, limit: int) -> str:
+    return (
+        f"{path} ({packed / 1e6:.1f} MB) unpacks to more than {limit / 1e6:.0f} MB, the least of {LARGEST_RATIO} times "
+        f"its size, {LARGEST_BYTES / 2**30:.0f} GiB and the free space of {cache_folder()}; unpack it by hand if you "
+        "trust it, or name another folder with DUDMAP_CACHE"
+    )
+
+
+def _inside(path: Path, member: Member) -> PurePosixPath:
+    """Relative path of a member that is a plain file or folder.
+
+    Raises:
+        DatasetError: It is something else, or leads out of the archive.
+    """
+    if member.kind not in ("file", "folder"):
+        raise DatasetError(f"{path} holds {member.name}, a {member.kind}; an archive of a recording has files only")
+    name = member.name.replace("\\", "/")
+    parts = PurePosixPath(name)
+    if parts.is_absolute() or ".." in parts.parts or ":" in name or "\0" in name:
+        raise DatasetError(f"{path} holds {member.name!r}, a path that leads out of the archive; it was not unpacked")
+    return parts
+
+
+def _members(path: Path) -> "Generator[Member]":
+    if path.name.lower().endswith(".zip"):
+        yield from _zip_members(path)
+    else:
+        yield from _tar_members(path)
+
+
+def _zip_members(path: Path) -> "Generator[Member]":
+    with zipfile.ZipFile(path) as archive:
+        for info in archive.infolist():
+            mode = stat.S_IFMT(info.external_attr >> 16)
+            kind = "folder" if info.is_dir() else "file" if mode in (0, stat.S_IFREG) else "link or device"
+            yield Member(info.filename, kind, partial(archive.open, info))
+
+
+def _tar_members(path: Path) -> "Generator[Member]":
+    with tarfile.open(path, "r|*") as archive:
+        for info in archive:
+            kind = "folder" if info.isdir() else "file" if info.isreg() else "link or device"
+            yield Member(info.name, kind, partial(archive.extractfile, info))

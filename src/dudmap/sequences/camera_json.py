@@ -1,0 +1,135 @@
+"""Intrinsics of JSON files: Open3D and its recorders, NICE-SLAM, librealsense, ZED, and plain keys."""
+
+import json
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError
+from dudmap.geometry import se3
+from dudmap.sequences.intrinsics import KEYS, Intrinsics
+
+NAMES = {
+    "fx": ("fx", "fl_x", "focal_x"),
+    "fy": ("fy", "fl_y", "focal_y"),
+    "cx": ("cx", "ppx", "principal_x"),
+    "cy": ("cy", "ppy", "principal_y"),
+    "width": ("width", "w", "image_width"),
+    "height": ("height", "h", "image_height"),
+    "depth_scale": ("depth_scale", "scale", "png_depth_scale", "depth_map_factor"),
+    "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
+}  # fmt: skip
+"""Our key and the names it has in files."""
+MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
+"""Names of a 4x4 matrix that takes points of the depth camera to the colour camera."""
+
+
+def load(paths: Iterable[Path], depth_scale: float) -> Intrinsics:
+    """Intrinsics of JSON files: of one camera, or of a depth and a colour camera.
+
+    Every object that holds focal lengths and a principal point is a camera; it is a depth camera where a name on the
+    way to it, the file's included, contains "depth". A depth scale below 1 is metres per unit.
+
+    Args:
+        paths: The files.
+        depth_scale: Depth units per metre where the files give none.
+
+    Raises:
+        DatasetError: A file cannot be read, or there is no camera or more than one of a kind.
+    """
+    cameras: list[tuple[str, dict[str, float]]] = []
+    scale, motion, files = depth_scale, np.eye(4), list(paths)
+    for path in files:
+        tree = _read(path)
+        cameras += _cameras(tree, path.stem.lower())
+        scale = _depth_scale(tree) or scale
+        motion = _motion(tree, motion)
+    source = " and ".join(path.name for path in files)
+    depths = [values for name, values in cameras if "depth" in name]
+    colors = [values for name, values in cameras if "depth" not in name and "right" not in name]
+    if len(depths) > 1 or len(colors) > 1 or not cameras:
+        raise DatasetError(
+            f"{source} gives {len(depths)} depth and {len(colors)} other cameras; expected one of each at most: "
+            "give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+        )
+    if not depths:
+        return Intrinsics(colors[0] | {"depth_scale": scale}, source)
+    color = colors[0] if colors and colors[0] != depths[0] else {}
+    return Intrinsics(depths[0] | {"depth_scale": scale}, source, color, se3.inverse(motion))
+
+
+def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        raise DatasetError(f"cannot read {path}: {error}") from error
+
+
+def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  # noqa: ANN401
+    """Names and values of all cameras below a JSON value."""
+    if isinstance(tree, dict):
+        values = values_of(tree)
+        if values is not None:
+            yield name, values
+            return
+        for key, below in tree.items():
+            yield from _cameras(below, f"{name}/{key.lower()}")
+    elif isinstance(tree, list):
+        for below in tree:
+            yield from _cameras(below, name)
+
+
+def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
+    """Numbers by our keys of one JSON object; None if it is no camera.
+
+    ``intrinsic_matrix`` has 9 numbers column by column (Open3D) or 3 rows of 3; its last row is 0 0 1.
+    """
+    values = {}
+    for key, names in NAMES.items():
+        found = next((tree[name] for name in names if isinstance(tree.get(name), int | float)), None)
+        if found is not None and key != "depth_scale":
+            values[key] = float(found)
+    K = _numbers(tree.get("intrinsic_matrix", tree.get("K")), 9)
+    if K is not None:
+        K = K.reshape(3, 3)
+        K = K.T if K[2, 0] or K[2, 1] else K
+        values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+    lens = tree.get("coeffs", tree.get("disto", tree.get("distortion")))
+    if isinstance(lens, list) and all(isinstance(number, int | float) for number in lens[:5]):
+        values |= dict(zip(KEYS[7:], map(float, lens[:5]), strict=False))
+    return values if all(key in values for key in KEYS[:4]) else None
+
+
+def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
+    """Depth units per metre anywhere in a JSON value."""
+    if isinstance(tree, list):
+        return next((scale for below in tree if (scale := _depth_scale(below))), None)
+    if not isinstance(tree, dict):
+        return None
+    for name in NAMES["depth_scale"]:
+        value = tree.get(name)
+        if isinstance(value, int | float) and value > 0:
+            return float(value) if value >= 1 else 1.0 / value
+    return next((scale for below in tree.values() if (scale := _depth_scale(below))), None)
+
+
+def _motion(tree: Any, default: NDArray[np.float64]) -> NDArray[np.float64]:  # noqa: ANN401
+    """T_color_depth of one of the names ``MOTIONS`` at the top of a JSON object."""
+    for name in MOTIONS:
+        numbers = _numbers(tree.get(name), 16) if isinstance(tree, dict) else None
+        if numbers is not None:
+            return numbers.reshape(4, 4)
+    return default
+
+
+def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
+    """Numbers (count,) of a list or of a list of rows; None if it is something else."""
+    if not isinstance(value, list):
+        return None
+    flat = [number for row in value for number in (row if isinstance(row, list) else [row])]
+    if len(flat) != count or not all(isinstance(number, int | float) for number in flat):
+        return None
+    return np.array(flat, dtype=np.float64)

@@ -1,0 +1,136 @@
+"""Folders of ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt``: 7-Scenes, VolumeDeform and others."""
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError
+from dudmap.geometry import se3
+from dudmap.geometry.association import TimedFile
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.sequences import images, intrinsics
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.poses import read_matrices, read_matrix, rigid_trajectory
+
+NAME = r"frame-(\d+)"
+SEVEN_SCENES_DEPTH = {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+"""Depth camera that the 7-Scenes page gives."""
+SEVEN_SCENES_COLOR = {"fx": 525.0, "fy": 525.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
+"""Colour camera that work on 7-Scenes uses (DSAC*, Brachmann and Rother 2021); the page gives none."""
+KINECT_COLOR_DEPTH = np.array(
+    [
+        [9.9996518012567637e-01, 2.6765126468950343e-03, -7.9041012313000904e-03, -2.5558943178152542e-02],
+        [-2.7409311281316700e-03, 9.9996302803027592e-01, -8.1504520778013286e-03, 1.0109636268061706e-04],
+        [7.8819942130445332e-03, 8.1718328771890631e-03, 9.9993554558014031e-01, 2.0318321729487039e-03],
+        [0, 0, 0, 1],
+    ]
+)
+"""Points of the depth camera of one Kinect into its colour camera (LIRIS), which DSAC* takes for 7-Scenes. ``dudmap
+calibrate`` on 200 frames of a recording finds no better place, focal length or principal point than these."""
+LOST = 65535
+"""Value of a pixel without reading in 7-Scenes."""
+
+
+class FrameFiles(ImageFolder):
+    """Base of the formats whose files are named ``frame-000000``; poses are camera to world, one file per frame."""
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        files = list(self.path.iterdir())
+        colors = numbered_files(files, NAME + r"\.(?:color|rgb)\.(?:png|jpe?g)")
+        return pair_numbered(self.path, colors, numbered_files(files, NAME + r"\.depth\.(?:png|pgm)"))
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        poses = numbered_files(self.path.iterdir(), NAME + r"\.pose\.txt")
+        return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
+
+
+class SevenScenesSequence(FrameFiles):
+    """Folder of 7-Scenes (Shotton et al. 2013). Depth is not registered to colour; 65535 means no reading.
+
+    The cameras are those of the data set; a camera-intrinsics.txt (3x3 matrix) beside the images is the depth camera.
+    Depth that somebody has registered to colour needs an intrinsics.txt.
+    """
+
+    format = "7-Scenes"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return path.is_dir() and any(path.glob("frame-*.depth.png")) and any(path.glob("frame-*.pose.txt"))
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        registered = intrinsics.own(self.path, self.depth_scale)
+        if registered is not None:
+            return registered
+        depth, source = SEVEN_SCENES_DEPTH, "the 7-Scenes cameras"
+        if (self.path / "camera-intrinsics.txt").is_file():
+            depth, source = _matrix(self.path / "camera-intrinsics.txt"), "camera-intrinsics.txt, colour of 7-Scenes"
+        return intrinsics.Intrinsics(
+            depth | {"depth_scale": self.depth_scale}, source, dict(SEVEN_SCENES_COLOR), se3.inverse(KINECT_COLOR_DEPTH)
+        )
+
+    def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
+        depth = images.read_depth(path, depth_scale)
+        depth[depth >= np.float32(LOST / depth_scale)] = 0
+        return depth
+
+
+class VolumeDeformSequence(FrameFiles):
+    """Folder of VolumeDeform (Innmann et al. 2016): images with colorIntrinsics.txt and depthIntrinsics.txt.
+
+    The folder is the one of the images (``data``) or the one above, in which poses.txt may hold a 4x4 matrix per frame.
+    The images are registered where both matrices are equal, as in that data set; otherwise the cameras are taken to be
+    in one place, as the files do not say more.
+    """
+
+    format = "VolumeDeform"
+
+    def __init__(self, path: str | Path, camera: intrinsics.Camera | str | None = None) -> None:
+        path = Path(path)
+        self._top = path
+        super().__init__(path / "data" if (path / "data").is_dir() else path, camera)
+        if self.name == "data":
+            self._top = self.path.resolve().parent
+            self.name = self._top.name
+        self.ground_truth = self._find_ground_truth()
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return any(
+            (place / "depthIntrinsics.txt").is_file() and any(place.glob("frame-*.depth.*"))
+            for place in (path, path / "data")
+            if place.is_dir()
+        )
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        depth = _matrix(self.path / "depthIntrinsics.txt") | {"depth_scale": self.depth_scale}
+        file = self.path / "colorIntrinsics.txt"
+        color = _matrix(file) if file.is_file() else {key: depth[key] for key in intrinsics.KEYS[:4]}
+        if all(color[key] == depth[key] for key in color):
+            return intrinsics.Intrinsics(depth, "depthIntrinsics.txt")
+        height, width = images.read_color(self._pairs[0][0].path).shape[:2]
+        color |= {"width": width, "height": height}
+        return intrinsics.Intrinsics(depth, "depthIntrinsics.txt and colorIntrinsics.txt", color)
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        per_frame = super()._find_ground_truth()
+        file = self._top / "poses.txt"
+        if per_frame is not None or not file.is_file():
+            return per_frame
+        poses = read_matrices(file)
+        return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(poses))
+
+
+def _matrix(path: Path) -> dict[str, float]:
+    """fx, fy, cx, cy of a 3x3 or 4x4 intrinsic matrix.
+
+    Raises:
+        DatasetError: The file cannot be read or holds another count of numbers.
+    """
+    try:
+        K = read_matrix(path, 4, 4)
+    except DatasetError:
+        K = read_matrix(path, 3, 3)
+    return {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}

@@ -1,0 +1,181 @@
+"""Recordings of pairs of image files: what all folder formats share."""
+
+import re
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError, FrameError
+from dudmap.frames.frame import Frame
+from dudmap.geometry.association import TimedFile
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.sequences import images, intrinsics
+
+PROBES = 30
+"""Number of evenly spread frames that are tried until one is valid and gives the image size."""
+FRAME_RATE = 30.0
+"""Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
+
+
+class ImageFolder:
+    """Base class of recordings whose frames are a colour file and a depth file each.
+
+    A format says how its files pair (``_find_pairs``), what its cameras are (``_find_intrinsics``), and optionally
+    where the truth is (``_find_ground_truth``) and how an image is stored (``_read_depth``, ``_read_color``).
+
+    Args:
+        path: The folder.
+        camera: Intrinsics that replace those of the depth camera, as a Camera or as
+            ``fx,fy,cx,cy[,w,h[,depth_scale]]``; a colour camera of its own stays as the recording gives it.
+
+    Attributes:
+        name: Name of the folder.
+        camera: Intrinsics.
+        intrinsics_source: Where they come from.
+        calibration: Of the colour camera, where it is another one; None for colour that is registered to depth.
+        timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
+        ground_truth: True camera poses, None if they are not known.
+
+    Raises:
+        DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
+    """
+
+    format = ""
+    options: tuple[str, ...] = ()
+    depth_scale = 1000.0
+    """Depth units per metre where neither the recording nor the user says otherwise."""
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        self.path = Path(path)
+        self.name = self.path.resolve().name
+        self._pairs = self._find_pairs()
+        self.timestamps = np.array([depth.timestamp for _, depth in self._pairs], dtype=np.float64)
+        known = self._find_intrinsics() if camera is None else self._replaced(camera)
+        self.intrinsics_source = known.source
+        self.calibration = known.calibration()
+        self.camera = self._probe(known)
+        self.ground_truth = self._find_ground_truth()
+
+    @property
+    def color_timestamps(self) -> NDArray[np.float64]:
+        """(N,) timestamps of the colour images of all frames, seconds."""
+        return np.array([color.timestamp for color, _ in self._pairs], dtype=np.float64)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame number ``index``.
+
+        Raises:
+            FrameError: The frame cannot be read, or has another size than the recording.
+        """
+        frame = self._read(index, self.camera.depth_scale)
+        if frame.depth.shape != self.camera.shape:
+            raise FrameError(
+                f"frame {index}: {self._pairs[index][1].path} is {size(frame.depth)} pixels, but the recording's "
+                f"camera is {self.camera.width}x{self.camera.height}"
+            )
+        return frame
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame; this layout has none."""
+        return None
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files of all frames, by increasing time of the depth."""
+        raise NotImplementedError
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        """Intrinsics as the recording or its data set gives them."""
+        raise NotImplementedError
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        """True camera poses."""
+        return None
+
+    def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
+        """Depth image (H, W) in metres."""
+        return images.read_depth(path, depth_scale)
+
+    def _read_color(self, path: Path) -> NDArray[np.uint8]:
+        """Colour image (H, W, 3), RGB."""
+        return images.read_color(path)
+
+    def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
+        """The given intrinsics of the depth camera, with the colour camera that the recording gives, if any."""
+        given = intrinsics.given(camera, self.depth_scale)
+        try:
+            own = self._find_intrinsics()
+        except DatasetError:  # the recording does not give them, which is why the user does
+            return given
+        return intrinsics.Intrinsics(given.values, given.source, own.color, own.T_depth_color)
+
+    def _read(self, index: int, depth_scale: float) -> Frame:
+        color_file, depth_file = self._pairs[index]
+        try:
+            depth = self._read_depth(depth_file.path, depth_scale)
+            color = self._read_color(color_file.path)
+        except FrameError as error:
+            raise FrameError(f"frame {index}: {error}") from error
+        if self.calibration is not None and color.shape[:2] != self.calibration.camera.shape:
+            expected = self.calibration.camera
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {size(color)} pixels, but the recording's "
+                f"colour camera is {expected.width}x{expected.height}"
+            )
+        if self.calibration is None and color.shape[:2] != depth.shape:
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {size(color)} pixels but the depth image "
+                f"{depth_file.path} is {size(depth)}; both must have one size, with depth registered to "
+                "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
+            )
+        return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
+
+    def _probe(self, known: intrinsics.Intrinsics) -> Camera:
+        """Camera with the size of the first valid frame.
+
+        Raises:
+            DatasetError: No frame is valid.
+        """
+        problem = None
+        for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
+            try:
+                frame = self._read(int(index), known.depth_scale)
+            except FrameError as error:
+                problem = problem or str(error)
+                continue
+            if frame.depth.any():
+                return known.camera(frame.depth.shape[1], frame.depth.shape[0])
+            problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"
+        raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+
+def size(image: NDArray) -> str:
+    """Width and height of an image, for messages."""
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
+    """Files by the number that the first group of a pattern of the whole file name holds; others are left out."""
+    matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
+    return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}
+
+
+def pair_numbered(
+    path: Path, colors: dict[int, Path], depths: dict[int, Path], rate: float = FRAME_RATE
+) -> list[tuple[TimedFile, TimedFile]]:
+    """(colour, depth) files of equal numbers; the time of a frame is its number over the frame rate.
+
+    Raises:
+        DatasetError: No number occurs in both.
+    """
+    numbers = sorted(colors.keys() & depths.keys())
+    if not numbers:
+        raise DatasetError(
+            f"{path} has {len(colors)} colour and {len(depths)} depth images, but none of them has the same number"
+        )
+    return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]

@@ -1,0 +1,44 @@
+"""Replica as rendered for NICE-SLAM (Zhu et al. 2022): results/frame000000.jpg, depth000000.png, traj.txt."""
+
+from pathlib import Path
+
+from dudmap.geometry.association import TimedFile
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.sequences import camera_json, intrinsics
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.poses import read_matrices, rigid_trajectory
+
+CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "width": 1200, "height": 680, "depth_scale": 6553.5}
+"""Camera of these renders, for folders without cam_params.json."""
+
+
+class ReplicaSequence(ImageFolder):
+    """Folder with ``results/`` and ``traj.txt``: one pose per line, 16 numbers, camera to world, x right, y down.
+
+    cam_params.json lies in the folder or, as downloaded, in the one above that holds all rooms.
+    """
+
+    format = "Replica (NICE-SLAM)"
+    depth_scale = CAMERA["depth_scale"]
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return (path / "results").is_dir() and any((path / "results").glob("depth*.png"))
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        files = list((self.path / "results").iterdir())
+        colors = numbered_files(files, r"frame(\d+)\.(?:jpe?g|png)")
+        return pair_numbered(self.path, colors, numbered_files(files, r"depth(\d+)\.png"))
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        for place in (self.path, self.path.resolve().parent):
+            if (place / "cam_params.json").is_file():
+                return camera_json.load([place / "cam_params.json"], self.depth_scale)
+        return intrinsics.own_or(self.path, CAMERA, "the Replica camera of NICE-SLAM")
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        file = self.path / "traj.txt"
+        if not file.is_file():
+            return None
+        return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(read_matrices(file)))

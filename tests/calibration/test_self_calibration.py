@@ -1,0 +1,145 @@
+"""Calibration while the camera moves: when a result is used, and what it changes in the map."""
+
+from threading import Event
+
+import cv2
+import numpy as np
+import pytest
+
+from dudmap.calibration import self_calibration
+from dudmap.calibration.estimator import Estimate
+from dudmap.calibration.self_calibration import SelfCalibration
+from dudmap.config import Config, SensorConfig
+from dudmap.frames.preprocess import Preprocessor
+from dudmap.geometry import se3
+from dudmap.geometry.calibration import Calibration
+from dudmap.geometry.camera import Camera
+from dudmap.slam import Slam
+from dudmap.synthetic import sequence
+from dudmap.synthetic.faults import SensorFaults
+
+SMALL = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
+FRAMES, FIRST, LATER = 24, 12, 4
+UNREGISTERED = {"color_translation": (0.04, 0.0, 0.0), "color_focal_ratio": 0.92}
+
+
+def recording(**faults):
+    return sequence(
+        movers=(), frames=FRAMES, camera=SMALL, noise="none", camera_path="fast", faults=SensorFaults(**faults), seed=3
+    )
+
+
+def truth_of(recorded) -> Calibration:
+    faults = recorded.faults
+    T = se3.inverse(faults.T_depth_color)
+    names = ("translation_x", "log_focal")
+    return Calibration(recorded.color_camera, T, faults.color_delay, faults.color_readout, np.ones(13), names)
+
+
+class Estimator:
+    """Knows the result, and gives it once it may."""
+
+    def __init__(self, result: Calibration) -> None:
+        self.result, self.may, self.keyframes = result, Event(), []
+
+    def __call__(self, given, sensor):
+        return self
+
+    def estimate(self, keyframes):
+        self.may.wait(20)
+        self.keyframes.append(len(keyframes))
+        return Estimate(self.result, {}, 0.3, 80)
+
+
+@pytest.fixture
+def estimator(monkeypatch):
+    monkeypatch.setattr(self_calibration, "ATTEMPTS", (FIRST,))
+    monkeypatch.setattr(self_calibration, "DELAY", LATER)
+    made = Estimator(truth_of(recording(**UNREGISTERED)))
+    monkeypatch.setattr(self_calibration, "CalibrationEstimator", made)
+    return made
+
+
+def observations(count: int):
+    recorded, preprocess = recording(), Preprocessor(SMALL)
+    for index in range(count):
+        yield preprocess(recorded[index]), recorded.ground_truth.Ts_world_camera[index], np.zeros(SMALL.shape, bool)
+
+
+def when_found(live: bool, estimator) -> int | None:
+    """Frame with which a result is found if it is there from frame FIRST + 1 on."""
+    estimator.may.clear()
+    calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig(), live=live)
+    for n, (observation, T, mask) in enumerate(observations(FIRST + LATER + 2), start=1):
+        calibrating.add(observation, T, mask, 0)
+        if n == FIRST + 1:
+            estimator.may.set()
+            if live:
+                calibrating._running.result(20)
+        if calibrating.found() is not None:
+            assert calibrating.finished
+            return n
+    return None
+
+
+def test_a_recording_uses_the_result_at_a_fixed_frame_and_a_live_camera_as_soon_as_it_is_there(estimator):
+    assert when_found(False, estimator) == FIRST + LATER
+    assert when_found(True, estimator) == FIRST + 1
+    assert estimator.keyframes[0] >= 2
+
+
+def test_what_is_as_given_changes_nothing(estimator):
+    estimator.result = Calibration.registered(SMALL)
+    assert when_found(False, estimator) is None
+
+
+def test_poses_that_do_not_fit_those_before_are_not_compared_with_them(estimator):
+    estimator.may.set()
+    calibrating = SelfCalibration(Calibration.registered(SMALL), SensorConfig())
+    for n, (observation, T, mask) in enumerate(observations(FIRST), start=1):
+        calibrating.add(observation, T, mask, submap=0 if n < FIRST - 1 else 1)
+    calibrating._running.result(20)
+    assert estimator.keyframes == [0]
+
+
+def test_a_failed_estimation_is_not_hidden(estimator, monkeypatch):
+    monkeypatch.setattr(estimator, "estimate", lambda keyframes: 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        when_found(False, estimator)
+
+
+def color_error(slam: Slam, exact, T_world_camera: np.ndarray) -> float:
+    """Mean difference between the colours of the map, seen from where a frame was taken, and a faultless image."""
+    seen = slam.volume.raycast(T_world_camera)
+    inside = np.s_[10:-10, 10:-10]
+    smooth = [cv2.GaussianBlur(image.astype(np.float32), (0, 0), 1.5)[inside] for image in (seen.color, exact.color)]
+    return float(np.abs(smooth[0] - smooth[1])[seen.depth[inside] > 0].mean())
+
+
+@pytest.mark.parametrize("ahead", [False, True])
+def test_the_map_is_repainted_with_the_calibration_that_was_found(estimator, ahead):
+    estimator.may.set()
+    faulty, exact = recording(**UNREGISTERED), recording()
+    config = Config().override(["loops.keep_gap=1", "volume.min_weight=1"])
+    slam = Slam(SMALL, config)
+    views = [slam.prepare(faulty[index]) for index in range(FRAMES)] if ahead else faulty
+    results, before = [], None
+    for index in range(FIRST + LATER + 2):
+        results.append(slam.process(views[index]))
+        if index == FIRST + LATER - 1:
+            T = results[8].T_world_camera
+            before = color_error(slam, exact[8], T)
+    # the first frame, of which the map is made, is not registered to it
+    assert [n for n, result in enumerate(results) if result.calibrated] == [FIRST + LATER]
+    assert slam.calibration is estimator.result
+    assert all(result.state == "tracked" for result in results)
+    assert color_error(slam, exact[8], T) < 0.7 * before
+
+
+def test_a_known_calibration_or_the_configuration_leave_the_estimation_out(estimator):
+    estimator.may.set()
+    faulty = recording(**UNREGISTERED)
+    for config, known in ((Config(), truth_of(faulty)), (Config().override(["sensor.self_calibration=false"]), None)):
+        slam = Slam(SMALL, config, calibration=known)
+        assert not any(slam.process(faulty[index]).calibrated for index in range(FIRST + LATER))
+    assert estimator.keyframes == []

@@ -1,0 +1,143 @@
+"""The table of cameras, and the sentences where a camera or its driver is missing."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dudmap.cameras import CAMERAS, CameraFrame, LiveCamera, open_camera
+from dudmap.errors import CameraError, DatasetError, FrameError
+from dudmap.frames.frame import Frame
+
+DRIVERS = {
+    "realsense": ("pyrealsense2", "pyrealsense2"),
+    "oak": ("depthai", "depthai"),
+    "orbbec": ("pyorbbecsdk2", "pyorbbecsdk"),
+    "iphone": ("record3d", "record3d"),
+}
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_a_missing_driver_is_named_with_the_command_that_installs_it(name, monkeypatch):
+    package, module = DRIVERS[name]
+    monkeypatch.delitem(sys.modules, module, raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Absent(module), *sys.meta_path])
+    with pytest.raises(CameraError, match=rf"^the driver {package} is not installed; .* 'dudmap\[{name}\]'$"):
+        open_camera(name)
+
+
+class Absent:
+    """Finder that knows that a module is not there."""
+
+    def __init__(self, module):
+        self.module = module
+
+    def find_spec(self, name, path=None, target=None):
+        if name == self.module:
+            raise ModuleNotFoundError(name)
+
+
+def test_a_missing_system_library_is_named(monkeypatch):
+    class Broken(Absent):
+        def find_spec(self, name, path=None, target=None):
+            if name == self.module:
+                raise ImportError("libusb-1.0.so.0: cannot open shared object file")
+
+    monkeypatch.delitem(sys.modules, "pyrealsense2", raising=False)
+    monkeypatch.setattr(sys, "meta_path", [Broken("pyrealsense2"), *sys.meta_path])
+    with pytest.raises(CameraError, match=r"cannot be loaded, libusb-1.0.so.0.* apt install libusb"):
+        open_camera("realsense")
+
+
+FAKES = {
+    "realsense": ("pyrealsense2", {"config": object, "context": lambda: SimpleNamespace(query_devices=list)}),
+    "oak": ("depthai", {"Device": SimpleNamespace(getAllAvailableDevices=list)}),
+    "orbbec": (
+        "pyorbbecsdk",
+        {"Context": lambda: SimpleNamespace(query_devices=lambda: SimpleNamespace(get_count=lambda: 0))},
+    ),
+    "iphone": ("record3d", {"Record3DStream": SimpleNamespace(get_connected_devices=list)}),
+}
+
+
+@pytest.mark.parametrize("name", FAKES)
+def test_a_camera_that_is_not_connected_is_one_sentence(name, monkeypatch):
+    """Drivers that answer as the real ones do without a camera."""
+    module, attributes = FAKES[name]
+    fake = ModuleType(module)
+    for key, value in attributes.items():
+        setattr(fake, key, value)
+    monkeypatch.setitem(sys.modules, module, fake)
+    with pytest.raises(CameraError, match=r"^no .* is connected; plug it in"):
+        open_camera(name)
+
+
+@pytest.mark.parametrize("name", DRIVERS)
+def test_the_real_driver_without_a_camera(name):
+    pytest.importorskip(DRIVERS[name][1], exc_type=ImportError)
+    with pytest.raises(CameraError, match=r"^no .* is connected; plug it in"):
+        open_camera(name)
+
+
+def test_openni_is_not_in_the_wheels_of_opencv():
+    import cv2
+
+    if cv2.CAP_OPENNI2 in cv2.videoio_registry.getCameraBackends():
+        pytest.skip("this OpenCV has OpenNI 2")
+    with pytest.raises(CameraError, match=r"built without OpenNI 2 here.*WITH_OPENNI2=ON"):
+        open_camera("openni")
+
+
+def test_without_a_name_all_are_tried_and_their_reasons_told(monkeypatch):
+    tried = []
+
+    class Kind(LiveCamera):
+        def __init__(self):
+            tried.append(self)
+            if len(tried) < 3:
+                raise CameraError("it is not there")
+
+        def read(self):
+            return None
+
+        def close(self):
+            pass
+
+    modules = {f"dudmap.cameras.{entry.split(':')[0]}": entry.split(":")[1] for entry in CAMERAS.values()}
+    for name, attribute in modules.items():
+        fake = ModuleType(name)
+        setattr(fake, attribute, Kind)
+        monkeypatch.setitem(sys.modules, name, fake)
+    assert open_camera() is tried[2]
+    monkeypatch.setattr(Kind, "__init__", lambda self: (_ for _ in ()).throw(CameraError("it is not there")))
+    with pytest.raises(CameraError, match=r"no camera was found; realsense: it is not there; oak: .*; openni: it is"):
+        open_camera()
+
+
+def test_wrong_names_are_told():
+    with pytest.raises(CameraError, match="no camera 'webcam'; expected one of realsense, oak, orbbec, iphone, openni"):
+        open_camera("webcam")
+    with pytest.raises(CameraError, match="expected --camera replay:PATH"):
+        open_camera("replay")
+    with pytest.raises(DatasetError, match="there is no"):
+        open_camera("replay:/nowhere")
+
+
+def test_the_preview_skips_what_cannot_be_read():
+    class Kind(LiveCamera):
+        frames = iter([FrameError("bad"), 1.0, 2.0, 3.0])
+
+        def read(self):
+            item = next(self.frames, None)
+            if item is None:
+                return None
+            if isinstance(item, float):
+                item = Frame(item, np.zeros((2, 2), np.float32), np.zeros((2, 2, 3), np.uint8))
+            return CameraFrame(0, item, 0.0)
+
+        def close(self):
+            pass
+
+    assert [frame.timestamp for frame in Kind().preview(2)] == [1.0, 2.0]
+    assert [frame.timestamp for frame in Kind().preview(9)] == [3.0]
