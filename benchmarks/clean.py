@@ -64,7 +64,14 @@ def true_poses(sequence):
     }
 
 
-def seen_elsewhere(index, sequence, twin, poses):
+def static_views(sequence, twin, poses):
+    """Pose and static depth, 0 where something moves, of every so many frames."""
+    return [
+        (poses[index], np.where(sequence.mask(index), 0, twin[index].depth)) for index in list(poses)[::LOOKED_AT]
+    ]
+
+
+def seen_elsewhere(index, sequence, twin, poses, views):
     """Pixels (H, W) of a frame that show something that moves and whose background another frame shows."""
     camera = replace(sequence.camera, distortion=())
     mask, depth = sequence.mask(index), twin[index].depth
@@ -72,12 +79,12 @@ def seen_elsewhere(index, sequence, twin, poses):
     points = camera.points(columns, rows, depth[rows, columns].astype(float))
     points = points @ poses[index][:3, :3].T + poses[index][:3, 3]
     seen = np.zeros(len(points), bool)
-    for other in list(poses)[::LOOKED_AT]:
-        T = se3.inverse(poses[other])
+    for T_world_camera, depth in views:
+        T = se3.inverse(T_world_camera)
         p = points @ T[:3, :3].T + T[:3, 3]
         u, v = np.rint(np.nan_to_num(camera.project(p), nan=-1)).T.astype(int)
         inside = (u >= 0) & (u < camera.width) & (v >= 0) & (v < camera.height)
-        there = np.where(sequence.mask(other), 0, twin[other].depth)[v[inside], u[inside]]
+        there = depth[v[inside], u[inside]]
         seen[inside] |= np.abs(there - p[inside, 2]) < TOLERANCE * p[inside, 2]
     out = np.zeros(mask.shape, bool)
     out[rows[seen], columns[seen]] = True
@@ -115,11 +122,12 @@ def score(name, sequence, twin, work: Path, passes: int, pictures: Path | None):
         )  # fmt: skip
     cleaner = Cleaner(RunContent.load(folder), sequence)
     poses = true_poses(sequence)
+    views = static_views(sequence, twin, poses)
     cleaned, as_is = [], []
     for index in cleaner.indices[::SCORED]:
         if index not in poses:
             continue
-        used = seen_elsewhere(index, sequence, twin, poses)
+        used = seen_elsewhere(index, sequence, twin, poses, views)
         frame, moving, background = cleaner.clean(index)
         truth = twin[index]
         missed = used & ~moving
