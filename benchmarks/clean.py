@@ -66,9 +66,7 @@ def true_poses(sequence):
 
 def static_views(sequence, twin, poses):
     """Pose and static depth, 0 where something moves, of every so many frames."""
-    return [
-        (poses[index], np.where(sequence.mask(index), 0, twin[index].depth)) for index in list(poses)[::LOOKED_AT]
-    ]
+    return [(poses[index], np.where(sequence.mask(index), 0, twin[index].depth)) for index in list(poses)[::LOOKED_AT]]
 
 
 def seen_elsewhere(index, sequence, twin, poses, views):

@@ -31,7 +31,7 @@ class Source:
 
     Attributes:
         color: (H, W, 3) uint8, of the colour camera.
-        depth: (H, W) float32, metres, of the map from the same pose, 0 where something moves or nothing is known.
+        depth: (H, W) float32, metres, of the map from the same pose, 0 where the frame's own differs or something moves.
         T_world_color: (4, 4) pose of the colour camera.
         gain: (3,) of its colours against the map's.
     """
@@ -73,8 +73,9 @@ class BackgroundRenderer:
     def add(self, frame: Frame, moving: NDArray[np.bool_], T_world_color: NDArray[np.float64]) -> None:
         """Let a frame lend its colours, but for the pixels that show something that moves (H, W)."""
         color, depth = self._map_in_color(T_world_color)
-        gain = exposure_gain(frame.color, color, (depth > 0) & ~moving)
-        self.sources.append(Source(frame.color, np.where(moving, 0, depth).astype(np.float32), T_world_color, gain))
+        static = ~moving & (np.abs(frame.depth - depth) < TOLERANCE * depth)
+        gain = exposure_gain(frame.color, color, static)
+        self.sources.append(Source(frame.color, np.where(static, depth, 0).astype(np.float32), T_world_color, gain))
 
     def render(
         self,
