@@ -343,7 +343,7 @@ def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
         exported(run, tmp_path / "map.npz", resolution=0.001)
     with pytest.raises(ConfigError, match=r"name it by --sequence"):
         exported(run, tmp_path / "transforms.json")
-    for name, module in ((".laz", "laspy"), (".e57", "pye57"), (".usdz", "pxr")):
+    for name, module in ((".laz", "laspy"), (".e57", "pye57"), (".usdz", "pxr.Sdf")):
         monkeypatch.setitem(sys.modules, module, None)
         with pytest.raises(ConfigError, match=r"pip install 'dudmap\[export\]'"):
             exported(run, tmp_path / f"map{name}")
