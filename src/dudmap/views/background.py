@@ -31,7 +31,7 @@ class Source:
 
     Attributes:
         color: (H, W, 3) uint8, of the colour camera.
-        depth: (H, W) float32, metres, of the map from the same pose, 0 where the frame's own differs or something moves.
+        depth: (H, W) float32, metres, of the map from the same pose; 0 where something moves or the frame differs.
         T_world_color: (4, 4) pose of the colour camera.
         gain: (3,) of its colours against the map's.
     """
