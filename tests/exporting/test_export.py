@@ -83,7 +83,7 @@ def test_a_run_without_a_mesh_is_written(run_folder, tmp_path):
 
 
 def test_bad_input_is_refused(run_folder, tmp_path, monkeypatch):
-    with pytest.raises(ConfigError, match=r"cannot export to 'run\.bag'; the ending must be one of \.mcap"):
+    with pytest.raises(ConfigError, match=r"cannot export to 'run\.bag'; the ending or name must be one of \.ply"):
         export_run(run_folder, tmp_path / "run.bag")
     with pytest.raises(ConfigError, match=r"the folder .*nowhere of the export does not exist"):
         export_run(run_folder, tmp_path / "nowhere" / "run.mcap")

@@ -20,6 +20,8 @@ COMMANDS = {
     "report": "Write one page on a run that opens offline.",
     "merge": "Join the maps of two runs of one place.",
     "export": "Write the results of a run for another program.",
+    "render": "Render the map along a camera path, as a video or a recording.",
+    "clean": "Write a recording as it would have been without what moves.",
     "live": "Run on a camera, or on a recording as if it were one.",
     "info": "Say what a recording holds, and what looks wrong in it.",
     "calibrate": "Find where and when the colour camera looks, relative to the depth camera.",

@@ -9,6 +9,7 @@ import numpy as np
 
 from dudmap.errors import ConfigError
 from dudmap.exporting import ros_messages as ros
+from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
 from dudmap.geometry import se3
 from dudmap.geometry.mesh_simplification import simplified
@@ -17,7 +18,7 @@ MESH_TRIANGLES = 50_000
 """Triangles of the mesh marker: viewers take every corner as a message of its own. The point cloud has all vertices."""
 
 
-def write(run: RunContent, path: Path) -> None:
+def write(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write trajectory, surface and movers of a run.
 
     Topics: /tf (map to camera), /odometry, /path, /points (vertices of the mesh), /mesh and /movers. Path, points and

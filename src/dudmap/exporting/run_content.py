@@ -1,51 +1,158 @@
 """The results in a run folder, as exporters take them."""
 
 import json
+import re
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from dudmap.errors import DatasetError
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import __version__
+from dudmap.errors import DatasetError, MapError
+from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+
+if TYPE_CHECKING:
+    from dudmap.mapping.volume import TsdfVolume
 
 
 @dataclass(frozen=True, eq=False)
 class RunContent:
-    """Results of a run.
+    """Results of a run; each file is read when it is first asked for.
 
     Attributes:
         folder: The run folder.
-        trajectory: Poses of the tracked frames.
-        mesh: The static surface, None if there is none (a run that only localised).
-        movers: Moving objects by frame, as in movers.jsonl.
     """
 
     folder: Path
-    trajectory: Trajectory
-    mesh: Mesh | None
-    movers: list[dict[str, Any]]
 
     @classmethod
     def load(cls, folder: str | Path) -> "RunContent":
-        """Read a run folder.
+        """Open a run folder.
 
         Raises:
-            DatasetError: The folder is no run folder, or a file is damaged.
-            MapError: The mesh cannot be read.
+            DatasetError: The folder is no run folder, or was written by a newer version of dudmap.
         """
         folder = Path(folder)
         if not (folder / "trajectory.txt").is_file():
             raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
-        mesh = Mesh.load(folder / "mesh.ply") if (folder / "mesh.ply").is_file() else None
-        return cls(folder, Trajectory.load(folder / "trajectory.txt"), mesh, _movers(folder / "movers.jsonl"))
+        _check_version(folder)
+        return cls(folder)
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of the tracked frames.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        return Trajectory.load(self.folder / "trajectory.txt")
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The static surface, None if there is none (a run that only localised).
+
+        Raises:
+            MapError: The file is damaged.
+        """
+        path = self.folder / "mesh.ply"
+        return Mesh.load(path) if path.is_file() else None
+
+    @property
+    def surface(self) -> Mesh:
+        """The static surface.
+
+        Raises:
+            MapError: There is none, or it has no triangles.
+        """
+        if self.mesh is None:
+            raise MapError(f"{self.folder} holds no mesh.ply (a run that only localised, or that was cut off)")
+        if len(self.mesh.faces) == 0:
+            raise MapError(f"the mesh of {self.folder} has no triangles, so there is nothing to export")
+        return self.mesh
+
+    @cached_property
+    def volume(self) -> "TsdfVolume":
+        """The map.
+
+        Raises:
+            MapError: The file is missing, damaged or of a newer version.
+        """
+        from dudmap.mapping.volume import TsdfVolume
+
+        if not (self.folder / "map.npz").is_file():
+            raise MapError(f"{self.folder} holds no map.npz, which this needs; repeat the run without --localize")
+        return TsdfVolume.load(self.folder / "map.npz")
+
+    @cached_property
+    def movers(self) -> list[dict[str, Any]]:
+        """Moving objects by frame, as in movers.jsonl; none if there is no file.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        path = self.folder / "movers.jsonl"
+        if not path.is_file():
+            return []
+        try:
+            return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
+        except ValueError as error:
+            raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Calibration of the colour camera that the run used, None if the folder holds none.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        path = self.folder / "calibration.toml"
+        return Calibration.load(path) if path.is_file() else None
+
+    def color_pose(self, timestamp: float) -> NDArray[np.float64]:
+        """Pose (4, 4) of the colour camera for an image with this time stamp; a second camera and its delay are
+        those of the calibration. Before the first and after the last pose it is that pose."""
+        calibration, stamps = self.calibration, self.trajectory.timestamps
+        delay = 0.0 if calibration is None else calibration.delay
+        T = self.trajectory.interpolate(float(np.clip(timestamp + delay, stamps[0], stamps[-1])))
+        return T if calibration is None else T @ np.linalg.inv(calibration.T_color_depth)
+
+    def mask_files(self) -> dict[float, Path]:
+        """Masks of what moves by time stamp of the depth image.
+
+        Raises:
+            DatasetError: The run saved no masks.
+        """
+        from dudmap.sequences.masks import stamped_masks
+
+        folder = self.folder / "masks"
+        masks = dict(stamped_masks(folder)) if folder.is_dir() else {}
+        if not masks:
+            raise DatasetError(f"{self.folder} holds no masks of what moves; repeat the run with --save-masks")
+        return masks
 
 
-def _movers(path: Path) -> list[dict[str, Any]]:
-    """Lines of movers.jsonl; none if there is no file."""
+def _check_version(folder: Path) -> None:
+    """Refuse a folder that a newer version of dudmap wrote.
+
+    Raises:
+        DatasetError: It did, or metrics.json is damaged.
+    """
+    path = folder / "metrics.json"
     if not path.is_file():
-        return []
+        return
     try:
-        return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-    except ValueError as error:
+        written = json.loads(path.read_text(encoding="utf-8")).get("versions", {}).get("dudmap", "0")
+    except (ValueError, AttributeError) as error:
         raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
+    if _numbers(written) > _numbers(__version__):
+        raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
+
+
+def _numbers(version: str) -> list[int]:
+    """Major and minor number of a version."""
+    return [int(number) for number in re.findall(r"\d+", version)[:2]]

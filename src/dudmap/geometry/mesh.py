@@ -1,5 +1,6 @@
 """Triangle mesh with colours and normals."""
 
+import re
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from numpy.typing import NDArray
 from dudmap.errors import MapError
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
+_PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
+_PLY_FACE = np.dtype([("count", "u1"), ("indices", "<i4", 3)])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,21 +61,32 @@ class Mesh:
 
     def _save_ply(self, path: Path) -> None:
         """Binary PLY with float32 normals; trimesh's exporter is three times slower on a million faces."""
-        vertex = np.empty(
-            len(self.vertices),
-            dtype=[("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)],
-        )
+        vertex = np.empty(len(self.vertices), _PLY_VERTEX)
         vertex["xyz"], vertex["normal"], vertex["rgb"] = self.vertices, self.normals, self.colors
-        face = np.empty(len(self.faces), dtype=[("count", "u1"), ("indices", "<i4", 3)])
+        face = np.empty(len(self.faces), _PLY_FACE)
         face["count"], face["indices"] = 3, self.faces
-        properties = [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
-        properties += [f"property uchar {name}" for name in ("red", "green", "blue")]
-        header = ["ply", "format binary_little_endian 1.0", "comment dudmap", f"element vertex {len(vertex)}"]
-        header += [*properties, f"element face {len(face)}", "property list uchar int vertex_indices", "end_header"]
         with path.open("wb") as file:
-            file.write(("\n".join(header) + "\n").encode("ascii"))
+            file.write(_ply_header(len(vertex), len(face)).encode("ascii"))
             file.write(vertex.tobytes())
             file.write(face.tobytes())
+
+    @classmethod
+    def _load_ply(cls, path: Path) -> "Mesh | None":
+        """Read a file that ``save`` wrote, None for any other: trimesh takes 2 s for a million triangles."""
+        with path.open("rb") as file:
+            head = file.read(1024)
+            counts = re.findall(rb"element (?:vertex|face) (\d+)", head)
+            header = _ply_header(*(int(count) for count in [*counts, 0][:2])).encode("ascii") if counts else b""
+            if not header or not head.startswith(header):
+                return None
+            file.seek(len(header))
+            vertex = np.fromfile(file, _PLY_VERTEX, int(counts[0]))
+            face = np.fromfile(file, _PLY_FACE, int(counts[1]) if len(counts) > 1 else 0)
+        whole = len(vertex) == int(counts[0]) and (len(counts) == 1 or len(face) == int(counts[1]))
+        if not whole or np.any(face["indices"] < 0) or np.any(face["indices"] >= len(vertex)):
+            raise MapError(f"the mesh {path} is cut off or damaged")
+        arrays = vertex["xyz"], face["indices"], vertex["rgb"], vertex["normal"]
+        return cls(*(np.ascontiguousarray(array) for array in arrays))
 
     @classmethod
     def load(cls, path: str | Path) -> "Mesh":
@@ -81,10 +95,16 @@ class Mesh:
         Raises:
             MapError: The file is missing, unreadable or empty.
         """
+        path = Path(path)
+        try:
+            own = cls._load_ply(path) if path.suffix.lower() == ".ply" else None
+        except OSError as error:
+            raise MapError(f"cannot read the mesh {path}: {error}") from error
+        if own is not None and len(own.vertices) > 0:
+            return own
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
-        path = Path(path)
         try:
             loaded = trimesh.load(path, process=False, force=None)
         except (OSError, ValueError, NotImplementedError, LookupError, TypeError) as error:  # trimesh on broken headers
@@ -106,3 +126,13 @@ class Mesh:
         if len(colors) != len(vertices):
             colors = np.full((len(vertices), 3), 128, dtype=np.uint8)
         return cls(vertices, faces, colors, normals)
+
+
+def _ply_header(vertices: int, faces: int) -> str:
+    """Header of a binary PLY file as ``Mesh.save`` writes it; a point cloud has no element ``face``."""
+    lines = ["ply", "format binary_little_endian 1.0", "comment dudmap", f"element vertex {vertices}"]
+    lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]
+    lines += [f"property uchar {name}" for name in ("red", "green", "blue")]
+    if faces:
+        lines += [f"element face {faces}", "property list uchar int vertex_indices"]
+    return "\n".join([*lines, "end_header"]) + "\n"

@@ -1,0 +1,1 @@
+"""Images of the map: artificial views, videos, and recordings without what moves."""
