@@ -52,7 +52,10 @@ def emulated_indices(
     Returns:
         The indices, None if the process predicts too little, and a sentence on how much it predicts.
     """
+    import warnings
+
     from SALib.sample.sobol import sample
+    from sklearn.exceptions import ConvergenceWarning
     from sklearn.gaussian_process import GaussianProcessRegressor
     from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
     from sklearn.model_selection import KFold, cross_val_predict
@@ -64,12 +67,14 @@ def emulated_indices(
         return None, f"{len(y)} different points are too few for an emulator, or the response does not vary."
     kernel = ConstantKernel() * RBF(np.ones(len(factors))) + WhiteKernel(1e-2)
     process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=seed)
-    guess = cross_val_predict(process, x, y, cv=KFold(FOLDS, shuffle=True, random_state=seed))
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)  # a length at its bound; cross-validation judges the fit
+        guess = cross_val_predict(process, x, y, cv=KFold(FOLDS, shuffle=True, random_state=seed))
+        process.fit(x, y)
     share = float(1 - np.sum((guess - y) ** 2) / np.sum((y - y.mean()) ** 2))
     text = f"A Gaussian process predicts {max(share, 0):.0%} of the variance between the points in cross-validation"
     if share < ENOUGH_PREDICTED:
         return None, f"{text}; Sobol indices of it would mean nothing."
-    process.fit(x, y)
     sampled = sample(problem(factors), EMULATED, calc_second_order=True, seed=seed)
     return sobol_indices(factors, process.predict(sampled), seed), f"{text}; the indices are those of the process."
 

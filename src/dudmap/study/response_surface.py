@@ -185,7 +185,8 @@ def optimum(surface: Surface) -> Optimum:
     ]
     best = min(found, key=lambda result: result.fun).x
     values = {f.key: f.value(float(x)) for f, x in zip(surface.factors, best, strict=True)}
-    return Optimum(tuple(map(float, best)), values, float(surface.predict(best[None])[0]))
+    exact = coded_points(surface.factors, [values])[0]  # whole numbers were rounded
+    return Optimum(tuple(map(float, exact)), values, float(surface.predict(exact[None])[0]))
 
 
 @dataclass(frozen=True, eq=False)
