@@ -40,16 +40,17 @@ class LocalExecutor:
     Args:
         workers: Number of processes.
         threads: Threads of each (DUDMAP_THREADS); by default the cores are shared equally.
+        kernels: Whether the first worker compiles the kernels before any other starts.
     """
 
-    def __init__(self, workers: int, threads: int | None = None) -> None:
+    def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:
         self.workers = workers
         self._threads = threads or max(1, usable_cores() // workers)
         self._feeders = ThreadPoolExecutor(workers, thread_name_prefix="study")
         self._own = threading.local()
         self._pids: set[int] = set()
         self._lock = threading.Lock()
-        self._loaded = False
+        self._loaded = not kernels
         self._closed = False
 
     def submit(self, job: Job) -> "Future[Outcome]":

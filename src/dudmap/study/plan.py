@@ -14,7 +14,7 @@ from dudmap.config import Config
 from dudmap.errors import ConfigError
 from dudmap.study.designs import DesignOptions, Point, count_of, points_of
 from dudmap.study.factors import Factor, configured, make_factors
-from dudmap.study.responses import check_truth, known_responses
+from dudmap.study.responses import RESPONSES, check_truth, known_responses
 
 SECTIONS = ("name", "base", "factors", "design", "sequences", "responses", "log", "calibrate", "confirm", "tune")
 MAX_RUNS = 1000
@@ -89,14 +89,16 @@ class Plan:
     tune: Mapping[str, Any] = field(default_factory=dict)
 
     def runs(self) -> list[Run]:
-        """All runs of the design."""
+        """All runs of the design, recording by recording."""
         points = points_of(self.factors, self.options)
-        return [run for number, point in enumerate(points) for run in self.runs_at(number, point)]
+        runs = [run for number, point in enumerate(points) for run in self.runs_at(number, point)]
+        names = [entry.name for _, _, entry in self.entries]
+        return sorted(runs, key=lambda run: names.index(run.entry.name))  # a worker keeps a recording for its next run
 
     def runs_at(self, number: int, point: Point) -> list[Run]:
         """Runs of one point on all recordings."""
         config = configured(self.base, point)
-        surfaces = bool({"mesh_accuracy", "completeness", "ghosts"} & set(self.responses))
+        surfaces = any(RESPONSES[name].needs == "surface" for name in self.responses)
         return [
             Run(number, point, entry, name, replicate, config, self.calibrate, surfaces, self.code)
             for name, replicate, entry in self.entries
@@ -112,7 +114,11 @@ class Plan:
             else:
                 last = max(int(entry.parameters["seed"]) for _, entry in same)
                 entries = [(-1 - n, _with_seed(same[0][1], last + 1 + n)) for n in range(self.confirm)]
-            fresh = replace(self, entries=tuple((name, replicate, entry) for replicate, entry in entries))
+            fresh = replace(
+                self,
+                entries=tuple((name, replicate, entry) for replicate, entry in entries),
+                responses=self.responses[:1],
+            )
             out += fresh.runs_at(-1, point)
         return out
 

@@ -361,6 +361,7 @@ class Confirmation:
         predicted: Prediction of the model.
         low, high: Interval in which the mean of the confirmation runs should fall.
         measured: Mean of the confirmation runs.
+        design_mean: Mean of all runs of the design: what one would predict without a model.
         best_point: Mean of the runs at the best point of the design on the same recordings.
         count: Number of confirmation runs.
         better: Whether ``low`` or ``high`` values are good.
@@ -369,6 +370,7 @@ class Confirmation:
     predicted: float
     low: float
     high: float
+    design_mean: float
     measured: float
     best_point: float
     count: int
@@ -380,21 +382,27 @@ class Confirmation:
         return self.low <= self.measured <= self.high
 
     @property
+    def informative(self) -> bool:
+        """Whether the interval excludes the mean of the design: a wider one holds whatever is measured."""
+        return not self.low <= self.design_mean <= self.high
+
+    @property
     def improves(self) -> bool:
         """Whether the optimum is at least as good as the best point of the design."""
         return self.measured == self.best_point or (self.measured < self.best_point) == (self.better == "low")
 
     @property
     def held(self) -> bool:
-        """Whether the model held: it said what would be measured, and where it is best."""
-        return self.inside and self.improves
+        """Whether the model held: it said what would be measured, more exactly than the mean does, and where to go."""
+        return self.inside and self.informative and self.improves
 
     def __str__(self) -> str:
         part = "inside" if self.inside else "outside"
+        wide = "" if self.informative else f" (so wide that it holds the mean of the design, {self.design_mean:.4g})"
         found = "no worse" if self.improves else "worse"
         return (
             f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({self.count} runs), {part} the interval "
-            f"{self.low:.4g} to {self.high:.4g}; {found} than the best point of the design on the same recordings, "
+            f"{self.low:.4g} to {self.high:.4g}{wide}; {found} than the best point of the design on the same recordings, "
             f"{self.best_point:.4g}. The model {'held' if self.held else 'did not hold'}."
         )
 
@@ -410,4 +418,4 @@ def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_poi
     """
     predicted, low, high = surface.interval(np.array(best.coded), len(measured))
     mean, other = float(np.mean(measured)), float(np.mean(best_point))
-    return Confirmation(predicted, low, high, mean, other, len(measured), surface.better)
+    return Confirmation(predicted, low, high, float(surface.observed.mean()), mean, other, len(measured), surface.better)
