@@ -11,8 +11,6 @@ from pathlib import Path
 
 import pytest
 
-pytest.importorskip("filelock")
-
 from dudmap.study.conduct import ATTEMPTS, conduct, table_of
 from dudmap.study.executor import LocalExecutor
 from dudmap.study.store import StudyFolder
@@ -108,7 +106,9 @@ def test_a_claimed_run_belongs_to_one_process(tmp_path):
     store.create()
     with store.claim("a") as mine:
         assert mine
-        other = f"from dudmap.study.store import StudyFolder\nwith StudyFolder({str(tmp_path)!r}).claim('a') as m: print(m)"
+        other = (
+            f"from dudmap.study.store import StudyFolder\nwith StudyFolder({str(tmp_path)!r}).claim('a') as m: print(m)"
+        )
         done = subprocess.run(
             [sys.executable, "-c", other], capture_output=True, text=True, check=True, env=dict(os.environ)
         )

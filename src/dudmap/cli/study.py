@@ -34,7 +34,7 @@ MaxRunsOption = Annotated[int, typer.Option("--max-runs", min=1, help="Refuse a 
 KeepOption = Annotated[bool, typer.Option("--keep", help="Keep trajectory, mesh and map of every run.")]
 ClusterOption = Annotated[
     str,
-    typer.Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto, or ray://HOST:PORT; default: processes here."),
+    typer.Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine."),
 ]
 
 
@@ -85,7 +85,27 @@ def thesis(
     else:
         plan = thesis_plan(table, recordings or (), frames)
         out = out or Path("runs/study") / f"thesis-{table}"
-            typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+        typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+    typer.echo(f"written to {out}")
+
+
+@app.command()
+def tune(
+    design: Annotated[Path, typer.Argument(help="Design file with a second set of recordings (judge).")],
+    out: OutOption = None,
+    jobs: JobsOption = 0,
+    max_runs: MaxRunsOption = 1000,
+    cluster: ClusterOption = "",
+) -> None:
+    """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
+    from dudmap.study.plan import load_plan
+    from dudmap.study.study import need_libraries
+    from dudmap.study.tune import run_tune
+
+    need_libraries()
+    plan = load_plan(design)
+    out = out or Path("runs/study") / f"{design.stem}-tune"
+    typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=_show))
     typer.echo(f"written to {out}")
 
 

@@ -7,18 +7,18 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.errors import ConfigError
-from dudmap.study import figures, indices, response_surface
+from dudmap.study import figures, indices, judgement, response_surface
 from dudmap.study.designs import DesignOptions, Point
 from dudmap.study.effects import anova, interactions, main_effects
 from dudmap.study.factors import Factor, coded_points
 from dudmap.study.pareto import pareto_front
 from dudmap.study.report import Report
 from dudmap.study.responses import RESPONSES
+from dudmap.study.tables import Table
 
 if TYPE_CHECKING:
-    import pandas as pd
-
-    from dudmap.study.response_surface import Confirmation, Optimum, Surface
+    from dudmap.study.judgement import Confirmation
+    from dudmap.study.response_surface import Optimum, Surface
 
 MOST_FAILURES = 10
 """Failed runs that a report lists one by one."""
@@ -42,33 +42,29 @@ class Prediction:
     best: "Optimum"
     point: Point
     best_point: Point
-    judgement: response_surface.Judgement
+    judgement: "judgement.Judgement"
 
 
-def usable(table: "pd.DataFrame", name: str, log: bool = False) -> "pd.DataFrame":
+def usable(table: Table, name: str, log: bool = False) -> Table:
     """Runs that have a response, under the column ``name``.
 
     Raises:
         ConfigError: No run has it, or its logarithm does not exist.
     """
-    import pandas as pd
-
     key = RESPONSES[name].key
     if key not in table or table[key].isna().all():
-        errors = table["error"].dropna() if "error" in table else []
-        reason = f"; the first error: {errors.iloc[0]}" if len(errors) else ""
+        errors = list(table["error"].dropna()) if "error" in table else []
+        reason = f"; the first error: {errors[0]}" if errors else ""
         raise ConfigError(f"no run has the response {name}{reason}")
     out = table[table[key].notna()].copy()
-    values = pd.to_numeric(out[key]).astype(float)
+    values = out[key].astype(float)
     if log and (values <= 0).any():
         raise ConfigError(f"the response {name} is 0 in some runs and has no logarithm there; take it out of log")
     out[name] = np.log(values) if log else values
     return out.reset_index(drop=True)
 
 
-def predict_optimum(
-    table: "pd.DataFrame", factors: Sequence[Factor], name: str, log: bool = False
-) -> "Prediction | str":
+def predict_optimum(table: Table, factors: Sequence[Factor], name: str, log: bool = False) -> "Prediction | str":
     """Quadratic model of a response and its optimum, or a sentence that says why there is none."""
     data = usable(table, name, log)
     surface = response_surface.fit_surface(data, factors, name, RESPONSES[name].better)
@@ -86,10 +82,8 @@ def predict_optimum(
         label = levels.idxmin() if low else levels.idxmax()
         usual = data[factor.key][data[factor.key].map(str) == label].iloc[0]
         point[factor.key] = best.values.get(factor.key, _plain(usual))
-    judgement = response_surface.judge(
-        surface, best, response_surface.lack_of_fit(surface), response_surface.influence(surface)
-    )
-    return Prediction(surface, best, point, {key: _plain(first[key]) for key in keys}, judgement)
+    reasons = judgement.judge(surface, best, response_surface.lack_of_fit(surface), judgement.influence(surface))
+    return Prediction(surface, best, point, {key: _plain(first[key]) for key in keys}, reasons)
 
 
 def _plain(value: Any) -> Any:  # noqa: ANN401 - a value of a table as plain Python
@@ -102,7 +96,7 @@ def heading_of(name: str, log: bool) -> str:
 
 
 def describe_response(
-    report: Report, table: "pd.DataFrame", factors: Sequence[Factor], name: str, options: DesignOptions, log: bool
+    report: Report, table: Table, factors: Sequence[Factor], name: str, options: DesignOptions, log: bool
 ) -> None:
     """Add everything that is known about one response but the confirmation of its optimum."""
     data, heading = usable(table, name, log), heading_of(name, log)
@@ -128,8 +122,8 @@ def describe_response(
 
 def describe_indices(
     report: Report,
-    table: "pd.DataFrame",
-    data: "pd.DataFrame",
+    table: Table,
+    data: Table,
     factors: Sequence[Factor],
     name: str,
     options: DesignOptions,
@@ -176,7 +170,9 @@ def describe_surface(report: Report, predicted: Prediction, heading: str) -> Non
         else f"Lack of fit: F = {fit.f:.2f}, p = {fit.p:.2g}, {fit.pure_dof} degrees of freedom of the pure error."
     )
     report.figure(figures.residuals_figure(surface), "Residuals, their normal quantiles, and Cook's distances.")
-    report.figure(figures.surface_figure(surface, best, heading), "Prediction through the optimum, with 95 % intervals.")
+    report.figure(
+        figures.surface_figure(surface, best, heading), "Prediction through the optimum, with 95 % intervals."
+    )
     canonical = response_surface.canonical_analysis(surface)
     where = "outside the bounds" if canonical.values is None else values_text(canonical.values)
     eigenvalues = ", ".join(f"{value:.3g}" for value in canonical.eigenvalues)
@@ -207,7 +203,7 @@ def describe_confirmation(report: Report, confirmation: "Confirmation | str") ->
     report.text(str(confirmation))
 
 
-def point_table(table: "pd.DataFrame", factors: Sequence[Factor], names: Sequence[str]) -> "pd.DataFrame":
+def point_table(table: Table, factors: Sequence[Factor], names: Sequence[str]) -> Table:
     """Mean responses of every point all of whose runs succeeded."""
     keys = [RESPONSES[name].key for name in names]
     complete = table.dropna(subset=[key for key in keys if key in table])
@@ -219,7 +215,7 @@ def point_table(table: "pd.DataFrame", factors: Sequence[Factor], names: Sequenc
     return means.rename(columns={RESPONSES[name].key: name for name in names}).reset_index(drop=True)
 
 
-def describe_pareto(report: Report, table: "pd.DataFrame", factors: Sequence[Factor], names: Sequence[str]) -> None:
+def describe_pareto(report: Report, table: Table, factors: Sequence[Factor], names: Sequence[str]) -> None:
     """Add the Pareto front of the first response and the time per frame, or else the second response."""
     if len(names) < 2:
         return
@@ -234,7 +230,7 @@ def describe_pareto(report: Report, table: "pd.DataFrame", factors: Sequence[Fac
     report.table(front)
 
 
-def describe_failures(report: Report, table: "pd.DataFrame") -> None:
+def describe_failures(report: Report, table: Table) -> None:
     """Add the runs that failed, which are missing from every figure above."""
     if "error" not in table or table["error"].isna().all():
         return

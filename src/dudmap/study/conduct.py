@@ -6,15 +6,13 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dudmap.study.executor import Executor, WorkerDied
 from dudmap.study.plan import Run
 from dudmap.study.store import StudyFolder
+from dudmap.study.tables import Table
 from dudmap.study.worker import Job
-
-if TYPE_CHECKING:
-    import pandas as pd
 
 ATTEMPTS = 3
 """Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""
@@ -114,7 +112,7 @@ def conduct(
     return state
 
 
-def table_of(runs: Sequence[Run], root: Path) -> "pd.DataFrame":
+def table_of(runs: Sequence[Run], root: Path) -> Table:
     """One row per run: number of the point, recording, replicate, values of the factors, figures, error, time.
 
     A run without a result has the error "no result: its worker died".

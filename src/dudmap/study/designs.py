@@ -51,6 +51,7 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
     """
     if options.kind not in DESIGNS:
         raise ConfigError(f"unknown design {options.kind!r}; known are {', '.join(DESIGNS)}")
+    found: list[Point]
     if options.kind == "full-factorial":
         found = _full_factorial(factors)
     elif options.kind == "fractional-factorial":

@@ -3,14 +3,12 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import combinations
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from dudmap.study.factors import Factor
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 CONFIDENCE = 0.95
 """Level of all confidence intervals."""
@@ -18,7 +16,7 @@ MOST_LEVELS = 6
 """A factor with more different values than this enters the analysis of variance as a linear term."""
 
 
-def main_effects(table: "pd.DataFrame", factors: Sequence[Factor], response: str) -> "pd.DataFrame":
+def main_effects(table: Table, factors: Sequence[Factor], response: str) -> Table:
     """Mean of the response at every level of every factor, with the confidence interval of the mean (Student's t).
 
     A factor with more than ``MOST_LEVELS`` values is cut into that many groups of equal size.
@@ -35,7 +33,7 @@ def main_effects(table: "pd.DataFrame", factors: Sequence[Factor], response: str
     return pd.DataFrame(rows, columns=["factor", "level", "runs", "mean", "low", "high"])
 
 
-def level_groups(values: "pd.Series") -> "pd.Series":
+def level_groups(values: Table) -> Table:
     """Level of each run; of a factor with many values, the mean of its group."""
     import pandas as pd
 
@@ -45,7 +43,7 @@ def level_groups(values: "pd.Series") -> "pd.Series":
     return values.groupby(groups, observed=True).transform("mean")
 
 
-def interactions(table: "pd.DataFrame", factors: Sequence[Factor], response: str) -> dict[tuple[str, str], Any]:
+def interactions(table: Table, factors: Sequence[Factor], response: str) -> dict[tuple[str, str], Any]:
     """Means of the response at all pairs of levels of two factors: one table per pair, rows of the first factor."""
     out = {}
     for a, b in combinations(factors, 2):
@@ -65,12 +63,12 @@ class Anova:
         residual_dof: Degrees of freedom of the residual.
     """
 
-    table: "pd.DataFrame"
+    table: Table
     formula: str
     residual_dof: int
 
 
-def anova(table: "pd.DataFrame", factors: Sequence[Factor], response: str) -> Anova | None:
+def anova(table: Table, factors: Sequence[Factor], response: str) -> Anova | None:
     """Analysis of variance with main effects and, if the runs suffice, all interactions of two factors.
 
     Sums of squares are of type II (statsmodels). Partial eta squared is SS / (SS + SS_residual); its interval comes
@@ -100,11 +98,11 @@ def anova(table: "pd.DataFrame", factors: Sequence[Factor], response: str) -> An
     return Anova(result, words + (", recordings as blocks" if block else ""), int(model.df_resid))
 
 
-def _varies(table: "pd.DataFrame", factor: Factor) -> bool:
+def _varies(table: Table, factor: Factor) -> bool:
     return table[factor.key].nunique() > 1
 
 
-def _columns(table: "pd.DataFrame", factors: Sequence[Factor], response: str) -> tuple["pd.DataFrame", list[str]]:
+def _columns(table: Table, factors: Sequence[Factor], response: str) -> tuple[Table, list[str]]:
     """Columns with names that a formula can hold, and the term of every factor that varies."""
     import pandas as pd
 
@@ -124,10 +122,11 @@ def _readable(term: str, names: dict[str, str]) -> str:
     return " x ".join(names.get(part, part.lower()) for part in term.split(":"))
 
 
-def _with_effect_sizes(found: "pd.DataFrame", residual_dof: int) -> "pd.DataFrame":
+def _with_effect_sizes(found: Table, residual_dof: int) -> Table:
     import pandas as pd
     from statsmodels.stats.oneway import confint_effectsize_oneway
 
+    intervals: Any = confint_effectsize_oneway
     rows = []
     residual = float(found.loc["Residual", "sum_sq"])
     total = float(found["sum_sq"].sum())
@@ -139,7 +138,7 @@ def _with_effect_sizes(found: "pd.DataFrame", residual_dof: int) -> "pd.DataFram
             omega = (squares - dof * residual / residual_dof) / (total + residual / residual_dof)
             if np.isfinite(f):
                 with np.errstate(divide="ignore"):  # a lower limit of zero
-                    low, high = confint_effectsize_oneway(f, (dof, residual_dof), alpha=1 - CONFIDENCE).eta2
+                    low, high = intervals(f, (dof, residual_dof), alpha=1 - CONFIDENCE).eta2
         rows.append((squares, int(dof), f, float(row["PR(>F)"]), eta, max(low, 0.0), high, omega))
     columns = ["sum of squares", "dof", "F", "p", "partial eta2", "eta2 low", "eta2 high", "omega2"]
     return pd.DataFrame(rows, columns=columns)

@@ -1,6 +1,7 @@
 """Where the runs of a study are done: the interface, and processes of this machine."""
 
 import multiprocessing
+import multiprocessing.process
 import os
 import signal
 import threading
@@ -105,14 +106,19 @@ def usable_cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def start_worker(threads: int) -> None:
-    """Prepare a worker process: so many threads, and no life of its own after the process that started it."""
+def set_threads(threads: int) -> None:
+    """Number of threads of this process: of the kernels, OpenCV, and the libraries of linear algebra."""
     import cv2
     from threadpoolctl import threadpool_limits
 
     os.environ["DUDMAP_THREADS"] = str(threads)
     cv2.setNumThreads(threads)
     threadpool_limits(threads)
+
+
+def start_worker(threads: int) -> None:
+    """Prepare a worker process: so many threads, and no life of its own after the process that started it."""
+    set_threads(threads)
     signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends the run; its folder stays unfinished
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.study.factors import Factor
+from dudmap.study.tables import Table
 
 if TYPE_CHECKING:
-    import pandas as pd
     from matplotlib.figure import Figure
 
     from dudmap.study.response_surface import Optimum, Surface
@@ -33,7 +33,7 @@ def _label(level: object) -> str:
     return f"{level:.3g}" if isinstance(level, float | int) and not isinstance(level, bool) else str(level)
 
 
-def main_effects_figure(effects: "pd.DataFrame", heading: str) -> bytes:
+def main_effects_figure(effects: Table, heading: str) -> bytes:
     """Mean response at every level of every factor with its confidence interval."""
     keys = list(dict.fromkeys(effects["factor"]))
     figure, axes = _axes(1, len(keys))
@@ -50,7 +50,7 @@ def main_effects_figure(effects: "pd.DataFrame", heading: str) -> bytes:
     return png(figure)
 
 
-def interactions_figure(tables: "dict[tuple[str, str], pd.DataFrame]", factors: Sequence[Factor], heading: str) -> bytes:
+def interactions_figure(tables: dict[tuple[str, str], Table], factors: Sequence[Factor], heading: str) -> bytes:
     """Mean response at all pairs of levels: one plot per pair, one line per level of the factor of the row."""
     count = len(factors)
     figure, axes = _axes(count, count, 2.5, 2.2)
@@ -63,7 +63,7 @@ def interactions_figure(tables: "dict[tuple[str, str], pd.DataFrame]", factors: 
                 ax.set_yticks([])
                 continue
             pair = (first.key, second.key)
-            table = tables[pair] if pair in tables else tables[pair[::-1]].T
+            table = tables[pair] if pair in tables else tables[second.key, first.key].T
             for level, line in table.iterrows():
                 ax.plot(range(len(line)), line.to_numpy(), marker="o", ms=3, label=_label(level))
             ax.set_xticks(range(table.shape[1]), [_label(level) for level in table.columns], fontsize=7)
@@ -82,7 +82,8 @@ def residuals_figure(surface: "Surface") -> bytes:
     axes[0][0].scatter(fitted, residuals, s=8)
     axes[0][0].axhline(0, color="0.7", lw=0.8)
     axes[0][0].set(xlabel="predicted", ylabel="residual")
-    (ordered, values), (slope, offset, _) = stats.probplot(residuals)
+    quantiles: Any = stats.probplot(residuals)
+    (ordered, values), (slope, offset, _) = quantiles
     axes[0][1].scatter(ordered, values, s=8)
     axes[0][1].plot(ordered, slope * ordered + offset, color="0.6", lw=0.8)
     axes[0][1].set(xlabel="normal quantile", ylabel="residual")
@@ -110,7 +111,7 @@ def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
     return png(figure)
 
 
-def pareto_figure(points: "pd.DataFrame", front: "pd.DataFrame", names: Sequence[str], headings: Sequence[str]) -> bytes:
+def pareto_figure(points: Table, front: Table, names: Sequence[str], headings: Sequence[str]) -> bytes:
     """Points in the plane of two responses, and those that no other beats."""
     figure, axes = _axes(1, 1, 5.0, 3.6)
     ax = axes[0][0]
@@ -122,7 +123,7 @@ def pareto_figure(points: "pd.DataFrame", front: "pd.DataFrame", names: Sequence
     return png(figure)
 
 
-def indices_figure(indices: "pd.DataFrame") -> bytes:
+def indices_figure(indices: Table) -> bytes:
     """First-order and total Sobol indices with their intervals."""
     figure, axes = _axes(1, 1, 5.0, 3.2)
     for shift, order in ((-0.2, "first"), (0.2, "total")):

@@ -2,16 +2,14 @@
 
 from collections.abc import Sequence
 from itertools import combinations
-from typing import TYPE_CHECKING
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.study.designs import MORRIS_LEVELS, problem
 from dudmap.study.factors import Factor, coded_points
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 FOLDS = 5
 """Folds of the cross-validation of an emulator."""
@@ -21,7 +19,7 @@ EMULATED = 1024
 """Base samples of the indices of an emulator; their error is then small beside that of the emulator."""
 
 
-def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: int = 0) -> "pd.DataFrame":
+def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: int = 0) -> Table:
     """First- and second-order and total Sobol indices with their confidence intervals (SALib).
 
     Args:
@@ -44,9 +42,7 @@ def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: 
     return pd.DataFrame(rows, columns=["term", "order", "index", "95 % +-"])
 
 
-def emulated_indices(
-    table: "pd.DataFrame", factors: Sequence[Factor], response: str, seed: int = 0
-) -> "tuple[pd.DataFrame | None, str]":
+def emulated_indices(table: Table, factors: Sequence[Factor], response: str, seed: int = 0) -> tuple[Table, str]:
     """Sobol indices of a Gaussian process (scikit-learn) that was fitted to the runs.
 
     Returns:
@@ -65,7 +61,8 @@ def emulated_indices(
     y = means[response].to_numpy(float)
     if len(y) < 2 * FOLDS or np.ptp(y) == 0:
         return None, f"{len(y)} different points are too few for an emulator, or the response does not vary."
-    kernel = ConstantKernel() * RBF(np.ones(len(factors))) + WhiteKernel(1e-2)
+    lengths: Any = np.ones(len(factors))  # one per factor, which the annotation of scikit-learn forgets
+    kernel = ConstantKernel() * RBF(lengths) + WhiteKernel(1e-2)
     process = GaussianProcessRegressor(kernel, normalize_y=True, random_state=seed)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", ConvergenceWarning)  # a length at its bound; cross-validation judges the fit
@@ -76,10 +73,12 @@ def emulated_indices(
     if share < ENOUGH_PREDICTED:
         return None, f"{text}; Sobol indices of it would mean nothing."
     sampled = sample(problem(factors), EMULATED, calc_second_order=True, seed=seed)
-    return sobol_indices(factors, process.predict(sampled), seed), f"{text}; the indices are those of the process."
+    return sobol_indices(
+        factors, np.asarray(process.predict(sampled)), seed
+    ), f"{text}; the indices are those of the process."
 
 
-def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values: NDArray[np.float64]) -> "pd.DataFrame":
+def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values: NDArray[np.float64]) -> Table:
     """Mean absolute elementary effect mu* with its interval, mean mu and standard deviation sigma (SALib).
 
     Args:
@@ -92,5 +91,7 @@ def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values
 
     found = analyze(problem(factors), coded, values, num_levels=MORRIS_LEVELS, seed=0)
     columns = {"mu*": found["mu_star"], "95 % +-": found["mu_star_conf"], "mu": found["mu"], "sigma": found["sigma"]}
-    frame = pd.DataFrame({"factor": [factor.name for factor in factors], **{k: np.asarray(v) for k, v in columns.items()}})
+    frame = pd.DataFrame(
+        {"factor": [factor.name for factor in factors], **{k: np.asarray(v) for k, v in columns.items()}}
+    )
     return frame.sort_values("mu*", ascending=False, ignore_index=True)

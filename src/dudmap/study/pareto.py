@@ -1,15 +1,13 @@
 """Points of a design that no other point beats in all responses at once."""
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
 from dudmap.study.responses import RESPONSES
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 
-def pareto_front(points: "pd.DataFrame", names: Sequence[str]) -> "pd.DataFrame":
+def pareto_front(points: Table, names: Sequence[str]) -> Table:
     """Rows of the Pareto front, sorted by the first response (Optuna's ``best_trials``).
 
     Args:
@@ -19,7 +17,7 @@ def pareto_front(points: "pd.DataFrame", names: Sequence[str]) -> "pd.DataFrame"
     import optuna
 
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    directions = ["minimize" if RESPONSES[name].better == "low" else "maximize" for name in names]
+    directions: Any = ["minimize" if RESPONSES[name].better == "low" else "maximize" for name in names]
     study = optuna.create_study(directions=directions)
     complete = points.dropna(subset=list(names))
     for number in complete.index:

@@ -16,7 +16,10 @@ from dudmap.study.designs import DesignOptions, Point, count_of, points_of
 from dudmap.study.factors import Factor, configured, make_factors
 from dudmap.study.responses import RESPONSES, check_truth, known_responses
 
-SECTIONS = ("name", "base", "factors", "design", "sequences", "responses", "log", "calibrate", "confirm", "tune")
+SECTIONS = (
+    "name", "base", "factors", "design", "sequences", "judge", "responses", "log", "calibrate", "confirm", "tune",
+)  # fmt: skip
+"""Sections of a design file."""
 MAX_RUNS = 1000
 """Runs of a design that is not refused unless ``--max-runs`` allows more."""
 
@@ -74,6 +77,7 @@ class Plan:
         confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
         code: Hash of the code.
         tune: Options of ``dudmap study tune``.
+        judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
     """
 
     name: str
@@ -87,6 +91,7 @@ class Plan:
     confirm: int = 1
     code: str = ""
     tune: Mapping[str, Any] = field(default_factory=dict)
+    judges: tuple[tuple[str, int, Entry], ...] = ()
 
     def runs(self) -> list[Run]:
         """All runs of the design, recording by recording."""
@@ -174,10 +179,14 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
     confirm = tree.get("confirm", 1)
     if not isinstance(confirm, int) or confirm < 0:
         raise ConfigError(f"confirm is {confirm!r}; expected the number of confirmation runs, 0 or more")
+    for key, expected in (("calibrate", bool), ("tune", dict)):
+        if key in tree and not isinstance(tree[key], expected):
+            raise ConfigError(f"{key} is {tree[key]!r}; expected {'true or false' if expected is bool else 'a table'}")
     return Plan(
         str(tree.get("name", name)), base, factors, options,
         make_entries(tree.get("sequences", []), folder), responses, log,
-        bool(tree.get("calibrate", False)), confirm, method_hash(), tree.get("tune", {}),
+        tree.get("calibrate", False), confirm, method_hash(), tree.get("tune", {}),
+        make_entries(tree["judge"], folder) if tree.get("judge") else (),
     )  # fmt: skip
 
 
@@ -190,16 +199,17 @@ def method_hash() -> str:
 
 def _options(table: object) -> DesignOptions:
     table = {"kind": table} if isinstance(table, str) else table
-    known = {option.name: option.type for option in fields(DesignOptions)}
+    known = [option.name for option in fields(DesignOptions)]
     if not isinstance(table, dict):
         raise ConfigError(f"design is {table!r}; expected a table with kind, samples, ...")
     for key, value in table.items():
         if key not in known:
             raise ConfigError(f"unknown option {key!r} of the design; known are {', '.join(known)}")
         expected = type(getattr(DesignOptions, key))
-        if type(value) is not expected or (key == "samples" and value < 1):
+        if type(value) is not expected or (key == "samples" and int(value) < 1):
             raise ConfigError(f"option {key} of the design is {value!r}; expected a {expected.__name__}")
-    return DesignOptions(**table)
+    checked: dict[str, Any] = table
+    return DesignOptions(**checked)
 
 
 def make_entries(tables: object, folder: Path) -> tuple[tuple[str, int, Entry], ...]:
@@ -240,7 +250,9 @@ def _synthetic(table: dict[str, Any]) -> list[tuple[str, int, Entry]]:
             raise ConfigError(f"a synthetic sequence has no parameter {key!r}; known are {', '.join(sorted(known))}")
     parameters = {key: value for key, value in table.items() if key in known}
     camera = parameters.get("camera")
-    if camera is not None and not (isinstance(camera, list) and len(camera) == 2 and all(type(n) is int for n in camera)):
+    if camera is not None and not (
+        isinstance(camera, list) and len(camera) == 2 and all(type(n) is int for n in camera)
+    ):
         raise ConfigError(f"camera of a synthetic sequence is {camera!r}; expected [width, height] in pixels")
     count, seed = _count(table, "replicates", 1), parameters.get("seed", 0)
     assert count is not None

@@ -5,16 +5,15 @@ import html
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal, NamedTuple
+from typing import Literal, NamedTuple
 
 from dudmap.benchmark.table import grid
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 STYLE = (
-    "body{font:15px/1.5 sans-serif;max-width:70em;margin:2em auto;padding:0 1em}img{max-width:100%}"
-    "table{border-collapse:collapse;font-size:13px}td,th{padding:.2em .7em;border-bottom:1px solid #ccc;text-align:right}"
+    "body{font:15px/1.5 sans-serif;max-width:70em;margin:2em auto;padding:0 1em}img{max-width:100%}figure{margin:1em 0}"
+    "table{border-collapse:collapse;font-size:13px}"
+    "td,th{padding:.2em .7em;border-bottom:1px solid #ccc;text-align:right}"
 )
 
 
@@ -58,7 +57,7 @@ class Report:
         """Add a list."""
         self.blocks.append(Block("list", "\n".join(lines)))
 
-    def table(self, frame: "pd.DataFrame") -> None:
+    def table(self, frame: Table) -> None:
         """Add a table without its index."""
         rows = [[shown(value) for value in row] for row in frame.itertuples(index=False)]
         self.blocks.append(Block("table", table=([str(column) for column in frame.columns], rows)))

@@ -1,25 +1,19 @@
-"""Full quadratic response surface (Box and Wilson 1951): fit, optimum within bounds, and reasons not to believe it."""
+"""Full quadratic response surface (Box and Wilson 1951): fit, optimum within bounds, stationary point, lack of fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import product
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.study.effects import CONFIDENCE
 from dudmap.study.factors import Factor, coded_points
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 Numbers = NDArray[np.float64]
 
-ENOUGH_EXPLAINED = 0.5
-"""Smallest share of the variance that a model must predict (leave-one-out) to be better than a guess."""
-SIGNIFICANT = 0.05
-"""Largest p of a significant lack of fit."""
 MOST_STARTS = 3**6
 """Starting points of the search for the optimum at most; all corners, edges and faces of six factors."""
 
@@ -67,7 +61,7 @@ class Surface:
     def predict(self, coded: Numbers) -> Numbers:
         """(N,) predictions at (N, K) coded values, for the mean over all recordings."""
         terms = self.features.transform(coded)
-        return self.model.predict(self._exog(terms))
+        return np.asarray(self.model.predict(self._exog(terms)))
 
     def interval(self, coded: Numbers, count: int = 1) -> tuple[float, float, float]:
         """Prediction at one point, and the interval in which the mean of ``count`` new runs should fall."""
@@ -95,7 +89,7 @@ class Surface:
         return float(self.point_means.min() if self.better == "low" else self.point_means.max())
 
     def _exog(self, terms: Numbers) -> Numbers:
-        return np.hstack([terms, np.zeros((len(terms), self.blocks))])
+        return np.hstack([np.asarray(terms), np.zeros((len(terms), self.blocks))])
 
     @property
     def quadratic_form(self) -> tuple[Numbers, Numbers]:
@@ -112,9 +106,7 @@ class Surface:
         return b, B
 
 
-def fit_surface(
-    table: "pd.DataFrame", factors: Sequence[Factor], response: str, better: str = "low"
-) -> Surface | str:
+def fit_surface(table: Table, factors: Sequence[Factor], response: str, better: str = "low") -> Surface | str:
     """Fit the full quadratic model by least squares; recordings are blocks whose effects sum to zero.
 
     Returns:
@@ -130,7 +122,7 @@ def fit_surface(
     features = PolynomialFeatures(2).fit(coded)
     blocks = np.asarray(OneHotEncoder(sparse_output=False).fit_transform(table[["sequence"]]))
     effects = blocks[:, :-1] - blocks[:, -1:]
-    exog = np.hstack([features.transform(coded), effects])
+    exog = np.hstack([np.asarray(features.transform(coded)), effects])
     rank = np.linalg.matrix_rank(exog)
     if rank < exog.shape[1]:
         return (
@@ -222,7 +214,7 @@ def canonical_analysis(surface: Surface) -> Canonical:
     eigenvalues, directions = np.linalg.eigh(B)
     if np.linalg.matrix_rank(B) < len(b):
         return Canonical(None, None, float("nan"), eigenvalues, directions)
-    point = np.linalg.solve(-2 * B, b)
+    point = np.asarray(np.linalg.solve(-2 * B, b), float)
     inside = bool(np.all(np.abs(point) <= 1))
     values = {f.key: f.value(float(x)) for f, x in zip(surface.factors, point, strict=True)} if inside else None
     return Canonical(point, values, float(surface.predict(point[None])[0]), eigenvalues, directions)
@@ -242,7 +234,11 @@ def lack_of_fit(surface: Surface) -> LackOfFit | None:
     import statsmodels.api as sm
     from statsmodels.stats.anova import anova_lm
 
-    blocks = np.asarray(surface.model.model.exog)[:, -surface.blocks :] if surface.blocks else np.empty((len(surface.observed), 0))
+    blocks = (
+        np.asarray(surface.model.model.exog)[:, -surface.blocks :]
+        if surface.blocks
+        else np.empty((len(surface.observed), 0))
+    )
     cells = np.hstack([surface.coded, blocks]).round(9)
     _, group = np.unique(cells, axis=0, return_inverse=True)
     group = group.ravel()
@@ -251,171 +247,3 @@ def lack_of_fit(surface: Surface) -> LackOfFit | None:
     saturated = sm.OLS(surface.observed, np.eye(group.max() + 1)[group]).fit()
     row = anova_lm(surface.model, saturated).iloc[1]
     return LackOfFit(float(row["F"]), float(row["Pr(>F)"]), int(saturated.df_resid))
-
-
-@dataclass(frozen=True)
-class Influence:
-    """The run with the largest Cook's distance, and the model without it.
-
-    Attributes:
-        label: The run.
-        value: Its response.
-        distance: Its Cook's distance.
-        limit: Median of F(P, N - P): beyond it the run moves the estimate out of its own 50 % confidence region
-            (Cook 1977).
-        r2_without: Share of the variance that the model explains without it.
-        sd_without: Standard deviation of the residuals without it.
-        optimum_without: Optimum without it.
-    """
-
-    label: str
-    value: float
-    distance: float
-    limit: float
-    r2_without: float
-    sd_without: float
-    optimum_without: Optimum
-
-    @property
-    def carries(self) -> bool:
-        """Whether the run carries the model."""
-        return self.distance > self.limit
-
-
-def influence(surface: Surface) -> Influence | None:
-    """The most influential run; None if the model cannot be fitted without it."""
-    import statsmodels.api as sm
-    from scipy import stats
-
-    model = surface.model
-    distances = model.get_influence().cooks_distance[0]
-    worst = int(np.argmax(distances))
-    rest = np.arange(len(distances)) != worst
-    exog = np.asarray(model.model.exog)
-    if np.linalg.matrix_rank(exog[rest]) < exog.shape[1] or rest.sum() <= exog.shape[1]:
-        return None
-    without = sm.OLS(surface.observed[rest], exog[rest]).fit()
-    smaller = Surface(
-        surface.factors, surface.features, without, surface.blocks, surface.observed[rest], surface.coded[rest],
-        [label for label, keep in zip(surface.labels, rest, strict=True) if keep], surface.better,
-    )  # fmt: skip
-    limit = float(stats.f.ppf(0.5, exog.shape[1], model.df_resid))
-    return Influence(
-        surface.labels[worst], float(surface.observed[worst]), float(distances[worst]), limit,
-        smaller.r2, smaller.residual_sd, optimum(smaller),
-    )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class Judgement:
-    """Reasons not to believe the optimum of a surface, each a sentence; none if there is nothing against it."""
-
-    reasons: tuple[str, ...] = field(default=())
-
-    @property
-    def credible(self) -> bool:
-        """Whether nothing speaks against the optimum."""
-        return not self.reasons
-
-
-def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influence | None) -> Judgement:
-    """Everything that speaks against the optimum of a surface before it is confirmed."""
-    reasons = []
-    if surface.r2_predicted < ENOUGH_EXPLAINED:
-        reasons.append(
-            f"The model explains {surface.r2:.0%} of the variance (R2 = {surface.r2:.2f}) and predicts "
-            f"{max(surface.r2_predicted, 0):.0%} of it when each run is left out in turn "
-            f"(R2 = {surface.r2_predicted:.2f})."
-        )
-    seen = surface.best_seen
-    gain = abs(seen - best.predicted)
-    noise = surface.residual_sd / np.sqrt(len(surface.observed) / len(surface.point_means))
-    if (best.predicted < seen) == (surface.better == "low") and best.predicted != seen:
-        side = "below" if surface.better == "low" else "above"
-        reasons.append(f"The prediction {best.predicted:.4g} lies {side} everything observed ({seen:.4g}).")
-    if gain < noise:
-        reasons.append(
-            f"It differs from the best of these by {gain:.4g}; the standard deviation of the residuals is {noise:.3g}"
-            f"{' per point' if noise < surface.residual_sd else ''}."
-        )
-    if single is not None and single.carries:
-        where = ", ".join(f"{key.rpartition('.')[2]} {value:.4g}" for key, value in single.optimum_without.values.items())
-        reasons.append(
-            f"One value carries the model: {single.value:.4g} at {single.label}, with a Cook's distance of "
-            f"{single.distance:.2f} (limit {single.limit:.2f}); without it R2 is {single.r2_without:.2f}, the standard "
-            f"deviation of the residuals {single.sd_without:.3g}, and the optimum {single.optimum_without.predicted:.4g} "
-            f"at {where}."
-        )
-    if fit is not None and fit.p < SIGNIFICANT:
-        reasons.append(
-            f"The lack of fit is significant (F = {fit.f:.2f}, p = {fit.p:.2g}): the response is not quadratic."
-        )
-    return Judgement(tuple(reasons))
-
-
-@dataclass(frozen=True)
-class Confirmation:
-    """Runs at the predicted optimum, beside runs at the best point of the design on the same recordings.
-
-    Attributes:
-        predicted: Prediction of the model.
-        low, high: Interval in which the mean of the confirmation runs should fall.
-        measured: Mean of the confirmation runs.
-        design_mean: Mean of all runs of the design: what one would predict without a model.
-        best_point: Mean of the runs at the best point of the design on the same recordings.
-        count: Number of confirmation runs.
-        better: Whether ``low`` or ``high`` values are good.
-    """
-
-    predicted: float
-    low: float
-    high: float
-    design_mean: float
-    measured: float
-    best_point: float
-    count: int
-    better: str
-
-    @property
-    def inside(self) -> bool:
-        """Whether the measured mean lies in the interval."""
-        return self.low <= self.measured <= self.high
-
-    @property
-    def informative(self) -> bool:
-        """Whether the interval excludes the mean of the design: a wider one holds whatever is measured."""
-        return not self.low <= self.design_mean <= self.high
-
-    @property
-    def improves(self) -> bool:
-        """Whether the optimum is at least as good as the best point of the design."""
-        return self.measured == self.best_point or (self.measured < self.best_point) == (self.better == "low")
-
-    @property
-    def held(self) -> bool:
-        """Whether the model held: it said what would be measured, more exactly than the mean does, and where to go."""
-        return self.inside and self.informative and self.improves
-
-    def __str__(self) -> str:
-        part = "inside" if self.inside else "outside"
-        wide = "" if self.informative else f" (so wide that it holds the mean of the design, {self.design_mean:.4g})"
-        found = "no worse" if self.improves else "worse"
-        return (
-            f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({self.count} runs), {part} the interval "
-            f"{self.low:.4g} to {self.high:.4g}{wide}; {found} than the best point of the design on the same recordings, "
-            f"{self.best_point:.4g}. The model {'held' if self.held else 'did not hold'}."
-        )
-
-
-def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_point: Sequence[float]) -> Confirmation:
-    """Compare confirmation runs with the prediction and with the best point of the design.
-
-    Args:
-        surface: The model.
-        best: Its optimum.
-        measured: (M,) response of the runs at the optimum, the same number on every recording.
-        best_point: (M,) response of runs at the best point of the design, on the same recordings.
-    """
-    predicted, low, high = surface.interval(np.array(best.coded), len(measured))
-    mean, other = float(np.mean(measured)), float(np.mean(best_point))
-    return Confirmation(predicted, low, high, float(surface.observed.mean()), mean, other, len(measured), surface.better)

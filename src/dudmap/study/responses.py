@@ -68,7 +68,9 @@ def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) ->
         if name == "rpe" and np.ptp(sequence.timestamps) < 1:
             raise DatasetError(f"{entry.name} is shorter than one second, the interval of the response rpe")
         if needs == "masks" and not _has_masks(entry, sequence):
-            raise DatasetError(f"{entry.name} has no true masks of anything that moves, which the response {name} needs")
+            raise DatasetError(
+                f"{entry.name} has no true masks of anything that moves, which the response {name} needs"
+            )
         if needs == "surface" and entry.path is not None and not (entry.path / "surface.ply").is_file():
             raise DatasetError(f"{entry.name} has no true surface (surface.ply), which the response {name} needs")
 

@@ -9,12 +9,11 @@ from dudmap.errors import ConfigError
 from dudmap.study.conduct import Progress, conduct, table_of
 from dudmap.study.executor import Executor
 from dudmap.study.plan import MAX_RUNS, Plan, sequence_names
+from dudmap.study.tables import Table
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from dudmap.study.analysis import Prediction
-    from dudmap.study.response_surface import Confirmation
+    from dudmap.study.judgement import Confirmation
 
 LIBRARIES = {
     "pyDOE3": "pyDOE3",
@@ -93,7 +92,7 @@ def _confirm(
     import pandas as pd
 
     from dudmap.study.analysis import usable
-    from dudmap.study.response_surface import confirm
+    from dudmap.study.judgement import confirm
 
     name = plan.responses[0]
     at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)
@@ -107,13 +106,15 @@ def _confirm(
     except ConfigError as error:
         return f"The model did not hold: a confirmation failed, {error}."
     if len(measured) < len(at_optimum):
-        return f"The model did not hold: {len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed."
+        return (
+            f"The model did not hold: {len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed."
+        )
     return confirm(predicted.surface, predicted.best, measured[name].tolist(), best[name].tolist())
 
 
 def write_report(
     plan: Plan,
-    table: "pd.DataFrame",
+    table: Table,
     predicted: "Prediction | str",
     confirmation: "Confirmation | str",
     out: Path,
@@ -128,8 +129,8 @@ def write_report(
     report = Report(f"Study {plan.name}")
     died = f" {state.deaths} workers died." if state and state.deaths else ""
     report.text(
-        f"{plan.options.kind} design of {len(plan.factors)} factors, {table['point'].nunique()} points, {len(table)} runs "
-        f"on {', '.join(sequence_names(plan))}; {workers} at a time.{died}"
+        f"{plan.options.kind} design of {len(plan.factors)} factors, {table['point'].nunique()} points, "
+        f"{len(table)} runs on {', '.join(sequence_names(plan))}; {workers} at a time.{died}"
     )
     report.items(
         f"{f.key}: {', '.join(map(str, f.levels)) if f.levels else f'{f.low:g} to {f.high:g} ({f.scale})'}"

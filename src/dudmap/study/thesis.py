@@ -3,13 +3,11 @@
 from collections.abc import Mapping, Sequence
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from dudmap.errors import ConfigError
 from dudmap.study.plan import Plan, make_plan
-
-if TYPE_CHECKING:
-    import pandas as pd
+from dudmap.study.tables import Table
 
 HUBER, DAMPING, VOXEL, WEIGHT = "tracker.huber", "tracker.damping", "volume.voxel_size", "tracker.color_weight"
 TABLES: Mapping[str, dict[str, list[float]]] = {
@@ -59,7 +57,7 @@ def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int
     return make_plan(tree)
 
 
-def published_table() -> "pd.DataFrame":
+def published_table() -> Table:
     """The 81 values of table 6.1 as runs: ATE RMSE in metres on freiburg3_walking_xyz."""
     import pandas as pd
 
@@ -77,7 +75,7 @@ def published_report(out: Path) -> str:
     The confirmation is the thesis' own: 0.089 m at its optimum, 0.080 m at the best point of the design.
     """
     from dudmap.study.analysis import Prediction, predict_optimum
-    from dudmap.study.response_surface import confirm
+    from dudmap.study.judgement import confirm
     from dudmap.study.study import write_report
 
     plan, table = thesis_plan(), published_table()
