@@ -96,8 +96,8 @@ def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influe
         beyond = (best.predicted < seen) == (surface.better == "low") and best.predicted != seen
         where = f"lies {side} everything observed" if beyond else "is no better than the best observed"
         reasons.append(
-            f"The prediction {best.predicted:.4g} {where} ({seen:.4g}), from which it differs by {gain:.2g}, less than the "
-            f"standard deviation of the residuals{per}, {noise:.3g}."
+            f"The prediction {best.predicted:.4g} {where} ({seen:.4g}), from which it differs by {gain:.2g}, less than "
+            f"the standard deviation of the residuals{per}, {noise:.3g}."
         )
     if single is not None and single.carries:
         where = ", ".join(
