@@ -1,34 +1,13 @@
 """A search recommends what holds on recordings it never saw, and nothing else."""
 
-from concurrent.futures import Future
-from dataclasses import replace
-
 import pytest
 
 from dudmap.config import Config
 from dudmap.study.plan import make_plan
 from dudmap.study.tune import run_tune
-from dudmap.study.worker import perform
+from study.here import Here
 
 SMALL = {"scene": "room", "movers": [], "frames": 30, "camera": [160, 120]}
-
-
-class Here:
-    """Executor that does jobs in this process with a given function."""
-
-    workers = 1
-
-    def __init__(self, do):
-        self.do, self.runs = do, []
-
-    def submit(self, job):
-        self.runs.append(job.run)
-        out = Future()
-        out.set_result(perform(replace(job, do=self.do)))
-        return out
-
-    def close(self):
-        pass
 
 
 def plan_of(**more):

@@ -1,6 +1,7 @@
 """Runs on a Ray cluster (extra ``cluster``)."""
 
 from concurrent.futures import Future
+from importlib import import_module
 from importlib.util import find_spec
 from typing import Any
 
@@ -26,7 +27,7 @@ class RayExecutor:
     def __init__(self, address: str, workers: int | None = None) -> None:
         if find_spec("ray") is None:
             raise ConfigError("a cluster needs ray; install it with: pip install 'dudmap[cluster]'")
-        import ray  # pyright: ignore[reportMissingImports]
+        ray: Any = import_module("ray")
 
         try:
             ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="error")
