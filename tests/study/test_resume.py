@@ -71,6 +71,28 @@ def test_twenty_killed_studies_of_real_runs_go_on_where_they_were(tmp_path):
     assert sum(killed) >= 15
 
 
+def test_two_studies_in_one_folder_share_the_runs(tmp_path):
+    both = [start(tmp_path, 20, "fake") for _ in range(2)]
+    assert [process.wait() for process in both] == [0, 0]
+    check_complete(tmp_path, 20, kills=0)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="no SIGKILL")
+def test_workers_end_with_a_killed_study(tmp_path):
+    process = start(tmp_path, 1000, "fake")
+    while len(StudyFolder(tmp_path).journal()) < 4:
+        time.sleep(0.01)
+    process.kill()
+    process.wait()
+    time.sleep(1)
+    count = len(StudyFolder(tmp_path).journal())
+    time.sleep(0.5)
+    assert len(StudyFolder(tmp_path).journal()) == count
+    for pid in {line["pid"] for line in StudyFolder(tmp_path).journal()}:
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
 def test_a_dead_worker_costs_its_current_run_only(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     executor = LocalExecutor(2, threads=1, kernels=False)

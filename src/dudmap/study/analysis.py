@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MOST_FAILURES = 10
 """Failed runs that a report lists one by one."""
+MOST_POINTS = 100
+"""Points of a design whose means a report lists; runs.csv holds those of larger ones."""
 MOST_INTERACTION_FACTORS = 6
 """Factors whose interactions are drawn; 36 plots fill a page."""
 
@@ -228,6 +230,14 @@ def describe_pareto(report: Report, table: Table, factors: Sequence[Factor], nam
     report.heading(f"Pareto front: {headings[0]} against {headings[1]}")
     report.figure(figures.pareto_figure(points, front, pair, headings), "Means of the points over all recordings.")
     report.table(front)
+
+
+def describe_points(report: Report, table: Table, factors: Sequence[Factor], names: Sequence[str]) -> None:
+    """Add the mean responses of all points, if a reader can take them in."""
+    points = point_table(table, factors, names)
+    if 0 < len(points) <= MOST_POINTS:
+        report.heading("Means of all points over the recordings")
+        report.table(points)
 
 
 def describe_failures(report: Report, table: Table) -> None:

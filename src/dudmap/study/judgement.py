@@ -160,11 +160,12 @@ class Confirmation:
         return self.inside and self.informative and self.improves
 
     def __str__(self) -> str:
+        runs = "1 run" if self.count == 1 else f"mean of {self.count} runs"
         part = "inside" if self.inside else "outside"
         wide = "" if self.informative else f" (so wide that it holds the mean of the design, {self.design_mean:.4g})"
         found = "no worse" if self.improves else "worse"
         return (
-            f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({self.count} runs), {part} the interval "
+            f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({runs}), {part} the interval "
             f"{self.low:.4g} to {self.high:.4g}{wide}; {found} than the best point of the design on the same "
             f"recordings, {self.best_point:.4g}. The model {'held' if self.held else 'did not hold'}."
         )

@@ -146,6 +146,7 @@ def write_report(
         if name == plan.responses[0]:
             analysis.describe_confirmation(report, confirmation)
     analysis.describe_pareto(report, table, plan.factors, plan.responses)
+    analysis.describe_points(report, table, plan.factors, plan.responses)
     analysis.describe_failures(report, table)
     report.save(out)
     return outcome(predicted, confirmation)
