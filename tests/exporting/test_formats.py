@@ -353,7 +353,7 @@ def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_incomplete_and_newer_exported_runs(tmp_path):
+def test_incomplete_and_newer_run_folders(tmp_path):
     folder = tmp_path / "run"
     folder.mkdir()
     Trajectory(np.array([1.0]), np.eye(4)[None]).save(folder / "trajectory.txt")

@@ -140,11 +140,12 @@ def _fingerprint(condition: Condition, config: Config) -> str:
 
 
 @cache
-def code_hash() -> str:
-    """SHA-256 of all sources of the package."""
+def code_hash(without: tuple[str, ...] = ()) -> str:
+    """SHA-256 of all sources of the package, except of the packages ``without``."""
     import dudmap
 
-    sources = sorted(Path(dudmap.__file__).parent.rglob("*.py"))
+    root = Path(dudmap.__file__).parent
+    sources = sorted(source for source in root.rglob("*.py") if source.relative_to(root).parts[0] not in without)
     return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 

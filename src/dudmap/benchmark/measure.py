@@ -65,6 +65,7 @@ def measure_sequence(
     samples: int = SAMPLES,
     passes: int = 1,
     calibrate: bool = False,
+    ahead: int | None = None,
 ) -> Row:
     """Run a system on a recording: figures of its metrics.json and errors of trajectory and mesh.
 
@@ -78,6 +79,7 @@ def measure_sequence(
         passes: See ``dudmap.pipeline.run.run``.
         calibrate: Estimate the calibration of the colour camera first, as ``dudmap run`` does; otherwise the recording
             is taken as given.
+        ahead: Frames read ahead, see ``dudmap.pipeline.run.run``; None reads ahead unless frames are rendered.
 
     Raises:
         DudmapError: The recording cannot be used, or no frame could be tracked.
@@ -88,7 +90,8 @@ def measure_sequence(
     from dudmap.pipeline.run import run
     from dudmap.synthetic.recording import SyntheticSequence
 
-    ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
+    if ahead is None:
+        ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
     if not calibrate:
         config = config.override(["sensor.self_calibration=false"])
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:

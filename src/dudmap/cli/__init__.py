@@ -29,6 +29,7 @@ COMMANDS = {
     "synth": "Render a synthetic recording with exact ground truth.",
     "evaluate": "Score a trajectory, mesh or masks against the ground truth.",
     "benchmark": "Run a suite of recordings and print one table.",
+    "study": "Run a designed experiment over configurations and analyse it.",
     "config": "Print all parameters with their meanings as TOML.",
     "warmup": "Compile all kernels in advance.",
 }

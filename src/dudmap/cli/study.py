@@ -1,0 +1,123 @@
+"""``dudmap study``: designed experiments over configurations, the thesis' chapter 6, and a search that is judged."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+from typer.core import TyperGroup
+
+if TYPE_CHECKING:
+    from dudmap.study.conduct import Progress
+    from dudmap.study.executor import Executor
+
+
+class StudyGroup(TyperGroup):
+    """Command group whose first command is meant where none is named: ``dudmap study DESIGN.toml``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
+        """Put the name of the first command before a design file."""
+        if args and not args[0].startswith("-") and args[0] not in self.commands:
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
+
+
+app = typer.Typer(
+    cls=StudyGroup,
+    add_completion=False,
+    no_args_is_help=True,
+    help="Run a designed experiment over configurations and analyse it: dudmap study DESIGN.toml, or a command below.",
+)
+
+OutOption = Annotated[Path | None, typer.Option("--out", help="Study folder; an interrupted study in it goes on.")]
+JobsOption = Annotated[int, typer.Option("--jobs", min=0, help="Runs at a time; 0: one per core.")]
+MaxRunsOption = Annotated[int, typer.Option("--max-runs", min=1, help="Refuse a design with more runs.")]
+KeepOption = Annotated[bool, typer.Option("--keep", help="Keep trajectory, mesh and map of every run.")]
+ClusterOption = Annotated[
+    str,
+    typer.Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine."),
+]
+
+
+@app.command()
+def run(
+    design: Annotated[Path, typer.Argument(help="Design file (docs/study.md).")],
+    out: OutOption = None,
+    jobs: JobsOption = 0,
+    max_runs: MaxRunsOption = 1000,
+    keep: KeepOption = False,
+    cluster: ClusterOption = "",
+) -> None:
+    """Run the study of a design file; the word run may be left out."""
+    from dudmap.study.plan import load_plan
+    from dudmap.study.study import need_libraries, run_study
+
+    need_libraries()
+    plan = load_plan(design)
+    out = out or Path("runs/study") / design.stem
+    typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+    typer.echo(f"written to {out}")
+
+
+@app.command()
+def thesis(
+    recordings: Annotated[
+        list[Path] | None, typer.Argument(help="Recordings; default: a synthetic room with a walking person.")
+    ] = None,
+    table: Annotated[str, typer.Option("--table", help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
+    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Use only the first frames.")] = None,
+    published: Annotated[
+        bool, typer.Option("--published", help="Analyse the printed values of table 6.1; nothing is run.")
+    ] = False,
+    out: OutOption = None,
+    jobs: JobsOption = 0,
+    max_runs: MaxRunsOption = 1000,
+    keep: KeepOption = False,
+    cluster: ClusterOption = "",
+) -> None:
+    """Repeat the sensitivity study of the thesis (chapter 6)."""
+    from dudmap.study.study import need_libraries, run_study
+    from dudmap.study.thesis import published_report, thesis_plan
+
+    need_libraries()
+    if published:
+        out = out or Path("runs/study/thesis-published")
+        typer.echo(published_report(out))
+    else:
+        plan = thesis_plan(table, recordings or (), frames)
+        out = out or Path("runs/study") / f"thesis-{table}"
+        typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+    typer.echo(f"written to {out}")
+
+
+@app.command()
+def tune(
+    design: Annotated[Path, typer.Argument(help="Design file with a second set of recordings (judge).")],
+    out: OutOption = None,
+    jobs: JobsOption = 0,
+    max_runs: MaxRunsOption = 1000,
+    cluster: ClusterOption = "",
+) -> None:
+    """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
+    from dudmap.study.plan import load_plan
+    from dudmap.study.study import need_libraries
+    from dudmap.study.tune import run_tune
+
+    need_libraries()
+    plan = load_plan(design)
+    out = out or Path("runs/study") / f"{design.stem}-tune"
+    typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=_show))
+    typer.echo(f"written to {out}")
+
+
+def _executor(jobs: int, cluster: str) -> "Executor":
+    if cluster:
+        from dudmap.study.cluster import RayExecutor
+
+        return RayExecutor(cluster, jobs or None)
+    from dudmap.study.executor import LocalExecutor, usable_cores
+
+    return LocalExecutor(jobs or usable_cores())
+
+
+def _show(progress: "Progress") -> None:
+    typer.echo(str(progress), err=True)

@@ -1,0 +1,164 @@
+"""A whole study: its runs, its confirmation, its tables and its report."""
+
+from collections.abc import Callable
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dudmap.errors import ConfigError
+from dudmap.study.conduct import Progress, conduct, table_of
+from dudmap.study.executor import Executor
+from dudmap.study.plan import MAX_RUNS, Plan, sequence_names
+from dudmap.study.tables import Table
+
+if TYPE_CHECKING:
+    from dudmap.study.analysis import Prediction
+    from dudmap.study.judgement import Confirmation
+
+LIBRARIES = {
+    "pyDOE3": "pyDOE3",
+    "SALib": "SALib",
+    "statsmodels": "statsmodels",
+    "sklearn": "scikit-learn",
+    "optuna": "optuna",
+    "filelock": "filelock",
+}
+"""Libraries of the extra ``study`` by the name under which they are imported."""
+
+
+def need_libraries() -> None:
+    """Check that the libraries of the extra ``study`` are installed.
+
+    Raises:
+        ConfigError: One is not.
+    """
+    missing = [name for module, name in LIBRARIES.items() if find_spec(module) is None]
+    if missing:
+        raise ConfigError(f"studies need {', '.join(missing)}; install them with: pip install 'dudmap[study]'")
+
+
+def run_study(
+    plan: Plan,
+    out: Path,
+    executor: Executor,
+    *,
+    max_runs: int = MAX_RUNS,
+    keep: bool = False,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> str:
+    """Do all runs that are missing, confirm the optimum, and write runs.csv, confirmation.csv and the report.
+
+    Args:
+        plan: The study.
+        out: Its folder.
+        executor: Where the runs are done; it is closed.
+        max_runs: Largest number of runs.
+        keep: Keep whole run folders.
+        report: Called after every run.
+
+    Returns:
+        The outcome in words.
+
+    Raises:
+        DudmapError: The study is refused before anything is run (``Plan.check``), or no run has a response.
+    """
+    from dudmap.study.analysis import predict_optimum
+
+    try:
+        plan.check(max_runs)
+        runs = plan.runs()
+        state = conduct(runs, out, executor, keep=keep, report=report)
+        table = table_of(runs, out)
+        table.to_csv(out / "runs.csv", index=False)
+        predicted = predict_optimum(table, plan.factors, plan.responses[0], plan.responses[0] in plan.log)
+        confirmation: Confirmation | str = "There is nothing to confirm."
+        if not isinstance(predicted, str) and plan.confirm:
+            confirmation = _confirm(plan, predicted, out, executor, keep=keep, report=report)
+    finally:
+        executor.close()
+    return write_report(plan, table, predicted, confirmation, out, executor.workers, state)
+
+
+def _confirm(
+    plan: Plan,
+    predicted: "Prediction",
+    out: Path,
+    executor: Executor,
+    *,
+    keep: bool,
+    report: Callable[[Progress], None],
+) -> "Confirmation | str":
+    """Run the optimum and the best point of the design on the same recordings."""
+    import pandas as pd
+
+    from dudmap.study.analysis import usable
+    from dudmap.study.judgement import confirm
+
+    name = plan.responses[0]
+    at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)
+    conduct([*at_optimum, *at_best], out, executor, keep=keep, report=report)
+    tables = [table_of(at_optimum, out), table_of(at_best, out)]
+    pd.concat(tables, keys=["optimum", "best point of the design"], names=["at"]).reset_index("at").to_csv(
+        out / "confirmation.csv", index=False
+    )
+    try:
+        measured, best = (usable(table, name, name in plan.log) for table in tables)
+    except ConfigError as error:
+        return f"The model did not hold: a confirmation failed, {error}."
+    if len(measured) < len(at_optimum):
+        return (
+            f"The model did not hold: {len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed."
+        )
+    return confirm(predicted.surface, predicted.best, measured[name].tolist(), best[name].tolist())
+
+
+def write_report(
+    plan: Plan,
+    table: Table,
+    predicted: "Prediction | str",
+    confirmation: "Confirmation | str",
+    out: Path,
+    workers: int,
+    state: Progress | None = None,
+) -> str:
+    """Write report.md and report.html; return the outcome in words."""
+    from dudmap.pipeline.environment import machine, versions
+    from dudmap.study import analysis
+    from dudmap.study.report import Report
+
+    report = Report(f"Study {plan.name}")
+    died = f" {state.deaths} workers died." if state and state.deaths else ""
+    report.text(
+        f"{plan.options.kind} design of {len(plan.factors)} factors, {table['point'].nunique()} points, "
+        f"{len(table)} runs on {', '.join(sequence_names(plan))}; {workers} at a time.{died}"
+    )
+    report.items(
+        f"{f.key}: {', '.join(map(str, f.levels)) if f.levels else f'{f.low:g} to {f.high:g} ({f.scale})'}"
+        for f in plan.factors
+    )
+    report.text(f"Base configuration: {plan.base.preset}. {machine()['cpu']}, {versions()}".replace("'", ""))
+    for name in plan.responses:
+        try:
+            analysis.describe_response(report, table, plan.factors, name, plan.options, name in plan.log)
+        except ConfigError as error:
+            report.heading(name)
+            report.text(f"{error}.")
+        if name == plan.responses[0]:
+            analysis.describe_confirmation(report, confirmation)
+    analysis.describe_pareto(report, table, plan.factors, plan.responses)
+    analysis.describe_points(report, table, plan.factors, plan.responses)
+    analysis.describe_failures(report, table)
+    report.save(out)
+    return outcome(predicted, confirmation)
+
+
+def outcome(predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:
+    """What a study found, in words."""
+    from dudmap.study.analysis import values_text
+
+    if isinstance(predicted, str):
+        return predicted
+    lines = [f"Predicted optimum: {predicted.best.predicted:.4g} at {values_text(predicted.point)}."]
+    if not predicted.judgement.credible:
+        lines += ["It must not be believed:", *(f"- {reason}" for reason in predicted.judgement.reasons)]
+    return "\n".join([*lines, str(confirmation)])

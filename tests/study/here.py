@@ -1,0 +1,24 @@
+"""Executor of the tests."""
+
+from concurrent.futures import Future
+from dataclasses import replace
+
+from dudmap.study.worker import perform
+
+
+class Here:
+    """Executor that does jobs in this process with a given function, or with the system."""
+
+    workers = 1
+
+    def __init__(self, do=None):
+        self.do, self.runs = do, []
+
+    def submit(self, job):
+        self.runs.append(job.run)
+        out = Future()
+        out.set_result(perform(replace(job, do=self.do)))
+        return out
+
+    def close(self):
+        pass

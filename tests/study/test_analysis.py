@@ -1,0 +1,136 @@
+"""Analysis of responses whose truth is known: indices, lack of fit, confirmation, Pareto front."""
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from dudmap.config import Config
+from dudmap.study.analysis import predict_optimum
+from dudmap.study.designs import DESIGNS, DesignOptions, count_of, points_of
+from dudmap.study.factors import make_factors
+from dudmap.study.indices import emulated_indices, morris_indices, sobol_indices
+from dudmap.study.judgement import confirm
+from dudmap.study.pareto import pareto_front
+from dudmap.study.response_surface import fit_surface, lack_of_fit
+
+RANGES = {"tracker.huber": {"range": [0.005, 0.025]}, "volume.voxel_size": {"range": [0.01, 0.04], "scale": "log"},
+          "tracker.damping": {"range": [0.002, 0.02]}}  # fmt: skip
+
+
+def factors_of(table=RANGES):
+    return make_factors(table, Config())
+
+
+def runs_of(factors, options, response, repeats=1, noise=0.0):
+    """Table of runs whose response is a function of the coded values."""
+    rng, rows = np.random.default_rng(2), []  # one seed in twenty shows a lack of fit by chance
+    for number, point in enumerate(points_of(factors, options)):
+        x = [float(factor.coded(point[factor.key])) for factor in factors]
+        for repeat in range(repeats):
+            y = response(*x) + noise * rng.normal()
+            rows.append({"point": number, "sequence": "a", "replicate": repeat, **point, "ate_rmse_m": y, "ate": y})
+    return pd.DataFrame(rows)
+
+
+@pytest.mark.parametrize("kind", [kind for kind in DESIGNS if kind != "full-factorial"])
+def test_designs_stay_in_their_bounds_and_are_counted(kind):
+    factors, options = factors_of(), DesignOptions(kind, samples=8, generators="a b ab" if "frac" in kind else "")
+    points = points_of(factors, options)
+    assert len(points) == count_of(factors, options)
+    coded = np.array([[float(f.coded(point[f.key])) for f in factors] for point in points])
+    assert np.all(np.abs(coded) <= 1 + 1e-9)
+    assert np.all(np.ptp(coded, axis=0) > 0.5)
+
+
+def test_a_full_factorial_design_has_every_combination_once():
+    factors = factors_of(
+        {"tracker.huber": [0.005, 0.01], "dynamics.method": ["em", "none"], "volume.max_weight": [5, 9]}
+    )
+    points = points_of(factors, DesignOptions())
+    assert len(points) == 8 == len({tuple(point.values()) for point in points})
+
+
+def test_whole_numbers_stay_whole():
+    factors = factors_of({"volume.max_weight": {"range": [10, 99]}, "tracker.huber": {"range": [0.005, 0.01]}})
+    points = points_of(factors, DesignOptions("latin-hypercube", samples=5))
+    assert all(type(point["volume.max_weight"]) is int for point in points)
+
+
+def additive(x, y, z):
+    return 3 * x + y + 0 * z
+
+
+def test_sobol_indices_of_an_additive_function():
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("saltelli", samples=256), additive)
+    found = sobol_indices(factors, table["ate"].to_numpy()).set_index(["term", "order"])["index"]
+    # variances of 3 x, y and 0 z are as 9 : 1 : 0
+    assert found["huber", "first"] == pytest.approx(0.9, abs=0.03)
+    assert found["voxel_size", "total"] == pytest.approx(0.1, abs=0.03)
+    assert found["damping", "total"] == pytest.approx(0, abs=0.01)
+    assert found["huber x voxel_size", "second"] == pytest.approx(0, abs=0.05)
+
+
+def test_an_emulator_gives_the_same_indices_from_a_latin_hypercube():
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("latin-hypercube", samples=40), additive)
+    found, text = emulated_indices(table, factors, "ate")
+    assert "100%" in text
+    found = found.set_index(["term", "order"])["index"]
+    assert found["huber", "first"] == pytest.approx(0.9, abs=0.03)
+
+
+def test_an_emulator_of_noise_gives_no_indices():
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("latin-hypercube", samples=40), lambda x, y, z: 0.0, noise=1.0)
+    found, text = emulated_indices(table, factors, "ate")
+    assert found is None
+    assert "mean nothing" in text
+
+
+def test_morris_ranks_the_factors():
+    factors = factors_of()
+    options = DesignOptions("morris", samples=6)
+    table = runs_of(factors, options, additive)
+    coded = np.column_stack([factor.coded(table[factor.key]) for factor in factors])
+    found = morris_indices(factors, coded, table["ate"].to_numpy())
+    assert found["factor"].tolist() == ["huber", "voxel_size", "damping"]
+    assert found["sigma"].max() == pytest.approx(0, abs=1e-9)
+
+
+def bowl(x, y, z):
+    return 0.05 + 0.02 * (x - 0.3) ** 2 + 0.01 * (y + 0.5) ** 2 + 0.01 * z**2
+
+
+def test_a_quadratic_response_is_found_believed_and_confirmed():
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("central-composite"), bowl, repeats=2, noise=2e-4)
+    found = predict_optimum(table, factors, "ate")
+    assert found.judgement.reasons == ()
+    np.testing.assert_allclose(found.best.coded, [0.3, -0.5, 0], atol=0.1)
+    assert lack_of_fit(found.surface).p > 0.05
+    truth = bowl(*found.best.coded)
+    held = confirm(found.surface, found.best, [truth], [bowl(0, 0, 0)])
+    assert held.held
+    assert "The model held" in str(held)
+
+
+def test_a_response_that_is_not_quadratic_lacks_fit():
+    factors = factors_of()
+    step = lambda x, y, z: float(x > 0.5) + float(y > 0.5) * float(z < -0.5)  # noqa: E731
+    table = runs_of(factors, DesignOptions("central-composite"), step, repeats=2, noise=1e-3)
+    surface = fit_surface(table, factors, "ate")
+    assert lack_of_fit(surface).p < 0.01
+
+
+def test_two_levels_give_no_quadratic_model():
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("fractional-factorial", generators="a b ab"), bowl)
+    assert "three or more levels" in fit_surface(table, factors, "ate")
+
+
+def test_pareto_front():
+    points = pd.DataFrame({"ate": [3, 1, 2, 3, 2.5], "ms": [1, 3, 2, 3, 2.5]})
+    front = pareto_front(points, ["ate", "ms"])
+    assert front["ate"].tolist() == [1, 2, 3]
+    assert front["ms"].tolist() == [3, 2, 1]
