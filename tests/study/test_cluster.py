@@ -10,10 +10,10 @@ import pytest
 
 ray = pytest.importorskip("ray")
 
-from dudmap.errors import ConfigError  # noqa: E402
-from dudmap.study.conduct import conduct  # noqa: E402
-from dudmap.study.store import StudyFolder  # noqa: E402
-from study.crash_study import sleep_row, tiny_plan  # noqa: E402
+from dudmap.errors import ConfigError
+from dudmap.study.conduct import conduct
+from dudmap.study.store import StudyFolder
+from study.crash_study import sleep_row, tiny_plan
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
 
