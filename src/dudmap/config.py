@@ -407,7 +407,6 @@ PRESETS: dict[str, dict[str, Any]] = {
             "truncation_behind_voxels": 10.0,
             "truncation_noise": 0.0,
             "max_readings": 255,
-            "antialias": False,
             "weighting": "constant",
             "take_turns": False,
         },
