@@ -1,6 +1,7 @@
 """Recordings of pairs of image files: what all folder formats share."""
 
 import re
+from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from pathlib import Path
 
@@ -20,7 +21,7 @@ FRAME_RATE = 30.0
 """Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
 
 
-class ImageFolder:
+class ImageFolder(ABC):
     """Base class of recordings whose frames are a colour file and a depth file each.
 
     A format says how its files pair (``_find_pairs``), what its cameras are (``_find_intrinsics``), and optionally
@@ -85,13 +86,13 @@ class ImageFolder:
         """True dynamic mask (H, W) of a frame; this layout has none."""
         return None
 
+    @abstractmethod
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of all frames, by increasing time of the depth."""
-        raise NotImplementedError
 
+    @abstractmethod
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         """Intrinsics as the recording or its data set gives them."""
-        raise NotImplementedError
 
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""

@@ -19,9 +19,8 @@ INTERVAL = 10
 SAMPLES = 30
 """Number of comparisons from which the variance components are estimated, the latest ones."""
 DEPTH_ERROR, COLOR_SHIFT = 0.005, 0.5
-"""Prior standard deviations of the smooth errors: relative error of the depth (calibrated consumer sensors: Khoshelham
-and Elberink 2012; Teichman, Miller and Thrun 2013), and displacement of the colours, pixels of an image 640 wide, which
-is what a calibration from a checkerboard leaves."""
+"""Assumed standard deviations of the smooth errors before anything is seen: relative error of the depth, and
+displacement of the colours in pixels of an image 640 wide, as a careful calibration leaves them."""
 PRIOR_SAMPLES = 1.0
 """Weight of the prior, comparisons."""
 ITERATIONS = 5
