@@ -150,9 +150,11 @@ def test_parameters_come_from_file_preset_and_single_assignments(slam, recording
     assert "are mutually exclusive" in sentence_of("run", recording, "--config", "my.toml", "--preset", "thesis")
 
 
-def test_a_calibration_that_is_given_is_not_estimated(slam, recording):
+def test_what_was_calibrated_beforehand_is_not_estimated_again(slam, recording):
+    call("run", recording, "--out", "live", "--live")
+    assert Config.load("live/config.toml").sensor.self_calibration
     call("run", recording, "--out", "a")
-    assert Config.load("a/config.toml").sensor.self_calibration
+    assert not Config.load("a/config.toml").sensor.self_calibration
     call("run", recording, "--out", "b", "--calibration", "given")
     assert not Config.load("b/config.toml").sensor.self_calibration
     call("run", recording, "--out", "c", "--calibration", "a/calibration.toml")

@@ -92,8 +92,7 @@ def measure_sequence(
 
     if ahead is None:
         ahead = 0 if isinstance(sequence, SyntheticSequence) else AHEAD  # rendering would compete for the cores
-    if not calibrate:
-        config = config.override(["sensor.self_calibration=false"])
+    config = config.override(["sensor.self_calibration=false"])  # estimated beforehand or not at all
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = out or Path(temporary)
         report = run(

@@ -126,7 +126,7 @@ def run(
         given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
     else:
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
-    if calibration != "auto":
+    if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
     with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
         done = run_sequence(
