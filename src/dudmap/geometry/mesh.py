@@ -1,6 +1,7 @@
 """Triangle mesh with colours and normals."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -126,6 +127,21 @@ class Mesh:
         if len(colors) != len(vertices):
             colors = np.full((len(vertices), 3), 128, dtype=np.uint8)
         return cls(vertices, faces, colors, normals)
+
+
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """Meshes as one, which shares no vertices between them."""
+    if not parts:
+        empty = np.zeros((0, 3), dtype=np.float32)
+        return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)
+    counts = np.array([len(part.vertices) for part in parts])
+    first = (np.cumsum(counts) - counts).astype(np.int32)
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, first, strict=True)]),
+        np.concatenate([part.colors for part in parts]),
+        np.concatenate([part.normals for part in parts]),
+    )
 
 
 def _ply_header(vertices: int, faces: int) -> str:

@@ -1,5 +1,7 @@
 """Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,6 +12,26 @@ __all__ = ["BLOCK", "VoxelBlocks"]
 
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockRecords:
+    """Blocks taken out of a map.
+
+    Attributes:
+        coords: (n, 3) int16 block coordinates.
+        free_count: (n,) uint8 observations of emptiness.
+        owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
+        geometry, colors: (m, 512) int32 packed voxels.
+        fused: (m,) uint8 frames that were fused into a block, 255 or more.
+    """
+
+    coords: NDArray[np.int16]
+    free_count: NDArray[np.uint8]
+    owners: NDArray[np.int32]
+    geometry: NDArray[np.int32]
+    colors: NDArray[np.int32]
+    fused: NDArray[np.uint8]
 
 
 class VoxelBlocks:
@@ -130,6 +152,50 @@ class VoxelBlocks:
         self.geometry[slots] = self.colors[slots] = 0
         self._released = np.concatenate([self._released, slots[::-1]])
         return entries
+
+    def entries_in(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Entries (n,) of the blocks from ``low`` up to, not including, ``high`` (3,), ascending."""
+        coords = self.coords[: self.num_entries]
+        return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
+
+    def records(self, entries: NDArray[np.integer]) -> BlockRecords:
+        """Copies of the blocks of entries (n,)."""
+        slots = self.slot_of[entries]
+        owners = np.flatnonzero(slots >= 0).astype(np.int32)
+        slots = slots[owners]
+        return BlockRecords(
+            self.coords[entries], self.free_count[entries], owners,
+            self.geometry[slots], self.colors[slots], self.fused[slots],
+        )  # fmt: skip
+
+    def remove(self, entries: NDArray[np.integer]) -> None:
+        """Forget entries (n,) and their voxels. The other entries are numbered anew; slots keep their numbers."""
+        n = self.num_entries
+        slots = self.slot_of[entries]
+        slots = np.sort(slots[slots >= 0])
+        kept = np.ones(n, dtype=bool)
+        kept[entries] = False
+        self.entry_of[slots] = -1
+        self.geometry[slots] = self.colors[slots] = 0
+        self._released = np.concatenate([self._released, slots[::-1]])
+        number = (np.cumsum(kept) - 1).astype(np.int32)
+        owned = self.active_slots
+        self.entry_of[owned] = number[self.entry_of[owned]]
+        m = int(np.count_nonzero(kept))
+        for array, unused in ((self.coords, 0), (self.slot_of, -1), (self.free_count, 0)):
+            array[:m] = array[:n][kept]
+            array[m:n] = unused
+        self.num_entries = m
+        self.table.fill(hashing.EMPTY)
+        hashing.rebuild(self.table, self.coords, m)
+
+    def insert(self, records: BlockRecords, frame_number: int) -> None:
+        """Add blocks, none of which is known."""
+        entries = self.entries_at(records.coords, len(records.coords))
+        self.free_count[entries] = records.free_count
+        slots = self.allocate(entries[records.owners], frame_number)
+        self.geometry[slots], self.colors[slots] = records.geometry, records.colors
+        self.fused[slots] = records.fused
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
