@@ -42,10 +42,6 @@ class BlockWindow:
         stays = self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN
         return None if stays else origin
 
-    def forget(self) -> None:
-        """Have the next ``moved`` place the window anew, since entries were numbered anew."""
-        self.origin = None
-
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""
         self.origin = origin

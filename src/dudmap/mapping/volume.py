@@ -205,7 +205,7 @@ class TsdfVolume:
         assert other.config == self.config
         number = self._frame_number + 1
         for first in self._visited_regions():
-            other._bring(first)
+            other._bring(first, first + REGION)
             slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
             slots = slots[slots >= 0]
             there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
@@ -224,11 +224,8 @@ class TsdfVolume:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
         origin = self.window.moved(middle)
-        if origin is None:
-            return
-        if self.pager is not None:
-            self.pager.focus(self.blocks, origin, origin + self.window.shape, self._frame_number)
-        self.window.fill(origin, self.blocks)
+        if origin is not None:
+            self._place_window(origin)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -324,14 +321,19 @@ class TsdfVolume:
         """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
         for region in regions_of(self.blocks, self.pager):
             first = np.array(region, dtype=np.int32) * REGION
-            self._bring(first)
+            self._bring(first, first + REGION)
             yield first
+        if self.pager is not None and self.window.origin is not None:
+            self._place_window(self.window.origin)
 
-    def _bring(self, first: NDArray[np.int32]) -> None:
-        """Have a region and all that touch it in memory."""
+    def _place_window(self, origin: NDArray[np.int64]) -> None:
+        self._bring(origin, origin + self.window.shape)
+        self.window.fill(origin, self.blocks)
+
+    def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
+        """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
         if self.pager is not None:
-            self.window.forget()
-            self.pager.focus(self.blocks, first, first + REGION, self._frame_number)
+            self.pager.focus(self.blocks, low, high, self._frame_number)
 
     def _mesh_parameters(self, min_weight: int) -> MeshParameters:
         return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
