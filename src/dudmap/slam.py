@@ -20,6 +20,7 @@ from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
 from dudmap.objects.object_map import RigidObject
@@ -64,6 +65,8 @@ class Slam:
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
+        max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
+            disk. It changes no result. None keeps all in memory.
     """
 
     def __init__(
@@ -76,7 +79,9 @@ class Slam:
         live: bool = False,
         saved_map: SavedMap | None = None,
         localize: bool = False,
+        max_blocks: int | MemoryLimit | None = None,
     ) -> None:
+        self.max_blocks = max_blocks
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
@@ -111,7 +116,7 @@ class Slam:
         self.objects = MovingObjects(config)
         self.localize = localize
         if saved_map is not None:
-            self.atlas.go_on_in(saved_map, self.camera)
+            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.restore(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
@@ -408,4 +413,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
+        config = self.config
+        return TsdfVolume(
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, max_blocks=self.max_blocks
+        )

@@ -93,6 +93,12 @@ def run(
     localize: Annotated[
         bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            "--max-memory", help="Largest memory of the process, such as 1GB; the rest of the map waits on disk."
+        ),
+    ] = None,
     report: ReportOption = True,
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
@@ -132,9 +138,24 @@ def run(
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
+            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
+            max_memory=None if max_memory is None else read_bytes(max_memory), observers=watching,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
+
+
+def read_bytes(text: str) -> int:
+    """Number of bytes of a text such as 1GB or 800MB.
+
+    Raises:
+        ConfigError: It is no amount of memory.
+    """
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    try:
+        return int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
 
 
 def _print_notice(text: str) -> None:

@@ -62,29 +62,20 @@ class Mesh:
 
     def _save_ply(self, path: Path) -> None:
         """Binary PLY with float32 normals; trimesh's exporter is three times slower on a million faces."""
-        vertex = np.empty(len(self.vertices), _PLY_VERTEX)
-        vertex["xyz"], vertex["normal"], vertex["rgb"] = self.vertices, self.normals, self.colors
-        face = np.empty(len(self.faces), _PLY_FACE)
-        face["count"], face["indices"] = 3, self.faces
+        vertex, face = ply_arrays(self)
         with path.open("wb") as file:
-            file.write(_ply_header(len(vertex), len(face)).encode("ascii"))
+            file.write(ply_header(len(vertex), len(face)).encode("ascii"))
             file.write(vertex.tobytes())
             file.write(face.tobytes())
 
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":
         """Read a file that ``save`` wrote, None for any other: trimesh takes 2 s for a million triangles."""
-        with path.open("rb") as file:
-            head = file.read(1024)
-            counts = re.findall(rb"element (?:vertex|face) (\d+)", head)
-            header = _ply_header(*(int(count) for count in [*counts, 0][:2])).encode("ascii") if counts else b""
-            if not header or not head.startswith(header):
-                return None
-            file.seek(len(header))
-            vertex = np.fromfile(file, _PLY_VERTEX, int(counts[0]))
-            face = np.fromfile(file, _PLY_FACE, int(counts[1]) if len(counts) > 1 else 0)
-        whole = len(vertex) == int(counts[0]) and (len(counts) == 1 or len(face) == int(counts[1]))
-        if not whole or np.any(face["indices"] < 0) or np.any(face["indices"] >= len(vertex)):
+        layout = ply_layout(path)
+        if layout is None:
+            return None
+        vertex, face = layout
+        if np.any(face["indices"] < 0) or np.any(face["indices"] >= len(vertex)):
             raise MapError(f"the mesh {path} is cut off or damaged")
         arrays = vertex["xyz"], face["indices"], vertex["rgb"], vertex["normal"]
         return cls(*(np.ascontiguousarray(array) for array in arrays))
@@ -144,7 +135,40 @@ def joined(parts: Sequence[Mesh]) -> Mesh:
     )
 
 
-def _ply_header(vertices: int, faces: int) -> str:
+def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
+    """Vertices and faces as they stand in a PLY file, in which the vertices of this mesh begin at number ``first``."""
+    vertex = np.empty(len(mesh.vertices), _PLY_VERTEX)
+    vertex["xyz"], vertex["normal"], vertex["rgb"] = mesh.vertices, mesh.normals, mesh.colors
+    face = np.empty(len(mesh.faces), _PLY_FACE)
+    face["count"], face["indices"] = 3, mesh.faces + np.int32(first)
+    return vertex, face
+
+
+def ply_layout(path: Path) -> tuple[NDArray, NDArray] | None:
+    """Vertices and faces of a PLY file that ``Mesh.save`` wrote, mapped into memory; None for any other file.
+
+    Raises:
+        MapError: The file is cut off.
+        OSError: It cannot be read.
+    """
+    with path.open("rb") as file:
+        head = file.read(1024)
+    counts = [int(count) for count in re.findall(rb"element (?:vertex|face) (\d+)", head)[:2]]
+    vertices, faces = (*counts, 0, 0)[:2]
+    header = ply_header(vertices, faces).encode("ascii")
+    if not counts or not head.startswith(header):
+        return None
+    end = len(header) + vertices * _PLY_VERTEX.itemsize
+    if path.stat().st_size < end + faces * _PLY_FACE.itemsize:
+        raise MapError(f"the mesh {path} is cut off or damaged")
+
+    def mapped(kind: np.dtype, offset: int, count: int) -> NDArray:
+        return np.memmap(path, kind, "r", offset, count) if count else np.empty(0, kind)
+
+    return mapped(_PLY_VERTEX, len(header), vertices), mapped(_PLY_FACE, end, faces)
+
+
+def ply_header(vertices: int, faces: int) -> str:
     """Header of a binary PLY file as ``Mesh.save`` writes it; a point cloud has no element ``face``."""
     lines = ["ply", "format binary_little_endian 1.0", "comment dudmap", f"element vertex {vertices}"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]

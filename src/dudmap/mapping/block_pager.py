@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import MapError
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.voxel_blocks import BlockRecords, VoxelBlocks
 
@@ -44,13 +45,14 @@ class BlockPager:
 
     Args:
         max_blocks: Largest number of blocks with voxels in memory. Blocks within the view stay, even if they are more.
+            Either a number, or a limit that is asked each time.
 
     Attributes:
         failure: Why the store could not be written the last time it was tried; empty if it could. The regions are then
             back in memory, and nothing is lost.
     """
 
-    def __init__(self, max_blocks: int) -> None:
+    def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
         self.failure = ""
         self._store: RegionStore | None = None
@@ -68,6 +70,12 @@ class BlockPager:
         self._unchanged_since: dict[Region, int] = {}
         self._middle = np.zeros(3)
         self._retry_in = 0
+
+    def new_blocks(self) -> VoxelBlocks:
+        """Empty blocks, with room for as many as will be in memory."""
+        if isinstance(self.max_blocks, int):
+            return VoxelBlocks()
+        return VoxelBlocks(self.max_blocks.capacity(VoxelBlocks()))
 
     @property
     def num_blocks(self) -> int:
@@ -153,26 +161,42 @@ class BlockPager:
     ) -> None:
         """Move the regions farthest from the box to the store while there are too many blocks."""
         self._retry_in = max(self._retry_in - 1, 0)
-        if blocks.num_voxel_blocks <= self.max_blocks or self._retry_in:
+        allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(blocks)
+        if blocks.num_voxel_blocks <= allowed or self._retry_in:
             return
-        keys, region_of = np.unique(blocks.coords[: blocks.num_entries] >> REGION_BITS, axis=0, return_inverse=True)
-        region_of = region_of.reshape(-1)
+        keys, region_of = _regions_of_entries(blocks)
         owned = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
         outside = np.maximum(np.maximum(first - keys, keys - last), 0)
         distance = np.linalg.norm(outside, axis=1)
         leaving = np.zeros(len(keys), dtype=bool)
-        surplus = blocks.num_voxel_blocks - ROOM * self.max_blocks
+        surplus = blocks.num_voxel_blocks - ROOM * allowed
         for n in np.lexsort((np.arange(len(keys)), -distance)):
             if surplus <= 0 or distance[n] == 0:
                 break
             leaving[n] = True
             surplus -= owned[n]
+        self._send_all_away(blocks, keys, region_of, leaving, frame_number)
+        blocks.remove(np.flatnonzero(leaving[region_of]))
+
+    def page_out(self, blocks: VoxelBlocks, frame_number: int) -> VoxelBlocks:
+        """Move all regions to the store; returns the empty blocks that take the place of ``blocks``."""
+        keys, region_of = _regions_of_entries(blocks)
+        self._send_all_away(blocks, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
+        return self.new_blocks()
+
+    def _send_all_away(
+        self,
+        blocks: VoxelBlocks,
+        keys: NDArray[np.integer],
+        region_of: NDArray[np.integer],
+        leaving: NDArray[np.bool_],
+        frame_number: int,
+    ) -> None:
+        """Send the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
         for n in np.flatnonzero(leaving):
-            entries = order[ends[n - 1] if n else 0 : ends[n]]
-            self._send_away(blocks, _key(keys[n]), entries, frame_number)
-        blocks.remove(np.flatnonzero(leaving[region_of]))
+            self._send_away(blocks, _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]], frame_number)
 
     def _send_away(self, blocks: VoxelBlocks, region: Region, entries: NDArray[np.integer], frame_number: int) -> None:
         """Have a region written, unless the store holds it as it is; the caller removes its entries (n,)."""
@@ -210,9 +234,17 @@ class BlockPager:
 
 def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
     """All regions of a map, in Morton order, so that neighbours follow each other."""
-    near = np.unique(blocks.coords[: blocks.num_entries] >> REGION_BITS, axis=0)
+    near, _ = _regions_of_entries(blocks)
     stored = () if pager is None else pager.stored_regions
     return sorted({_key(region) for region in near} | set(stored), key=morton)
+
+
+def _regions_of_entries(blocks: VoxelBlocks) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
+    x, y, z = (blocks.coords[: blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
+    packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
+    parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]
+    return np.stack(parts, axis=1) - (1 << 15), region_of.reshape(-1)
 
 
 def morton(region: Region) -> int:

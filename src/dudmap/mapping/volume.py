@@ -28,6 +28,7 @@ from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
 from dudmap.mapping.block_window import BlockWindow
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.map_file import read_map, write_map
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
 
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
@@ -50,10 +51,10 @@ class TsdfVolume:
         config: Voxel size, truncation, weights.
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
-        extent: Depth that the window covers, metres; None covers ``depth_max``.
         backend: Compute device, of this map alone; None takes the CPU.
-        max_blocks: Largest number of blocks with voxels in memory; those farthest from the view wait on disk. None
-            keeps all in memory.
+        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the blocks
+            farthest from the view wait on disk. None keeps all in memory.
+        extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
         blocks: The blocks of the map that are in memory.
@@ -74,9 +75,9 @@ class TsdfVolume:
         config: VolumeConfig | None = None,
         sensor: SensorConfig | None = None,
         depth_max: float = 6.0,
-        extent: float | None = None,
         backend: Backend | None = None,
-        max_blocks: int | None = None,
+        max_blocks: int | MemoryLimit | None = None,
+        extent: float | None = None,
     ) -> None:
         self.camera = camera
         self.pager = None if max_blocks is None else BlockPager(max_blocks)
@@ -105,7 +106,7 @@ class TsdfVolume:
     def clear(self) -> None:
         """Remove everything that was integrated."""
         self.window = BlockWindow(self.block_size, self._window_cells)
-        self.blocks = VoxelBlocks()
+        self.blocks = VoxelBlocks() if self.pager is None else self.pager.new_blocks()
         if self.pager is not None:
             self.pager.clear()
         self._frame_number = 0
@@ -191,10 +192,10 @@ class TsdfVolume:
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
-    def for_camera(self, camera: Camera) -> "TsdfVolume":
+    def for_camera(self, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> "TsdfVolume":
         """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
-        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
-        other.blocks, other.pager, other._frame_number = self.blocks, self.pager, self._frame_number
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, self.backend, max_blocks)
+        other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
         return other
 
     def take_colors(self, other: "TsdfVolume") -> None:
@@ -219,6 +220,12 @@ class TsdfVolume:
             if self.pager is not None:
                 self.pager.changed(first)
         self._frame_number = number
+
+    def page_out(self) -> None:
+        """Have all blocks wait on disk, where the map may do so, until they are needed again."""
+        if self.pager is not None:
+            self.blocks = self.pager.page_out(self.blocks, self._frame_number)
+            self.window = BlockWindow(self.block_size, self._window_cells)
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""

@@ -40,6 +40,9 @@ class VoxelBlocks:
     An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
     than their content and grow by factors.
 
+    Args:
+        slots: Number of slots to provide at the start. Those that are not used take no memory.
+
     Attributes:
         table: Hash table of entry numbers (``kernels/hashing.py``).
         coords: (entries, 3) int16 block coordinates.
@@ -54,18 +57,18 @@ class VoxelBlocks:
         num_slots: Number of slots in use or released.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, slots: int = 1 << 10) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int16)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
-        self.geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self.colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
-        self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
-        self.written = np.zeros(1 << 10, dtype=np.int32)
-        self.fused = np.zeros(1 << 10, dtype=np.uint8)
+        self.geometry = np.zeros((slots, BLOCK**3), dtype=np.int32)
+        self.colors = np.zeros((slots, BLOCK**3), dtype=np.int32)
+        self.entry_of = np.full(slots, -1, dtype=np.int32)
+        self.slot_coords = np.zeros((slots, 3), dtype=np.int16)
+        self.written = np.zeros(slots, dtype=np.int32)
+        self.fused = np.zeros(slots, dtype=np.uint8)
         self.num_slots = 0
         self._released = np.empty(0, dtype=np.int32)
 
@@ -85,12 +88,13 @@ class VoxelBlocks:
 
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
         """
+        return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
+
+    @property
+    def slot_bytes(self) -> int:
+        """Bytes of a slot."""
         slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
-        return (
-            self.num_slots * sum(_row_bytes(array) for array in slots)
-            + self.num_entries * self._index_bytes
-            + self.table.nbytes
-        )
+        return sum(_row_bytes(array) for array in slots)
 
     @property
     def entry_bytes(self) -> float:

@@ -40,6 +40,7 @@ def run(
     calibration: "Calibration | None" = None,
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
+    max_memory: int | None = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
@@ -76,6 +77,8 @@ def run(
         calibration: Of the colour camera; None takes that of the recording.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
+        max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
+            wait on disk. None keeps the whole map in memory. It changes no result.
         observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
 
@@ -86,6 +89,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.calibration.depth_model import DepthModel
+    from dudmap.mapping.memory_limit import MemoryLimit
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -100,6 +104,8 @@ def run(
         )
     if saved_map is None and localize:
         raise ConfigError("there is nothing to localize in; name the run folder of a saved map (--map)")
+    if max_memory is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a memory limit, but two passes need two maps; expected 1 pass")
     if saved_map is not None and passes == 2:
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     given_masks = None if masks is None else _open_masks(masks, sequence)
@@ -107,7 +113,7 @@ def run(
     calibration = calibration or sequence.calibration
     slam = Slam(
         sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
-        localize=localize,
+        localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
     )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
+from dudmap.geometry.mesh_pieces import save_pieces
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
@@ -115,9 +116,13 @@ def write_run_folder(
     metrics["calibration"] = calibration.tree()
 
     def save_mesh() -> None:
-        mesh = volume.extract_mesh()
-        metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
-        mesh.save(out / "mesh.ply")
+        if volume.pager is not None:  # the mesh may not fit into the memory either
+            vertices, triangles = save_pieces(volume.extract_pieces(), out / "mesh.ply")
+        else:
+            mesh = volume.extract_mesh()
+            vertices, triangles = len(mesh.vertices), len(mesh.faces)
+            mesh.save(out / "mesh.ply")
+        metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
 
     def save_metrics() -> None:
         if sequence.ground_truth is not None:

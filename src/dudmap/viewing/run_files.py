@@ -11,13 +11,16 @@ import numpy as np
 
 from dudmap import __version__
 from dudmap.errors import DudmapError
-from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.mesh import Mesh, ply_layout
+from dudmap.geometry.mesh_pieces import load_simplified
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.viewing.snapshot import KINDS, MoverBox
 from dudmap.viewing.thumbnails import FOLDER
 
 NOT_STAGES = ("timestamp", "state", "fused", "dynamic_share", "reading", "total", "dropped", "latency")
 """Columns of timings.csv that are not the time of a stage."""
+MAX_TRIANGLES = 5_000_000
+"""Triangles of a mesh that a page or a window can hold; a larger one is simplified."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,7 +32,7 @@ class RunFiles:
         metrics: Content of metrics.json.
         config: Text of config.toml, empty if there is none.
         trajectory: Poses of all tracked frames; without any if no frame was tracked.
-        mesh: The mesh, None if no frame was fused.
+        mesh: The mesh, simplified to ``MAX_TRIANGLES``; None if no frame was fused.
         frames: Rows of timings.csv: timestamp, state, times; one per processed frame.
         movers: Moving objects by the timestamp of the frame, as text with six decimals.
         thumbnails: JPEG files by kind of image, by the timestamp of the frame as text.
@@ -62,7 +65,7 @@ class RunFiles:
             metrics=metrics,
             config=config.read_text(encoding="utf-8") if config.is_file() else "",
             trajectory=Trajectory.load(path) if tracked else Trajectory.from_poses([]),
-            mesh=Mesh.load(mesh) if mesh.is_file() and metrics.get("mesh_triangles") else None,
+            mesh=_mesh(mesh) if mesh.is_file() and metrics.get("mesh_triangles") else None,
             frames=_frames(folder / "timings.csv"),
             movers=_movers(folder / "movers.jsonl"),
             thumbnails=_thumbnails(folder / FOLDER),
@@ -76,6 +79,13 @@ class RunFiles:
     def column(self, name: str) -> np.ndarray:
         """Column of timings.csv, one number per processed frame."""
         return np.array([float(row[name] or 0) for row in self.frames])
+
+
+def _mesh(path: Path) -> Mesh:
+    """The mesh of a run; a very large one is simplified as it is read, so that it need not fit into the memory."""
+    layout = ply_layout(path)
+    large = layout is not None and len(layout[1]) > MAX_TRIANGLES
+    return load_simplified(path, MAX_TRIANGLES) if large else Mesh.load(path)
 
 
 def _metrics(folder: Path) -> dict[str, Any]:
