@@ -14,7 +14,7 @@ from dudmap.synthetic.recording import DEFAULT_CAMERA
 from dudmap.synthetic.ring_corridor import ring_corridor
 from triangles import triangles
 
-FRAMES = 130
+FRAMES = 100
 
 
 @pytest.fixture(scope="module")
