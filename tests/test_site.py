@@ -83,3 +83,14 @@ def test_pictures_are_small():
     sizes = {path.name: path.stat().st_size for path in (DOCS / "images").iterdir()}
     assert sizes["people.webp"] < 1.5e6
     assert sum(size for name, size in sizes.items() if name.startswith("concept-")) < 1e6
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("script", "target", "written"), [
+    ("pictures.py", ".", ["concept-labels.png", "concept-pose-graph.png", "concept-tsdf.png"]),
+    ("moving_picture.py", "people.webp", ["people.webp"]),
+])  # fmt: skip
+def test_the_pictures_can_be_drawn_again(script, target, written, tmp_path):
+    done = subprocess.run([sys.executable, DOCS / script, target], cwd=tmp_path, capture_output=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == written
