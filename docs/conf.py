@@ -10,11 +10,11 @@ sys.path[:0] = [str(ROOT / "src"), str(ROOT / "docs")]
 
 from command_reference import command_pages
 
-from dudmap import __version__
+import dudmap
 
 project = "dudmap"
 author = "the dudmap authors"
-version = release = __version__
+version = release = dudmap.__version__
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.viewcode", "sphinx_copybutton"]
 exclude_patterns = ["README.md", "_build"]
 
@@ -47,8 +47,18 @@ def _read(app: Any, name: str, source: list[str]) -> None:
     source[0] = LINK.sub(lambda found: f"{found[1]} (`{found[2].removeprefix('../')}`)", source[0])
 
 
+def _public(app: Any, env: Any, node: Any, text: Any) -> Any:
+    """Link a public name that a signature gives with its module, such as dudmap.slam.Slam."""
+    name = node.get("reftarget", "").rpartition(".")[2]
+    if node.get("refdomain") != "py" or name not in dudmap.__all__:
+        return None
+    page = node.get("refdoc", "api")
+    return env.get_domain("py").resolve_xref(env, page, app.builder, "obj", f"dudmap.{name}", node, text)
+
+
 def setup(app: Any) -> dict[str, bool]:
     """Connect this file's hooks."""
     app.connect("source-read", _read)
+    app.connect("missing-reference", _public)
     app.connect("env-get-outdated", lambda *_: ["commands", "api"])  # they change with the code, not with their pages
     return {"parallel_read_safe": True, "parallel_write_safe": True}
