@@ -54,6 +54,14 @@ class RunRecord:
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
 
+    def elapsed(self) -> tuple[float, float]:
+        """Seconds, and seconds of processor time, since the run began."""
+        return time.perf_counter() - self._wall_start, time.process_time() - self._cpu_start
+
+    def continue_from(self, wall_s: float, cpu_s: float) -> None:
+        """Count the time on from that of a process that ended."""
+        self._wall_start, self._cpu_start = time.perf_counter() - wall_s, time.process_time() - cpu_s
+
     def add(
         self,
         result: "FrameResult",

@@ -1,8 +1,8 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
 Tables: ``blocks`` (voxels by map and Morton code), ``frames`` (stored frames), ``chunks`` (parts of arrays by their
-content), ``state`` (the tree), ``meta`` (what the run is). The write-ahead log makes a checkpoint whole or absent after a
-crash, and lets others read while it is written.
+content), ``state`` (the tree), ``meta`` (what the run is). The write-ahead log makes a checkpoint whole or absent after
+a crash, and lets others read while it is written.
 """
 
 import hashlib
@@ -146,7 +146,7 @@ class StateDatabase:
         known = self._constants.get(id(array))
         if constant and known is not None and known[0] is array:
             return about | {"chunks": known[1]}, {}
-        data = memoryview(np.ascontiguousarray(array.T if transposed else array).reshape(-1).view(np.uint8))
+        data = np.ascontiguousarray(array.T if transposed else array).reshape(-1).view(np.uint8).data
         pieces = [data[start : start + CHUNK] for start in range(0, len(data), CHUNK)]
         keys = [hashlib.blake2b(piece, digest_size=16).hexdigest() for piece in pieces]
         if constant:
@@ -223,7 +223,9 @@ class StateReader:
         rows = list(self._rows(select, start | first, start | last))
         for key, _, crc, content in rows:
             if len(content) != 4 * VOXELS or zlib.crc32(content) != crc:
-                raise StateError(f"the state of the run in {self.path} is damaged: block {key} is not as it was written")
+                raise StateError(
+                    f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
+                )
         voxels = np.empty((len(rows), VOXELS), np.int32)
         for n in range(0, len(rows), ROWS):
             part = b"".join(row[3] for row in rows[n : n + ROWS])
@@ -240,7 +242,8 @@ class StateReader:
         rows = list(self._rows(select, store, number))
         if not rows:
             raise StateError(f"the state of the run in {self.path} is damaged: stored frame {number} is missing")
-        return rows[0]
+        depth, color, mask = rows[0]
+        return depth, color, mask
 
     def num_frames(self, store: int) -> int:
         """Number of stored frames of a store."""

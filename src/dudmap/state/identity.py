@@ -13,6 +13,7 @@ from dudmap.pipeline.environment import versions
 from dudmap.state.wiring import PACKAGES
 
 if TYPE_CHECKING:
+    from dudmap.frames.frame import Frame
     from dudmap.sequences import Sequence
 
 
@@ -42,11 +43,17 @@ def recording_fingerprint(sequence: "Sequence") -> str:
 
 
 def frame_fingerprint(sequence: "Sequence", index: int) -> str:
-    """Checksum of the images of a frame, or of the sentence on why it cannot be read."""
+    """Checksum of a frame of a recording; see ``images_fingerprint``."""
     try:
-        frame = sequence[index]
+        return images_fingerprint(sequence[index])
     except FrameError as error:
-        return hashlib.sha256(str(error).encode()).hexdigest()
+        return images_fingerprint(error)
+
+
+def images_fingerprint(frame: "Frame | Exception") -> str:
+    """Checksum of the images of a frame, or of the sentence on why it cannot be read."""
+    if isinstance(frame, Exception):
+        return hashlib.sha256(str(frame).encode()).hexdigest()
     digest = hashlib.sha256(repr((frame.timestamp, frame.color_timestamp)).encode())
     for image in (frame.depth, frame.color):
         digest.update(np.ascontiguousarray(image).tobytes())

@@ -281,7 +281,7 @@ class TreeReader:
         columns = [self._items(column) for column in node["values"]]
         out = []
         for values in zip(*columns, strict=True):
-            one = cls.__new__(cls)
+            one = object.__new__(cls)
             for name, value in zip(node["names"], values, strict=True):
                 object.__setattr__(one, name, value)
             out.append(one)
@@ -290,7 +290,7 @@ class TreeReader:
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
         cls = _class(node["object"])
         usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
-        value = current if usable else cls.__new__(cls)
+        value = current if usable else object.__new__(cls)
         self._made[node["id"]] = value
         self._taken.add(id(value))
         rebuilt = wiring.REBUILT.get(cls.__name__, ())
