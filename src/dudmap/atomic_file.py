@@ -6,7 +6,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-__all__ = ["atomic_file", "atomic_path", "bring_to_disk", "write_bytes", "write_text"]
+__all__ = ["atomic_file", "atomic_path", "bring_to_disk", "put_in_place", "write_bytes", "write_text"]
 
 
 @contextmanager
@@ -38,13 +38,22 @@ def atomic_path(path: str | Path, *, sync: bool = True) -> Iterator[Path]:
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
         yield temporary
-        if sync:
-            bring_to_disk(temporary)
-        temporary.replace(path)
-        if sync and os.name == "posix":  # a folder is no file elsewhere
-            bring_to_disk(path.parent)
+        put_in_place(temporary, path, sync=sync)
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
+    """Give a complete file on the same disk its name, as ``atomic_file`` does.
+
+    Raises:
+        OSError: It cannot be brought to the disk or renamed.
+    """
+    if sync:
+        bring_to_disk(temporary)
+    temporary.replace(path)
+    if sync and os.name == "posix":  # a folder is no file elsewhere
+        bring_to_disk(path.parent)
 
 
 def write_bytes(path: str | Path, content: bytes, *, sync: bool = True) -> None:

@@ -1,20 +1,15 @@
 """A system that was stored and read again is the same, attribute by attribute, and goes on with the same results."""
 
-import warnings
-from dataclasses import fields, is_dataclass, replace
-
 import numpy as np
 import pytest
 
 from dudmap import synthetic
 from dudmap.config import Config
-from dudmap.errors import StateError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
-from dudmap.state import wiring
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import differences, restore, take_snapshot
+from dudmap.state.database import StateDatabase
+from dudmap.state.system import differences, take_snapshot
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_path
 from dudmap.errors import MapError
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
@@ -45,10 +46,11 @@ class Mesh:
         if path.suffix.lower() not in FORMATS:
             raise MapError(f"cannot write a mesh as {path.name!r}; the ending must be one of {', '.join(FORMATS)}")
         try:
-            if path.suffix.lower() == ".ply":
-                self._save_ply(path)
-            else:
-                self._as_trimesh().export(path)
+            with atomic_path(path) as temporary:
+                if path.suffix.lower() == ".ply":
+                    self._save_ply(temporary)
+                else:
+                    self._as_trimesh().export(temporary)
         except OSError as error:
             raise MapError(f"cannot write the mesh to {path}: {error}") from error
 

@@ -145,6 +145,8 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
         raise StateError(_why_nothing(out))
     reader = StateReader(out / DATABASE)
     meta = reader.meta()
+    if not meta:
+        raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
     if not {"options", "recording", "pass", "next", "frame"} <= meta.keys():
         raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")

@@ -8,6 +8,7 @@ a crash, and lets others read while it is written.
 import hashlib
 import json
 import sqlite3
+import weakref
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -60,6 +61,7 @@ class StateDatabase:
         self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
         self._chunks: set[str] = set()
         self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
+        weakref.finalize(self, self._connection.close)
         self._execute("PRAGMA journal_mode = WAL")
         self._execute("PRAGMA synchronous = FULL")  # a commit is on the disk when it returns
         if not self._execute("SELECT 1 FROM sqlite_master").fetchone():
@@ -172,6 +174,7 @@ class StateReader:
         try:
             self._connection = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True, timeout=5,
                                                isolation_level=None, check_same_thread=False)  # fmt: skip
+            weakref.finalize(self, self._connection.close)
             self._connection.execute("BEGIN")  # one state for all that is read
             found = [self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in _HEADER]
         except sqlite3.Error as error:

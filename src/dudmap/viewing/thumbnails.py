@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dudmap.atomic_file import write_bytes
 from dudmap.errors import FrameError
 from dudmap.pipeline.observer import RunObserver
 from dudmap.viewing.snapshot import FrameImages, jpeg
@@ -48,7 +49,7 @@ class Thumbnails(RunObserver):
         paths = []
         for kind, image in FrameImages.of(read.frame, result).pictures().items():
             paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
-            paths[-1].write_bytes(jpeg(image))
+            write_bytes(paths[-1], jpeg(image), sync=False)
         self._kept.append(paths)
         if self._count is None:
             self._thin()
