@@ -30,7 +30,13 @@ from dudmap.synthetic.recording import SyntheticSequence
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 CONFIG = Config().override(
-    ["submaps.patience=0.3", "loops.min_age=1.0", "loops.gap=3", "sensor.self_calibration=false"]
+    [
+        "volume.voxel_size=0.02",
+        "submaps.patience=0.3",
+        "loops.min_age=1.0",
+        "loops.gap=3",
+        "sensor.self_calibration=false",
+    ]
 )
 TIMES = "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb"
 
@@ -65,7 +71,7 @@ def lost_and_found():
     return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0))
 
 
-def begin(sequence, out, every=0.15, **options):
+def begin(sequence, out, every=0.3, **options):
     """The run whose processes are killed."""
     return run(sequence, CONFIG, out, save_masks=True, progress=False, storing=Storing({}, every), **options)
 

@@ -46,13 +46,13 @@ def both(recording, tmp_path, passes=1, **options):
     """Results of a whole run, and of one that was interrupted in its last pass and continued."""
     from dudmap.sequences import open_sequence
 
-    settings = Config().override(["sensor.self_calibration=false", "movers.meshes=true"])
+    settings = Config().override(["sensor.self_calibration=false", "movers.meshes=true", "volume.voxel_size=0.02"])
     for name in ("whole", "parts"):
         out = tmp_path / name
         if "saved_map" in options:
             options["saved_map"] = SavedMap.load(tmp_path / "first", settings.volume.voxel_size)
         watching = (Thumbnails(), *([Interrupt(12, passes)] if name == "parts" else []))
-        storing = Storing({"path": str(recording), "camera": None, "topics": None}, 0.02)
+        storing = Storing({"path": str(recording), "camera": None, "topics": None}, 0.1)
         arguments = {"progress": False, "save_masks": True, "passes": passes, "observers": watching, "storing": storing}
         try:
             run(open_sequence(recording), settings, out, **arguments, **options)
@@ -91,7 +91,7 @@ def test_two_passes(recording, tmp_path):
 def test_a_run_that_goes_on_in_a_saved_map(recording, tmp_path, localize):
     from dudmap.sequences import open_sequence
 
-    run(open_sequence(recording), Config(), tmp_path / "first", progress=False)
+    run(open_sequence(recording), Config().override(["volume.voxel_size=0.02"]), tmp_path / "first", progress=False)
     whole, parts = both(recording, tmp_path, saved_map=None, localize=localize)
     assert whole == parts
     assert whole["tracked"] > 8

@@ -259,3 +259,34 @@ def test_no_class_from_elsewhere_is_made():
         tree = {"object": name, "id": 0, "attributes": {}}
         with pytest.raises(StateError, match="does not know"):
             TreeReader([], [], None, None).restore(tree, None)
+
+
+def test_what_is_shared_stays_shared_and_numbers_keep_their_type(tmp_path):
+    array, number, both = np.arange(3.0), np.float32(0.1), [1, 2]
+    itself: list = []
+    itself.append(itself)
+    far = np.asfortranarray(np.arange(12.0).reshape(3, 4))
+    state = {
+        "a": [array, number, both],
+        "b": (array, number, both),
+        "itself": itself,
+        "far": far,
+        "empty": np.empty((0, 3)),
+    }
+    state |= {"nan": float("nan"), "big": 1 << 70, "numbers": list(range(100)), "random": np.random.default_rng(5)}
+    state |= {"set": {3, 1}, "keys": {0.5 * n: np.eye(4) * n for n in range(40)}}
+    state["random"].normal(size=3)
+    database = StateDatabase(tmp_path / "state.db")
+    database.write(take_snapshot(state, database), {})
+    found = restore(StateReader(tmp_path / "state.db"), {})
+    assert found["a"][0] is found["b"][0]
+    assert found["a"][2] is found["b"][2]
+    assert type(found["b"][1]) is np.float32
+    assert found["itself"][0] is found["itself"]
+    assert found["far"].flags.f_contiguous
+    assert found["nan"] != found["nan"]
+    assert found["random"].normal() == state["random"].normal()
+    np.testing.assert_array_equal(found["keys"][7.5], np.eye(4) * 15)
+    for key in ("big", "numbers", "set"):
+        assert found[key] == state[key]
+    assert found["empty"].shape == (0, 3)

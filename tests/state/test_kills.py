@@ -1,5 +1,6 @@
 """A run that is killed at any moment and continued gives what a run that was not interrupted gives."""
 
+import shutil
 import sys
 import time
 
@@ -52,6 +53,10 @@ def test_a_killed_run_is_continued(whole, tmp_path, moment):
 @pytest.mark.slow
 def test_fifty_killed_runs_are_continued(whole, tmp_path):
     kinds = ["anywhere"] * 26 + ["checkpoint"] * 10 + ["join"] * 6 + ["export"] * 8
-    count = sum(trial(whole, tmp_path / str(seed), moment, seed) for seed, moment in enumerate(kinds))
+    count = 0
+    for seed, moment in enumerate(np.random.default_rng(0).permutation(kinds)):
+        count += trial(whole, tmp_path / str(seed), moment, seed)
+        shutil.rmtree(tmp_path / str(seed))
+        print(f"{seed + 1} of {len(kinds)}: {moment}, {count} killed", flush=True)
     print(f"{count} of {len(kinds)} runs were killed; all were continued with equal results")
     assert count >= 45

@@ -50,7 +50,7 @@ def writers(tree):
             ]
             if any(isinstance(value, str) and set(value) & set("wax+") and len(value) <= 3 for value in constants):
                 yield node
-        elif name in TO_FILES - {"open", "save"} and not (isinstance(first, ast.Name) and first.id in WHOLE):
+        elif name in TO_FILES - {"open", "save"} and method and not (isinstance(first, ast.Name) and first.id in WHOLE):
             yield node
         elif name == "save" and isinstance(node.func, ast.Attribute) and getattr(node.func.value, "id", "") == "np":
             yield node

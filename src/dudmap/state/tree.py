@@ -85,14 +85,14 @@ class TreeWriter:
     def _node(self, value: Any, place: str, *, constant: bool = False) -> Node:  # noqa: ANN401
         if value is None or type(value) in (bool, int, float, str):
             return value
+        if isinstance(value, np.generic):
+            return {"scalar": value.dtype.str, "value": value.item()}
         if id(value) in self._seen:
             return {"same": self._seen[id(value)][0]}
         number = len(self._seen)
         self._seen[id(value)] = number, value
         if isinstance(value, np.ndarray):
             return {"array": self._array(value, place, constant=constant), "id": number}
-        if isinstance(value, np.generic):
-            return {"scalar": value.dtype.str, "value": value.item()}
         if isinstance(value, BaseModel):
             return {"model": _class_name(value, place), "json": value.model_dump_json(), "id": number}
         if isinstance(value, np.random.Generator):
@@ -293,7 +293,7 @@ class TreeReader:
         value = current if usable else object.__new__(cls)
         self._made[node["id"]] = value
         self._taken.add(id(value))
-        rebuilt = wiring.REBUILT.get(cls.__name__, ())
+        rebuilt = wiring.rebuilt(cls)
         content = node["attributes"]
         if usable:
             for name in [name for name in vars(value) if name not in content and name not in rebuilt]:
@@ -327,7 +327,7 @@ def _defaults(cls: type) -> dict[str, Any]:
         "LoopCloser": {"_executor": None},
         "Observation": {"_halvings": [], "_recorded_halvings": []},
     }  # fmt: skip
-    return made.get(cls.__name__, {})
+    return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
 
 
 def _is_frozen(cls: type) -> bool:

@@ -33,6 +33,11 @@ def is_state_class(cls: type) -> bool:
     return package == "dudmap" and any(rest == part or rest.startswith(part + ".") for part in PACKAGES)
 
 
+def rebuilt(cls: type) -> set[str]:
+    """Attributes that objects of a class make themselves."""
+    return {name for base in cls.__mro__ for name in REBUILT.get(base.__name__, ())}
+
+
 def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
     """The attributes of an object that are its state, in the order in which they were set.
 
@@ -41,9 +46,9 @@ def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
     from functools import cached_property
 
     cls = type(value)
-    rebuilt = REBUILT.get(cls.__name__, ())
+    left_out = rebuilt(cls)
     return {
         name: content
         for name, content in vars(value).items()
-        if name not in rebuilt and not isinstance(getattr(cls, name, None), cached_property)
+        if name not in left_out and not isinstance(getattr(cls, name, None), cached_property)
     }
