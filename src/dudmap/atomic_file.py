@@ -6,7 +6,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
-__all__ = ["atomic_file", "atomic_path", "bring_to_disk", "put_in_place", "write_bytes", "write_text"]
+__all__ = ["UNFINISHED", "atomic_file", "atomic_path", "bring_to_disk", "put_in_place", "write_bytes", "write_text"]
+
+UNFINISHED = ".*.[0-9]*.part*"
+"""Pattern of the temporary names, under which a process that is killed leaves what it was writing."""
 
 
 @contextmanager

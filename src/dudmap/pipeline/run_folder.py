@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import write_bytes, write_text
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
@@ -66,6 +66,8 @@ def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
 def locked(out: Path) -> Iterator[None]:
     """Keep other processes from writing into the run folder, which is created if needed.
 
+    What a process that was killed has left half written is removed.
+
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
     """
@@ -75,6 +77,9 @@ def locked(out: Path) -> Iterator[None]:
     except OSError as error:
         raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
     with lock:
+        for folder in (out, *(out / name for name in ("masks", "movers", "thumbnails"))):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
         yield
 
 

@@ -1,6 +1,5 @@
 """Checkpoints of a run: a snapshot between two frames, written by a background thread."""
 
-import contextlib
 import os
 import sqlite3
 import time
@@ -10,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from dudmap.atomic_file import bring_to_disk
+from dudmap.errors import StateError
 from dudmap.state.database import StateDatabase
 from dudmap.state.system import take_snapshot
 from dudmap.state.tree import NotSettledError, Snapshot
@@ -74,23 +74,26 @@ class Checkpoints:
             state: What is stored.
             meta: Values that describe the run.
             wait: Wait for what is computed in the background, and until the snapshot is written.
-
-        Raises:
-            StateError: There is something that cannot be stored.
         """
         if wait and self._running is not None:
             self._running.exception()  # waits
             self._finish()
         start = time.perf_counter()
-        with contextlib.suppress(NotSettledError):
+        try:
             snapshot = take_snapshot(state, self.database, wait=wait)
-            files, self._files = self._files, []
-            self._last_cost, self._last = time.perf_counter() - start, start
-            self._cost += self._last_cost
-            self._running = self._thread.submit(self._write, snapshot, meta, files)
-            if wait:
-                self._running.exception()
-                self._finish()
+        except NotSettledError:
+            return
+        except StateError as error:  # a defect of this program, which is no reason to end the run
+            self._last = start
+            self._warn(error)
+            return
+        files, self._files = self._files, []
+        self._last_cost, self._last = time.perf_counter() - start, start
+        self._cost += self._last_cost
+        self._running = self._thread.submit(self._write, snapshot, meta, files)
+        if wait:
+            self._running.exception()
+            self._finish()
 
     def close(self) -> None:
         """Wait for the thread, and close the database."""
@@ -122,9 +125,12 @@ class Checkpoints:
             self._failing = False
         elif not isinstance(error, OSError | sqlite3.Error):
             raise error
-        elif not self._failing:
+        else:
+            self._warn(error)
+
+    def _warn(self, error: BaseException) -> None:
+        """Say once that no checkpoints are written."""
+        if not self._failing:
             self._failing = True
-            self._notice(
-                f"the state of the run cannot be stored: {error}; it goes on in memory and tries again; make room on "
-                "the disk of the run folder"
-            )
+            hint = "" if isinstance(error, StateError) else "; make room on the disk of the run folder"
+            self._notice(f"the state of the run cannot be stored: {error}; it goes on in memory and tries again{hint}")
