@@ -37,8 +37,9 @@ def long_run(frames: int, blocks: int) -> tuple[RunState, list[Frame]]:
         record.add(slam.process(sequence[index]), 100.0, 5.0, None)
     atlas, store = slam.atlas, slam.atlas.history
     assert store is not None
-    first = [TimedPose(pose.timestamp - 1e4, pose.T_world_camera.copy(), 0) for pose in atlas.poses]
-    atlas.poses[:0] = (first * (frames // len(first) + 1))[: frames - len(atlas.poses)]
+    known = [pose.T_world_camera for pose in atlas.poses]
+    early = range(frames - len(known))
+    atlas.poses[:0] = [TimedPose(n - 1e5, known[n % len(known)].copy(), 0) for n in early]
     record.rows = [dict(record.rows[n % TRACKED]) for n in range(frames)]
     while len(atlas.keyframes.keyframes) < Config().relocalization.max_keyframes:
         one = atlas.keyframes.keyframes[0]
@@ -50,7 +51,7 @@ def long_run(frames: int, blocks: int) -> tuple[RunState, list[Frame]]:
         store.add(sequence[n % TRACKED], np.ones(CAMERA.shape, bool), T, 0)
     n = 0
     while slam.volume.num_blocks < blocks:  # rooms beside each other, 20 m apart
-        T = slam.trajectory.Ts_world_camera[-1 - n % TRACKED].copy()
+        T = atlas.poses[-1 - n % TRACKED].T_world_camera.copy()
         T[0, 3] += 20.0 * (1 + n // TRACKED)
         slam.volume.integrate(sequence[TRACKED - 1 - n % TRACKED], T)
         n += 1

@@ -71,6 +71,7 @@ class StoredMaps:
 
     def __init__(self) -> None:
         self.by_id: dict[int, StoredMap] = {}
+        self._promised: dict[int, int] = {}  # numbers of maps that are not in the database yet
 
     def snapshot(self, volume: TsdfVolume) -> tuple[dict[str, Any], MapSnapshot]:
         """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state.
@@ -106,8 +107,6 @@ class StoredMaps:
         keys = np.where(blocks.entry_of[: blocks.num_slots] >= 0, block_keys(number, coords), -1)
         self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, keys)
 
-    _promised: dict[int, int] = {}  # noqa: RUF012 - replaced, never changed
-
     def _free_number(self, map_id: int) -> int:
         """Number for a map that is not in the database; the same until the next ``commit``."""
         if map_id not in self._promised:
@@ -115,7 +114,7 @@ class StoredMaps:
             free = next(number for number in range(len(used) + 1) if number not in used)
             if free >= MAX_MAPS:
                 raise StateError(f"there are more than {MAX_MAPS} maps, which the database cannot hold")
-            self._promised = self._promised | {map_id: free}
+            self._promised[map_id] = free
         return self._promised[map_id]
 
 
