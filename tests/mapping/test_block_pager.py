@@ -7,10 +7,11 @@ import pytest
 
 from dudmap.errors import MapError
 from dudmap.geometry import se3
-from dudmap.mapping.block_pager import REGION_BITS, morton
 from dudmap.mapping.incremental_mesh import IncrementalMesh
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.state.database import StateDatabase, StateReader
+from dudmap.state.system import restore, take_snapshot
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 
@@ -133,13 +134,21 @@ def test_an_unreadable_store_is_reported(maps, monkeypatch):
         store.read((0, 0, 0))
 
 
-def test_morton_codes_order_regions_by_their_highest_differing_bit():
-    rng = np.random.default_rng(0)
-    for a, b in rng.integers(-40, 40, (200, 2, 3)):
-        highest = np.array([int(x ^ y).bit_length() for x, y in zip(a + (1 << 20), b + (1 << 20), strict=True)])
-        axis = int(np.argmax(highest))  # of equal bits, that of the first axis weighs more
-        if highest[axis]:
-            assert (morton(tuple(a.tolist())) < morton(tuple(b.tolist()))) == (a[axis] < b[axis])
-    assert REGION_BITS == 4
-    with pytest.raises(MapError, match="found region coordinate"):
-        morton((1 << 20, 0, 0))
+def test_a_paged_map_is_stored_and_goes_on(tmp_path):
+    """The map, its regions on disk included, is in a database after each checkpoint, whatever came and went between."""
+    whole, paged = (TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS))
+    database = StateDatabase(tmp_path / "state.db")
+    for number in range(len(PATH)):
+        whole.integrate(*frame(number))
+        paged.integrate(*frame(number))
+        if number % 3 == 0:
+            database.write(take_snapshot({"map": paged}, database), {})
+        if number in (12, 18):
+            database.close()
+            reader, database = StateReader(tmp_path / "state.db"), StateDatabase(tmp_path / "state.db")
+            empty = TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=MAX_BLOCKS)
+            paged = restore(reader, {"map": empty}, database)["map"]
+            assert paged.pager.num_blocks > 0
+            assert content(paged) == content(whole)
+    assert content(paged) == content(whole)
+    database.close()

@@ -4,7 +4,7 @@ The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Nie
 """
 
 import weakref
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
@@ -12,8 +12,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import MapError
 from dudmap.mapping.memory_limit import MemoryLimit
+from dudmap.mapping.morton import morton_codes
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.voxel_blocks import BlockRecords, VoxelBlocks
 
@@ -57,6 +57,7 @@ class BlockPager:
         self.failure = ""
         self._store: RegionStore | None = None
         self._executor: ThreadPoolExecutor | None = None
+        self._next_serial = 0
         self.clear()
 
     def clear(self) -> None:
@@ -68,6 +69,9 @@ class BlockPager:
         self._writing: dict[Region, tuple[BlockRecords, Future[None]]] = {}
         self._reading: dict[Region, Future[BlockRecords]] = {}
         self._unchanged_since: dict[Region, int] = {}
+        self._serial: dict[Region, int] = {}
+        self._archived: set[Region] = set()
+        self._archive: Callable[[Region], BlockRecords] | None = None
         self._middle = np.zeros(3)
         self._retry_in = 0
 
@@ -99,6 +103,28 @@ class BlockPager:
     def stored_regions(self) -> Iterable[Region]:
         """The regions in the store."""
         return self._away.keys()
+
+    def away(self) -> dict[Region, tuple[int, int, int]]:
+        """Of each region in the store: a number that is another for each content, and its numbers of blocks and of
+        blocks with voxels."""
+        return {region: (self._serial[region], one.blocks, one.voxel_blocks) for region, one in self._away.items()}
+
+    def records(self, region: Region) -> BlockRecords:
+        """Content of a region in the store.
+
+        Raises:
+            MapError: It cannot be read.
+        """
+        return self._writing[region][0] if region in self._writing else self._read(region)
+
+    def continue_from(
+        self, away: dict[Region, tuple[int, int, int]], archive: Callable[[Region], BlockRecords]
+    ) -> None:
+        """Take regions from an archive, which has them as long as they have not come back into memory."""
+        self.clear()
+        self._away = {region: _Away(count, owning) for region, (_, count, owning) in away.items()}
+        self._serial = {region: serial for region, (serial, _, _) in away.items()}
+        self._archived, self._archive = set(away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
         """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
@@ -139,10 +165,12 @@ class BlockPager:
         if region in self._writing:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
-            read = self._reading.pop(region, None) or self._submit(self._stored.read, region)
+            read = self._reading.pop(region, None) or self._submit(self._read, region)
             records = read.result()
-            self._unchanged_since[region] = frame_number
+            if region not in self._archived:
+                self._unchanged_since[region] = frame_number
         del self._away[region]
+        self._archived.discard(region)
         blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
 
     def _read_ahead(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> None:
@@ -154,7 +182,12 @@ class BlockPager:
         for region in set(self._reading) - wanted:
             self._reading.pop(region).cancel()
         for region in wanted - set(self._reading) - set(self._writing):
-            self._reading[region] = self._submit(self._stored.read, region)
+            self._reading[region] = self._submit(self._read, region)
+
+    def _read(self, region: Region) -> BlockRecords:
+        if self._archive is not None and region in self._archived:
+            return self._archive(region)
+        return self._stored.read(region)
 
     def _make_room(
         self, blocks: VoxelBlocks, first: NDArray[np.integer], last: NDArray[np.integer], frame_number: int
@@ -176,7 +209,7 @@ class BlockPager:
             leaving[n] = True
             surplus -= owned[n]
         self._send_all_away(blocks, keys, region_of, leaving, frame_number)
-        blocks.remove(np.flatnonzero(leaving[region_of]))
+        blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
 
     def page_out(self, blocks: VoxelBlocks, frame_number: int) -> VoxelBlocks:
         """Move all regions to the store; returns the empty blocks that take the place of ``blocks``."""
@@ -203,6 +236,7 @@ class BlockPager:
         self._away[region] = _Away(len(entries), int(np.count_nonzero(blocks.slot_of[entries] >= 0)))
         if self._unchanged_since.pop(region, -1) == frame_number:
             return
+        self._serial[region] = self._next_serial = self._next_serial + 1
         records = blocks.records(entries)
         self._writing[region] = records, self._submit(self._stored.write, region, records)
 
@@ -235,8 +269,9 @@ class BlockPager:
 def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
     """All regions of a map, in Morton order, so that neighbours follow each other."""
     near, _ = _regions_of_entries(blocks)
-    stored = () if pager is None else pager.stored_regions
-    return sorted({_key(region) for region in near} | set(stored), key=morton)
+    stored = np.array(list(() if pager is None else pager.stored_regions), np.int64).reshape(-1, 3)
+    regions = np.unique(np.concatenate([near, stored]), axis=0)
+    return [_key(region) for region in regions[np.argsort(morton_codes(regions.astype(np.int16)))]]
 
 
 def _regions_of_entries(blocks: VoxelBlocks) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
@@ -245,17 +280,6 @@ def _regions_of_entries(blocks: VoxelBlocks) -> tuple[NDArray[np.int64], NDArray
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
     parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]
     return np.stack(parts, axis=1) - (1 << 15), region_of.reshape(-1)
-
-
-def morton(region: Region) -> int:
-    """Morton code of a region: the bits of its coordinates, shifted to be positive, one after the other."""
-    code = 0
-    for axis, value in enumerate(region):
-        if not -(1 << 20) <= value < 1 << 20:
-            raise MapError(f"found region coordinate {value}; expected one between {-(1 << 20)} and {(1 << 20) - 1}")
-        for bit in range(21):
-            code |= (((value + (1 << 20)) >> bit) & 1) << (3 * bit + 2 - axis)
-    return code
 
 
 def _key(region: NDArray[np.integer]) -> Region:

@@ -172,7 +172,7 @@ class VoxelBlocks:
             self.geometry[slots], self.colors[slots], self.fused[slots],
         )  # fmt: skip
 
-    def remove(self, entries: NDArray[np.integer]) -> None:
+    def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
         """Forget entries (n,) and their voxels. The other entries are numbered anew; slots keep their numbers."""
         n = self.num_entries
         slots = self.slot_of[entries]
@@ -181,6 +181,7 @@ class VoxelBlocks:
         kept[entries] = False
         self.entry_of[slots] = -1
         self.geometry[slots] = self.colors[slots] = 0
+        self.written[slots] = frame_number
         self._released = np.concatenate([self._released, slots[::-1]])
         number = (np.cumsum(kept) - 1).astype(np.int32)
         owned = self.active_slots
