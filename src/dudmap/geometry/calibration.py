@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, read_toml
 
 PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
@@ -138,7 +139,7 @@ class Calibration:
             DatasetError: The file is missing, not TOML, or lacks a value or holds an invalid one.
         """
         try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"cannot read the calibration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
@@ -156,5 +157,5 @@ class Calibration:
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
-        except (TypeError, ValueError, AttributeError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"cannot understand the calibration {path}: {error}") from error

@@ -1,5 +1,6 @@
 """Triangle mesh with colours and normals."""
 
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import MapError
+from dudmap.input_files import damaged, open_plain
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -73,12 +75,15 @@ class Mesh:
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":
         """Read a file that ``save`` wrote, None for any other: trimesh takes 2 s for a million triangles."""
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             head = file.read(1024)
             counts = re.findall(rb"element (?:vertex|face) (\d+)", head)
             header = _ply_header(*(int(count) for count in [*counts, 0][:2])).encode("ascii") if counts else b""
             if not header or not head.startswith(header):
                 return None
+            wanted = int(counts[0]) * _PLY_VERTEX.itemsize + int([*counts, 0][1]) * _PLY_FACE.itemsize
+            if len(header) + wanted > os.fstat(file.fileno()).st_size:
+                raise MapError(f"the mesh {path} is cut off or damaged")
             file.seek(len(header))
             vertex = np.fromfile(file, _PLY_VERTEX, int(counts[0]))
             face = np.fromfile(file, _PLY_FACE, int(counts[1]) if len(counts) > 1 else 0)
@@ -102,13 +107,20 @@ class Mesh:
             raise MapError(f"cannot read the mesh {path}: {error}") from error
         if own is not None and len(own.vertices) > 0:
             return own
+        if path.suffix.lower() not in FORMATS:  # others may be archives, or name further files
+            raise MapError(f"cannot read the mesh {path}; the ending must be one of {', '.join(FORMATS)}")
+        with damaged(MapError, f"the mesh {path}"):
+            return cls._load_foreign(path)
+
+    @classmethod
+    def _load_foreign(cls, path: Path) -> "Mesh":
+        """Read a file that another program wrote; materials, which name further files, are left out."""
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
-        try:
-            loaded = trimesh.load(path, process=False, force=None)
-        except (OSError, ValueError, NotImplementedError, LookupError, TypeError) as error:  # trimesh on broken headers
-            raise MapError(f"cannot read the mesh {path}: {error}") from error
+        options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        with open_plain(path) as file:
+            loaded = trimesh.load(file, file_type=path.suffix.lower()[1:], process=False, force=None, **options)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float32)

@@ -12,6 +12,7 @@ from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh
+from dudmap.input_files import DAMAGE, open_arrays
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.parameters import (
@@ -345,10 +346,8 @@ class TsdfVolume:
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        import zipfile
-
         try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
+            with open_arrays(path) as data:
                 if str(data["format"]) != FORMAT:
                     raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
                 fx, fy, cx, cy = (float(value) for value in data["camera"])
@@ -362,6 +361,6 @@ class TsdfVolume:
                 volume.blocks = VoxelBlocks.restored(
                     data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
                 )
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except DAMAGE as error:
             raise MapError(f"{path} is not a readable map file: {error}") from error
         return volume

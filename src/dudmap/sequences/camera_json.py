@@ -1,6 +1,5 @@
 """Intrinsics of JSON files: Open3D and its recorders, NICE-SLAM, librealsense, ZED, and plain keys."""
 
-import json
 from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
+from dudmap.input_files import read_json
 from dudmap.sequences.intrinsics import KEYS, Intrinsics
 
 NAMES = {
@@ -63,8 +63,8 @@ def load(paths: Iterable[Path], depth_scale: float) -> Intrinsics:
 
 def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        return read_json(path)
+    except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
 
 

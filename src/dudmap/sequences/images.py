@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import FrameError
+from dudmap.input_files import load_array, read_bytes
+from dudmap.sequences.image_headers import check_size
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
@@ -83,7 +85,7 @@ def read_depth_array(path: Path) -> NDArray[np.float32]:
         FrameError: The file is missing, damaged, or holds something else.
     """
     try:
-        metres = np.squeeze(np.load(path, allow_pickle=False))
+        metres = np.squeeze(load_array(path))
     except (OSError, ValueError, EOFError) as error:
         raise FrameError(f"cannot read the array {path}: {error}") from error
     if metres.ndim != 2 or metres.dtype.kind != "f":
@@ -109,7 +111,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except FileNotFoundError:
         raise FrameError(f"the listed file {path} does not exist") from None
     except OSError as error:
@@ -119,12 +121,13 @@ def _bytes(path: Path) -> bytes:
 def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
     """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
     raw = bytes(data)
+    if not raw:
+        raise FrameError(f"{name} is an empty file")
     if raw.startswith(PNG):
         _check_png(name, raw)
     elif raw.startswith(JPEG) and b"\xff\xd9" not in raw[-1024:]:
         raise FrameError(f"{name} is cut off: the JPEG end marker is missing")
-    if not raw:
-        raise FrameError(f"{name} is an empty file")
+    check_size(raw, name)
     return np.frombuffer(raw, dtype=np.uint8)
 
 

@@ -11,6 +11,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import read_text
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 DEPTH_SCALE = 5000.0
@@ -175,7 +176,7 @@ def from_file(path: Path) -> Intrinsics:
         DatasetError: The file has none of these forms, or a key is unknown or missing.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
     rows = [row for line in lines if (row := re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split())]
