@@ -40,5 +40,9 @@ class CameraError(DudmapError):
     """A camera or its driver is missing, or the camera stopped to deliver frames."""
 
 
+class InternalError(DudmapError):
+    """A defect of dudmap itself: something happened that it does not foresee, and a report of it was written."""
+
+
 class MapError(DudmapError):
     """A map or mesh is invalid, or cannot be loaded or saved."""

@@ -12,6 +12,7 @@ import math
 import os
 import stat
 import struct
+import tokenize
 import tomllib
 import zipfile
 import zlib
@@ -236,9 +237,9 @@ def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
         raise ValueError(f"{name} has version {version} of NumPy's format; expected 1.0 or 2.0")
     try:
         shape, by_columns, kind = read(file)
-    except (SyntaxError, TypeError, RecursionError, MemoryError) as error:  # of the literal that is the header
+    except (SyntaxError, TypeError, RecursionError, tokenize.TokenError) as error:  # the header is a literal
         raise ValueError(f"the header of {name} is damaged: {error}") from None
-    if kind.kind not in SAFE_KINDS or kind.hasobject:
+    if kind.kind not in SAFE_KINDS or kind.hasobject or not kind.itemsize:
         raise ValueError(f"{name} holds {kind}; expected numbers or text")
     if any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
         raise ValueError(f"{name} has the shape {shape}; expected up to 8 whole numbers")
@@ -248,8 +249,7 @@ def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
     data = file.read(expected)
     if len(data) != expected:
         raise ValueError(f"{name} is cut off: it holds {len(data)} of {expected} bytes")
-    flat = np.frombuffer(bytearray(data), kind) if kind.itemsize else np.zeros(math.prod(shape), kind)
-    return flat.reshape(shape, order="F" if by_columns else "C")
+    return np.frombuffer(bytearray(data), kind).reshape(shape, order="F" if by_columns else "C")
 
 
 def load_array(path: str | Path) -> NDArray[Any]:

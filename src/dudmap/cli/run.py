@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.view import observers
+from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -52,6 +52,9 @@ RerunOption = Annotated[
     Path | None,
     typer.Option("--rerun", help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd"),
 ]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", help="File for one JSON object per line and event of the run.", metavar="FILE")
+]
 
 
 @app.command()
@@ -97,7 +100,9 @@ def run(
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
+    log: LogOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -128,7 +133,7 @@ def run(
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,

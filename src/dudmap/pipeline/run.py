@@ -206,6 +206,8 @@ def process_source(
     if isinstance(read.frame, FrameError):
         record.unreadable.append(str(read.frame))
         display.note(f"skipped: {read.frame}")
+        for observer in observers:
+            observer.event("unreadable", frame=index, reason=str(read.frame))
         return
     true_mask = read.true_mask
     if isinstance(true_mask, FrameError):

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import FrameError
-from dudmap.input_files import load_array, read_bytes
+from dudmap.input_files import damaged, load_array, read_bytes
 from dudmap.sequences.image_headers import check_size
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
@@ -32,9 +32,7 @@ def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
     """
     import cv2
 
-    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_COLOR)
-    if image is None:
-        raise FrameError(f"{name} is not an image that can be decoded")
+    image = _decoded(data, name, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
@@ -55,9 +53,7 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
     """
     import cv2
 
-    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise FrameError(f"{name} is not an image that can be decoded")
+    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise FrameError(f"the depth image {name} has {image.shape[2]} channels; expected one with 16 bit or float")
     return metres(image, depth_scale, name)
@@ -103,9 +99,7 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """
     import cv2
 
-    image = cv2.imdecode(_checked(_bytes(path), str(path)), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise FrameError(f"{path} is not an image that can be decoded")
+    image = _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
     return image > 127
 
 
@@ -116,6 +110,21 @@ def _bytes(path: Path) -> bytes:
         raise FrameError(f"the listed file {path} does not exist") from None
     except OSError as error:
         raise FrameError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
+    """Image of the content of an image file.
+
+    Raises:
+        FrameError: It is truncated, damaged, too large or not an image.
+    """
+    import cv2
+
+    with damaged(FrameError, name):
+        image = cv2.imdecode(_checked(data, name), flags)
+    if image is None:
+        raise FrameError(f"{name} is not an image that can be decoded")
+    return np.asarray(image)
 
 
 def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:

@@ -1,5 +1,6 @@
 """Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
 
+import math
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -158,7 +159,7 @@ def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
         numbers = [float(field) for field in camera.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (4, 6, 7):
+    if len(numbers) not in (4, 6, 7) or not all(map(math.isfinite, numbers)):
         raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
     return Intrinsics({"depth_scale": depth_scale} | _by_key(*numbers), f"the camera {camera!r}")
 
@@ -234,8 +235,8 @@ def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
 
 
 def _is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
     try:
-        float(text)
+        return math.isfinite(float(text))
     except ValueError:
         return False
-    return True

@@ -12,7 +12,7 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
-from dudmap.input_files import LARGEST_FILE, RATIO_FREE_BYTES, damaged, open_plain, parse_json
+from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, damaged, open_plain, parse_json
 from dudmap.sequences import images, intrinsics
 
 LARGEST_COMMAND = 315 + 2359
@@ -105,7 +105,7 @@ class Record3DRecording:
             if self._zip.getinfo(name).file_size > LARGEST_FILE:
                 raise FrameError(f"{name} in {self.path} has more than {LARGEST_FILE / 1e6:.0f} MB")
             return self._zip.read(name)
-        except (KeyError, zipfile.BadZipFile, EOFError, OSError) as error:
+        except (RuntimeError, *DAMAGE) as error:
             raise FrameError(f"cannot read {name} in {self.path}: {error}") from None
 
     def _metadata(self) -> tuple[Camera, tuple[int, int], NDArray[np.float64]]:
@@ -117,7 +117,7 @@ class Record3DRecording:
             size = int(tree["dw"]), int(tree["dh"])
             stamps = tree.get("frameTimestamps") or [n / float(tree["fps"]) for n in range(max(self._numbers) + 1)]
             times = np.array([stamps[number] for number in self._numbers], dtype=np.float64)
-        except (KeyError, ValueError, TypeError, IndexError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"cannot understand the metadata of {self.path}: {error!r}") from None
         if np.any(np.diff(times) <= 0):
             raise DatasetError(f"the frame times in the metadata of {self.path} do not increase")

@@ -109,7 +109,15 @@ def _release(version: str) -> tuple[int, ...]:
 def _frames(path: Path) -> list[dict[str, str]]:
     if not path.is_file():
         return []
-    return list(csv.DictReader(read_text(path).splitlines()))
+    rows = list(csv.DictReader(read_text(path).splitlines()))
+    numbers = [name for name in (rows[0] if rows else ()) if name not in ("state", "fused")]
+    for number, row in enumerate(rows, start=2):
+        try:
+            _ = [float(row[name]) for name in ("timestamp", "total", "dynamic_share")]
+            _ = [float(row[name] or 0) for name in numbers]
+        except DAMAGE as error:
+            raise DudmapError(f"{path}, line {number} is damaged ({error!r}); run again") from None
+    return rows
 
 
 def _movers(path: Path) -> dict[str, list[MoverBox]]:
