@@ -66,7 +66,7 @@ def open_plain(path: str | Path) -> IO[bytes]:
     except OSError:
         os.close(number)
         raise
-    return os.fdopen(number, "rb")
+    return open(path, "rb", opener=lambda *_: number)  # so that its name is the path
 
 
 def _check_plain(mode: int, path: str | Path) -> None:
@@ -166,6 +166,21 @@ def damaged(kind: type[DudmapError], what: object) -> Iterator[None]:
     except (*DAMAGE, cv2.error) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise
+        raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
+
+
+@contextmanager
+def foreign(kind: type[DudmapError], what: object) -> Iterator[None]:
+    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh.
+
+    Raises:
+        DudmapError: Of class ``kind``; our own errors pass unchanged.
+    """
+    try:
+        yield
+    except DudmapError:
+        raise
+    except Exception as error:
         raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
 
 

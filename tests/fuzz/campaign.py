@@ -22,8 +22,8 @@ from pathlib import Path
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-from loaders import LOADERS  # noqa: E402
-from trial import Finding, Subject  # noqa: E402
+from loaders import LOADERS
+from trial import Finding, Subject
 
 COUNT = struct.Struct("<QQ")
 """In memory shared with the child: number of inputs that were read, and number of the present one."""
@@ -31,7 +31,7 @@ COUNT = struct.Struct("<QQ")
 
 def child(name, first, seconds, share, memory, report):
     """Read inputs from number ``first`` on for some seconds; findings go to the file ``report``."""
-    sys.stderr = open(os.devnull, "w")  # noqa: SIM115 - decoders write on it
+    sys.stderr = open(os.devnull, "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:

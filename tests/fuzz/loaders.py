@@ -261,6 +261,9 @@ INTRINSICS = (
 )
 
 
+IMAGES = "depth", "color", "tiff", "webp", "pnm", "bmp"
+
+
 def image(kind, folder):
     extension = {"depth": ".png", "color": ".jpg", "tiff": ".tiff", "webp": ".webp", "pnm": ".pgm", "bmp": ".bmp"}[kind]
     path = folder / f"image{extension}"
@@ -374,7 +377,7 @@ LOADERS = {
     "trajectory": Loader(partial(text, "trajectory.txt", trajectory), load_trajectory),
     "intrinsics": Loader(partial(text, "intrinsics.txt", INTRINSICS), load_intrinsics),
     "camera as JSON": Loader(camera_files, load_camera_file),
-    **{f"image {kind}": Loader(partial(image, kind), load_image) for kind in ("depth", "color", "tiff", "webp", "pnm", "bmp")},
+    **{f"image {kind}": Loader(partial(image, kind), load_image) for kind in IMAGES},
     "array": Loader(array, load_array),
     **{f"mesh {kind}": Loader(partial(mesh, kind), load_mesh) for kind in ("ply", "obj", "glb", "stl")},
     "run folder": Loader(run_folder, load_run_folder),

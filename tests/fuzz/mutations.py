@@ -290,7 +290,8 @@ def zip_names(rng, data):
     return zipped(parts)
 
 
-PACKERS = {".tar": bytes, ".gz": lambda data: zlib.compress(data, wbits=31), ".tgz": lambda data: zlib.compress(data, wbits=31), ".bz2": bz2.compress, ".xz": lzma.compress}  # fmt: skip
+PACKERS = (bytes, lambda data: zlib.compress(data, wbits=31), bz2.compress, lzma.compress)
+"""No compression, gzip, bzip2, xz."""
 
 
 def tar_member(rng, data):
@@ -303,7 +304,7 @@ def tar_member(rng, data):
         body = bytes(rng.choice((0, 10, 2**20)))
         member.size = len(body) if member.isreg() else 0
         archive.addfile(member, io.BytesIO(body))
-    packed = rng.choice(list(PACKERS.values()))(out.getvalue())
+    packed = rng.choice(PACKERS)(out.getvalue())
     return rng.choice(RAW)(rng, packed) if rng.random() < 0.5 else packed
 
 

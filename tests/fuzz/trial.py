@@ -8,16 +8,16 @@ import warnings
 from contextlib import contextmanager
 
 import numpy as np
-
-from dudmap.errors import DudmapError
 from loaders import LOADERS, check_sentence
 from mutations import SPECIAL, mutated, put_special
+
+from dudmap.errors import DudmapError
 
 SECONDS = 10
 """Time that a loader has for one input."""
 
 
-class Finding(Exception):
+class Finding(Exception):  # noqa: N818
     """A loader did what it must not do."""
 
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import MapError
-from dudmap.input_files import damaged, open_plain
+from dudmap.input_files import foreign, open_plain
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -109,7 +109,7 @@ class Mesh:
             return own
         if path.suffix.lower() not in FORMATS:  # others may be archives, or name further files
             raise MapError(f"cannot read the mesh {path}; the ending must be one of {', '.join(FORMATS)}")
-        with damaged(MapError, f"the mesh {path}"):
+        with foreign(MapError, f"the mesh {path}"):
             return cls._load_foreign(path)
 
     @classmethod

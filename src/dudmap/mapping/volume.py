@@ -33,6 +33,8 @@ __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolu
 
 _MAP_IDS = itertools.count()
 FORMAT = "dudmap map 1"
+LARGEST_DEPTH = 1000.0
+"""Largest range of depth of a map file, metres; the steps of a raycast grow with it. Depth cameras reach 100 m."""
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_JUMP = 5.0
@@ -350,6 +352,8 @@ class TsdfVolume:
             with open_arrays(path) as data:
                 if str(data["format"]) != FORMAT:
                     raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
+                if not 0 < data["depth_max"] <= LARGEST_DEPTH:
+                    raise ValueError(f"its depths reach {data['depth_max']} m; expected up to {LARGEST_DEPTH:g} m")
                 fx, fy, cx, cy = (float(value) for value in data["camera"])
                 width, height = (int(value) for value in data["image"])
                 volume = cls(

@@ -2,7 +2,7 @@
 
 import weakref
 from collections.abc import Generator
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import cached_property
 from itertools import islice
 from pathlib import Path
@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError, DudmapError, FrameError
+from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.input_files import describe, open_plain
+from dudmap.input_files import foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
 from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
 from dudmap.sequences.bag_limits import check_bag, limit_decompression
@@ -71,7 +71,7 @@ class RosBag:
         self._reader = _open(self.path)
         self._stream = MessageStream(self._reader)
         weakref.finalize(self, _close, self._reader, self._stream)
-        with whole(DatasetError, f"the bag {self.path}"):
+        with foreign(DatasetError, f"the bag {self.path}"):
             self._find_frames(chosen, camera)
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
@@ -104,7 +104,7 @@ class RosBag:
         """
         index = range(len(self))[index]
         name = f"frame {index} of {self.path}"
-        with whole(FrameError, name):
+        with foreign(FrameError, name):
             return self._frame(index, name)
 
     def _frame(self, index: int, name: str) -> Frame:
@@ -129,7 +129,7 @@ class RosBag:
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
-        with whole(DatasetError, f"the poses in /tf of {self.path}"):
+        with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()
 
     def _true_poses(self) -> Trajectory | None:
@@ -298,21 +298,6 @@ def starts_with(path: Path, magic: bytes) -> bool:
         return False
     with open_plain(path) as file:
         return file.read(len(magic)) == magic
-
-
-@contextmanager
-def whole(kind: type[DudmapError], what: str) -> Generator[None]:
-    """Turn whatever a damaged bag raises into one sentence of class ``kind`` about ``what``.
-
-    Raises:
-        DudmapError: Of that class; our own errors pass unchanged.
-    """
-    try:
-        yield
-    except DudmapError:
-        raise
-    except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
-        raise kind(f"cannot read {what}, it is damaged: {describe(error)}") from error
 
 
 def _open(path: Path) -> "AnyReader":
