@@ -96,9 +96,7 @@ def _processor() -> Check:
         return Check("processor", "note", f"{name}; its features are not known: {error}", "see the packages above")
     missing = [feature for feature in FEATURES if not features.get(feature)]
     if missing:
-        mend = (
-            "expect several times the time per frame; if it is a virtual machine, pass on the host's processor"
-        )
+        mend = "expect several times the time per frame; if it is a virtual machine, pass on the host's processor"
         return Check("processor", "note", f"{name} without {' and '.join(missing)}", mend)
     return Check("processor", "good", f"{name} with {', '.join(FEATURES)}")
 
@@ -125,9 +123,7 @@ def _gpu() -> Check:
     except (OSError, subprocess.TimeoutExpired) as error:
         return Check("GPU", "note", f"nvidia-smi does not answer: {error}", "none is needed; check its driver")
     if done.returncode:
-        return Check(
-            "GPU", "note", f"nvidia-smi: {done.stdout.strip()[:200]}", "none is needed; check its driver"
-        )
+        return Check("GPU", "note", f"nvidia-smi: {done.stdout.strip()[:200]}", "none is needed; check its driver")
     return Check("GPU", "good", done.stdout.strip().replace("\n", "; "))
 
 
@@ -252,7 +248,7 @@ def licences() -> list[Licence]:
 
 def licence_of(name: str) -> str:
     """Licence of an installed package: its SPDX expression, else its classifiers, else the first line of its text."""
-    about = metadata(name)
+    about: Any = metadata(name)
     expression = about.get("License-Expression")
     if expression:
         return expression

@@ -4,6 +4,7 @@ import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -118,7 +119,7 @@ class Mesh:
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
-        options = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
         with open_plain(path) as file:
             loaded = trimesh.load(file, file_type=path.suffix.lower()[1:], process=False, force=None, **options)
         if isinstance(loaded, trimesh.Scene):

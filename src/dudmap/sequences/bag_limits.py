@@ -4,8 +4,9 @@ import sqlite3
 from bz2 import BZ2Decompressor
 from collections.abc import Callable
 from contextlib import closing
+from importlib import import_module
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 from urllib.parse import quote
 
 from dudmap.input_files import open_plain, read_text
@@ -53,17 +54,15 @@ def sqlite_uri(path: Path) -> str:
 def limit_decompression() -> None:
     """Make rosbags give up where a chunk or message unpacks to more than ``LARGEST_CHUNK``."""
     import lz4.frame
-    from rosbags.rosbag1 import reader as ros1
-    from rosbags.rosbag2 import reader as ros2
-    from rosbags.rosbag2 import storage_mcap
 
-    zstd: Any = storage_mcap.zstd
-    unzstd = bounded(zstd.ZstdDecompressor)
+    names = "rosbags.rosbag1.reader", "rosbags.rosbag2.reader", "rosbags.rosbag2.storage_mcap"
+    ros1, ros2, storage_mcap = (cast("Any", import_module(name)) for name in names)
+    unzstd = bounded(storage_mcap.zstd.ZstdDecompressor)
     unlz4 = bounded(lz4.frame.LZ4FrameDecompressor)
     ros1.decompressors.update(bz2=bounded(BZ2Decompressor), lz4=unlz4)
     storage_mcap.DECOMPRESSORS.update(lz4=lambda data, _: unlz4(data), zstd=lambda data, _: unzstd(data))
     if not isinstance(ros2.zstd, _Bounded):
-        ros2.zstd = _Bounded(unzstd)  # pyright: ignore[reportAttributeAccessIssue]
+        ros2.zstd = _Bounded(unzstd)
 
 
 class _Bounded:

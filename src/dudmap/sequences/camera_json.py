@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -126,7 +126,7 @@ def _motion(tree: Any, default: NDArray[np.float64]) -> NDArray[np.float64]:  # 
     return default
 
 
-def _is_finite(value: Any) -> bool:  # noqa: ANN401 - any JSON value
+def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON value
     return isinstance(value, int | float) and math.isfinite(value)
 
 

@@ -3,7 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,7 +129,7 @@ class _Header(NamedTuple):
         )  # fmt: skip
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
+def _read_header(file: IO[bytes], path: Path) -> _Header:
     (version,) = _unpack(file, "<I")
     if version != VERSION:
         raise DatasetError(f"{path} has version {version} of the .sens format; expected {VERSION}, which ScanNet uses")
@@ -153,7 +153,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
     )  # fmt: skip
 
 
-def _read_index(file: BinaryIO, num_frames: int) -> tuple[list[_Entry], NDArray[np.float64]]:
+def _read_index(file: IO[bytes], num_frames: int) -> tuple[list[_Entry], NDArray[np.float64]]:
     """Places of the frames and their poses (N, 4, 4), without reading the images."""
     end = file.seek(0, 1), file.seek(0, 2)
     file.seek(end[0])
@@ -174,7 +174,7 @@ def _times(microseconds: list[int]) -> NDArray[np.float64]:
     return times.astype(np.float64)
 
 
-def _unpack(file: BinaryIO, form: str) -> tuple:
+def _unpack(file: IO[bytes], form: str) -> tuple:
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 
