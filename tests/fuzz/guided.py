@@ -2,8 +2,9 @@
 
 Usage: python tests/fuzz/guided.py "sens" [libFuzzer's options, e.g. -max_total_time=60]
 
-For loaders of one file. Needs the package atheris, which nothing else needs: pip install atheris. An input that fails is
-written to the folder of the call as ``crash-...``; the corpus lives in a temporary folder and starts with the valid file.
+For loaders of one file. Needs the package atheris, which nothing else needs: pip install atheris. An input that fails
+is written to the folder of the call as ``crash-...``; the corpus lives in a temporary folder and starts with the valid
+file.
 """
 
 import shutil
@@ -26,11 +27,11 @@ with atheris.instrument_imports(include=["dudmap", "rosbags"], exclude=["dudmap.
     import dudmap.sequences
     import dudmap.sequences.camera_json
     import dudmap.sequences.masks
-    import dudmap.viewing.run_files  # noqa: F401
+    import dudmap.viewing.run_files
 
     dudmap.sequences.readers()
 
-from trial import Subject  # noqa: E402
+from trial import Subject
 
 
 def main() -> None:
