@@ -128,6 +128,8 @@ class Mesh:
         if len(vertices) == 0:
             raise MapError(f"the mesh {path} holds no vertices")
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int32).reshape(-1, 3)
+        if vertices.shape != (len(vertices), 3) or (len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)):
+            raise MapError(f"the mesh {path} is damaged: vertices without three coordinates, or faces without vertices")
         if isinstance(loaded, trimesh.Trimesh):
             visual = loaded.visual.to_color() if isinstance(loaded.visual, TextureVisuals) else loaded.visual
             assert isinstance(visual, ColorVisuals)
