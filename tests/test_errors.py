@@ -10,6 +10,8 @@ from typer.testing import CliRunner
 
 from dudmap import doctor, errors
 from dudmap.cli import app
+from dudmap.sequences import open_sequence
+from fake_slam import FakeVolume
 from recordings import write_recording
 
 ROOT = Path(__file__).parents[1]
@@ -143,6 +145,24 @@ def test_a_defect_leaves_a_report_and_what_was_computed(slam, tmp_path, monkeypa
     )
     assert again.exit_code == 0, again.stderr
     assert not list(out.glob("crash-*.txt")), "a new run removes the report of the old one"
+
+
+def test_a_map_that_the_defect_spoilt_does_not_hide_it(slam, tmp_path, monkeypatch):
+    recording, out = write_recording(tmp_path / "desk", 5), tmp_path / "run"
+    slam.script = {3: ZeroDivisionError("injected")}
+    monkeypatch.setattr(FakeVolume, "extract_mesh", lambda self: [][1])
+    done = CliRunner().invoke(app, ["run", str(recording), "--out", str(out), *PLAIN])
+    assert "ZeroDivisionError: injected" in done.stderr
+    assert len((out / "trajectory.txt").read_text().splitlines()) == 4
+    assert json.loads((out / "metrics.json").read_text())["not_written"] == ["list index out of range"]
+
+
+def test_frames_can_be_iterated_and_counted_from_the_end(tmp_path):
+    sequence = open_sequence(write_recording(tmp_path / "desk", 3))
+    assert [frame.timestamp for frame in sequence] == [100, 100.1, 100.2]
+    assert sequence[-1].timestamp == 100.2
+    with pytest.raises(IndexError):
+        sequence[3]
 
 
 def test_a_defect_outside_of_a_run_leaves_a_report_where_one_stands(tmp_path, monkeypatch):

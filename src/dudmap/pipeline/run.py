@@ -112,7 +112,7 @@ def run(
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     finished: tuple[Slam, RunRecord] | None = None
     prepare_run_folder(out, masks, save_masks=save_masks)
-    stopped = ""
+    stopped, defect = "", False
     with RunProgress(count * passes, bar=progress) as display:
         try:
             if live:
@@ -152,13 +152,13 @@ def run(
             stopped = str(error)
             raise type(error)(f"{stopped}; {_saved(finished)} in {out}") from error
         except BaseException as error:
-            stopped = repr(error)
+            stopped, defect = repr(error), not isinstance(error, OSError)
             raise
         finally:
             display.working("writing")
             if stopped and finished is not None:  # the first pass is complete, the second is not
                 slam, record = finished
-            report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map)
+            report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map, defect=defect)
             for observer in observers:
                 observer.finish(out)
     if record.rows and not len(report.trajectory):

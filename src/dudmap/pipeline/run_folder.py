@@ -101,16 +101,17 @@ def write_run_folder(
     stopped: str,
     *,
     save_map: bool,
+    defect: bool = False,
 ) -> RunReport:
     """Write all files of the run folder; a file that fails does not prevent the others.
 
-    After a run that an error has stopped, what cannot be made of its state is listed under ``not_written`` in
+    After a defect of dudmap itself, what cannot be made of the state that it left is listed under ``not_written`` in
     metrics.json, so that the error is not replaced by another one.
 
     Raises:
-        DudmapError: A file could not be written, and the run was not stopped by an error.
+        DudmapError: A file could not be written, other than after a defect.
     """
-    foreseen = Exception if stopped else (OSError, MapError)
+    foreseen = Exception if defect else (OSError, MapError)
     (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= record.metrics()
@@ -172,7 +173,7 @@ def write_run_folder(
         if problems:
             metrics["not_written"] = problems
         save_metrics()
-    if problems and not stopped:
+    if problems and not defect:
         raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
     return RunReport(out, metrics, trajectory)
 

@@ -75,6 +75,7 @@ class ImageFolder(ABC):
         Raises:
             FrameError: The frame cannot be read, or has another size than the recording.
         """
+        index = range(len(self))[index]
         with damaged(FrameError, f"frame {index} of {self.path}"):
             frame = self._read(index, self.camera.depth_scale)
         if frame.depth.shape != self.camera.shape:
