@@ -13,7 +13,7 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
-from dudmap.cli.run import read_bytes
+from dudmap.cli.run import memory_size
 from dudmap.config import Config
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
@@ -40,7 +40,7 @@ def main() -> None:
     width, height = (int(number) for number in options.size.split("x"))
     camera = DEFAULT_CAMERA.resized(width, height)
     corridor = ring_corridor(options.length, options.speed, options.fps, camera=camera)
-    limit = None if options.max_memory == "none" else MemoryLimit(read_bytes(options.max_memory))
+    limit = None if options.max_memory == "none" else MemoryLimit(memory_size(options.max_memory))
     slam = Slam(camera, Config().override(options.set), max_blocks=limit)
     print(f"{len(corridor)} frames of {options.size}, {options.length:g} m; {machine()['cpu']}")
     print("| walk m | ms per frame, median | memory MB | blocks in memory | on disk | lost | corrections |")

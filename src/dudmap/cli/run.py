@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.view import observers
+from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -51,6 +51,9 @@ PortOption = Annotated[int, typer.Option("--port", help="Port of the page of --v
 RerunOption = Annotated[
     Path | None,
     typer.Option("--rerun", help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd"),
+]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", help="File for one JSON object per line and event of the run.", metavar="FILE")
 ]
 
 
@@ -115,7 +118,9 @@ def run(
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
+    log: LogOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -134,7 +139,8 @@ def run(
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
-        _resume(resume, page=(host, port) if view else None, rerun=rerun, quiet=quiet, as_json=as_json)
+        page = (host, port, token) if view else None
+        _resume(resume, page=page, rerun=rerun, log=log, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
@@ -156,17 +162,17 @@ def run(
         parameters = parameters.override(["sensor.self_calibration=false"])
     opened = {"path": str(sequence.resolve()), "camera": camera, "topics": topics}
     storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
             depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
-            max_memory=None if max_memory is None else read_bytes(max_memory), observers=watching, storing=storing,
+            max_memory=None if max_memory is None else memory_size(max_memory), observers=watching, storing=storing,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
-def read_bytes(text: str) -> int:
+def memory_size(text: str) -> int:
     """Number of bytes of a text such as 1GB or 800MB.
 
     Raises:
@@ -180,11 +186,19 @@ def read_bytes(text: str) -> int:
         raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
 
 
-def _resume(folder: Path, *, page: tuple[str, int] | None, rerun: Path | None, quiet: bool, as_json: bool) -> None:
+def _resume(
+    folder: Path,
+    *,
+    page: tuple[str, int, str | None] | None,
+    rerun: Path | None,
+    log: Path | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
     """Go on with an interrupted run."""
     from dudmap.pipeline.resume import resume, wants_report
 
-    with observers(report=wants_report(folder), page=page, rerun=rerun) as watching:
+    with observers(report=wants_report(folder), page=page, rerun=rerun, log=log) as watching:
         done = resume(folder, progress=not quiet, observers=watching)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 

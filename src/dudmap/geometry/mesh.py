@@ -4,13 +4,14 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.errors import MapError
+from dudmap.input_files import foreign, open_plain
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -97,19 +98,28 @@ class Mesh:
             raise MapError(f"cannot read the mesh {path}: {error}") from error
         if own is not None and len(own.vertices) > 0:
             return own
+        if path.suffix.lower() not in FORMATS:  # others may be archives, or name further files
+            raise MapError(f"cannot read the mesh {path}; the ending must be one of {', '.join(FORMATS)}")
+        with foreign(MapError, f"the mesh {path}"):
+            return cls._load_foreign(path)
+
+    @classmethod
+    def _load_foreign(cls, path: Path) -> "Mesh":
+        """Read a file that another program wrote; materials, which name further files, are left out."""
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
-        try:
-            loaded = trimesh.load(path, process=False, force=None)
-        except (OSError, ValueError, NotImplementedError, LookupError, TypeError) as error:  # trimesh on broken headers
-            raise MapError(f"cannot read the mesh {path}: {error}") from error
+        options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        with open_plain(path) as file:
+            loaded = trimesh.load(file, file_type=path.suffix.lower()[1:], process=False, force=None, **options)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float32)
         if len(vertices) == 0:
             raise MapError(f"the mesh {path} holds no vertices")
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int32).reshape(-1, 3)
+        if vertices.shape != (len(vertices), 3) or (len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)):
+            raise MapError(f"the mesh {path} is damaged: vertices without three coordinates, or faces without vertices")
         if isinstance(loaded, trimesh.Trimesh):
             visual = loaded.visual.to_color() if isinstance(loaded.visual, TextureVisuals) else loaded.visual
             assert isinstance(visual, ColorVisuals)
@@ -154,7 +164,7 @@ def ply_layout(path: Path) -> tuple[NDArray, NDArray] | None:
         MapError: The file is cut off.
         OSError: It cannot be read.
     """
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         head = file.read(1024)
     counts = [int(count) for count in re.findall(rb"element (?:vertex|face) (\d+)", head)[:2]]
     vertices, faces = (*counts, 0, 0)[:2]

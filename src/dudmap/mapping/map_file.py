@@ -12,12 +12,15 @@ from dudmap.atomic_file import atomic_file
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, open_arrays
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
 if TYPE_CHECKING:
     from dudmap.mapping.volume import TsdfVolume
 
 FORMAT = "dudmap map 1"
+LARGEST_DEPTH = 1000.0
+"""Largest range of depth of a map file, metres; the steps of a raycast grow with it. Depth cameras reach 100 m."""
 
 
 class MapContent(NamedTuple):
@@ -84,9 +87,11 @@ def read_map(path: str | Path) -> MapContent:
         MapError: The file is missing, damaged or not a map of this version.
     """
     try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with open_arrays(path) as data:
             if str(data["format"]) != FORMAT:
                 raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
+            if not 0 < data["depth_max"] <= LARGEST_DEPTH:
+                raise ValueError(f"its depths reach {data['depth_max']} m; expected up to {LARGEST_DEPTH:g} m")
             fx, fy, cx, cy = (float(value) for value in data["camera"])
             width, height = (int(value) for value in data["image"])
             return MapContent(
@@ -98,5 +103,5 @@ def read_map(path: str | Path) -> MapContent:
                     data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
                 ),
             )
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error

@@ -224,7 +224,12 @@ class VoxelBlocks:
         geometry: NDArray[np.int32],
         colors: NDArray[np.int32],
     ) -> "VoxelBlocks":
-        """Blocks of a map file: all entries, and entry and voxels of each slot."""
+        """Blocks of a map file: all entries, and entry and voxels of each slot.
+
+        Raises:
+            ValueError: The arrays do not belong together, or a block is there twice.
+        """
+        _check_restored(coords, free_count, entries, geometry, colors)
         blocks, n, m = cls(), len(coords), len(entries)
         blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
         blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n
@@ -236,6 +241,29 @@ class VoxelBlocks:
         blocks.slot_of = np.full(n, -1, dtype=np.int32)
         blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
         return blocks
+
+
+def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
+    """Check types, shapes and ranges of the arrays of a map file, which kernels take as they are.
+
+    Raises:
+        ValueError: They are not those of a map.
+    """
+    n, m = len(coords), len(entries)
+    wanted = {
+        "coords": (coords, np.int32, (n, 3)), "free_count": (free_count, np.uint8, (n,)),
+        "entries": (entries, np.int32, (m,)), "geometry": (geometry, np.int32, (m, BLOCK**3)),
+        "colors": (colors, np.int32, (m, BLOCK**3)),
+    }  # fmt: skip
+    for name, (array, kind, shape) in wanted.items():
+        if array.dtype != kind or array.shape != shape:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {np.dtype(kind)} {shape}")
+    if m and not (0 <= entries.min() and entries.max() < n and len(np.unique(entries)) == m):
+        raise ValueError("the voxels of a block belong to no block, or two to one")
+    if n and np.abs(coords.astype(np.int64)).max() > np.iinfo(np.int16).max:
+        raise ValueError("a block lies farther away than block coordinates reach")
+    if len(np.unique(coords, axis=0)) != n:
+        raise ValueError("a block is there twice")
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:

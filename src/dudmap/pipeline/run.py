@@ -175,7 +175,7 @@ class Job:
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
-        out, display, stopped = self.out, self.display, ""
+        out, display, stopped, defect = self.out, self.display, "", False
         with display:
             try:
                 if self.live:
@@ -193,10 +193,10 @@ class Job:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
             except BaseException as error:
-                stopped = repr(error)
+                stopped, defect = repr(error), not isinstance(error, OSError)
                 raise
             finally:
-                report = self._finish(state, store, stopped)
+                report = self._finish(state, store, stopped, defect=defect)
         record = state.record
         if record.rows and not len(report.trajectory):
             raise DudmapError(
@@ -250,7 +250,7 @@ class Job:
             calibration=state.calibration,
         )  # fmt: skip
 
-    def _finish(self, state: RunState, store: RunStore | None, stopped: str) -> RunReport:
+    def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
         self.display.working("writing")
         slam, record = state.slam, state.record
@@ -259,7 +259,7 @@ class Job:
         complete = False
         try:
             report = write_run_folder(
-                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map
+                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map, defect=defect
             )
             for observer in self.observers:
                 observer.finish(self.out)
@@ -308,6 +308,8 @@ def process_source(
     if isinstance(read.frame, FrameError):
         record.unreadable.append(str(read.frame))
         display.note(f"skipped: {read.frame}")
+        for observer in observers:
+            observer.event("unreadable", frame=index, reason=str(read.frame))
         return
     true_mask = read.true_mask
     if isinstance(true_mask, FrameError):
