@@ -41,11 +41,22 @@ class BlockSums:
     color: NDArray[np.int32]
     free: NDArray[np.int64]
 
-    def __add__(self, other: "BlockSums") -> "BlockSums":
-        """Sums of both over the same blocks."""
-        assert np.array_equal(self.coords, other.coords)
-        names = list(self.__dataclass_fields__)[1:]
-        return BlockSums(self.coords, *(getattr(self, name) + getattr(other, name) for name in names))
+    @classmethod
+    def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
+        """Sums over no map."""
+        n = len(coords)
+        flat = [np.zeros((n, VOXELS), kind) for kind in (np.int32, np.int64, np.int32, np.int32, np.int32)]
+        return cls(coords, *flat, np.zeros((n, VOXELS, 3), np.int32), np.zeros(n, np.int64))
+
+    def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
+        """Sums over some of the blocks."""
+        return BlockSums(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def add(self, rows: NDArray[np.intp], other: "BlockSums") -> None:
+        """Add sums over the same blocks as ``rows`` (k,) of these."""
+        assert np.array_equal(self.coords[rows], other.coords)
+        for name in list(self.__dataclass_fields__)[1:]:
+            getattr(self, name)[rows] += getattr(other, name)
 
 
 def block_sums(

@@ -1,18 +1,22 @@
 """Joining two saved maps: relative pose, refinement, checks, fusion."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import SensorConfig
 from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging.agreement import Agreement, agreement
 from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
 from dudmap.merging.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
+from dudmap.places.place_recognition import Keyframe
 from dudmap.places.saved_map import SavedMap
 
 SURFACE_POINTS = 20_000
@@ -20,6 +24,7 @@ SURFACE_POINTS = 20_000
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
 """Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
 features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
+NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
 MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
 """Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
 degrees: that of a relocalised frame (``relocalization.max_distance``)."""
@@ -55,25 +60,52 @@ class MapPair:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class MapSurface:
+    """A map with points on its surface, to be compared with others."""
+
+    volume: TsdfVolume
+    points: SurfacePoints
+
+    @classmethod
+    def of(cls, saved: SavedMap) -> "MapSurface":
+        """That of a saved map.
+
+        Raises:
+            MapError: The map has no surface.
+        """
+        positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
+        return cls(saved.volume, surface_points(saved.volume, positions, SURFACE_POINTS))
+
+
 def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     """Find the relative pose of two maps and decide whether they show the same place.
-
-    Relative poses that the features suggest are refined and checked one after the other; the first that passes all
-    checks is taken.
 
     Raises:
         ConfigError: The voxels differ in size.
         MapError: A map has no surface.
     """
     check_voxel_sizes([a.volume, b.volume])
-    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
-    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    found = suggested_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     if not found:
-        return MapPair(None, "too few places of one were recognised in the other at the same relative pose")
-    of_a, of_b = (surface_points(saved.volume, _positions(saved), SURFACE_POINTS) for saved in (a, b))
+        return MapPair(None, NOT_RECOGNISED)
+    return decided(MapSurface.of(a), MapSurface.of(b), found)
+
+
+def suggested_poses(
+    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
+) -> list[Hypothesis]:
+    """Relative poses that enough features of two maps with these keyframes suggest, best first."""
+    found = relative_poses(a, b, camera, sensor=sensor)
+    return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+
+
+def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis]) -> MapPair:
+    """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
+    is taken."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a.volume, b.volume, of_a, of_b, hypothesis)
+        pair = _checked(a.volume, b.volume, a.points, b.points, hypothesis)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -84,11 +116,6 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     """Fuse two maps into one in the world of a, with the keyframes of both."""
     moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
-
-
-def _positions(saved: SavedMap) -> NDArray[np.float64]:
-    """Positions (k, 3) of the keyframes."""
-    return np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
 
 
 def _checked(a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, hypothesis: Hypothesis) -> MapPair:
