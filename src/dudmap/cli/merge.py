@@ -38,7 +38,7 @@ def merge(
     if len(runs) == 2 and not world:
         from dudmap.pipeline.merge import merge_runs
 
-        report = merge_runs(*runs, out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}"))
+        report = merge_runs(runs[0], runs[1], out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}"))
         found = report.tree
         text = (
             f"merged by {found['features']} features of {found['keyframes']} keyframes: {found['area']:.1f} m2 of "

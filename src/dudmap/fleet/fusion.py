@@ -1,14 +1,13 @@
 """Fusion of many maps into one on disk, a range of space at a time.
 
-The world is cut into cells of 16x16x16 blocks, which are octree nodes and so have consecutive Morton codes. A range is a
-sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses a range by itself: it adds the maps that
-reach into it one after the other, writes the blocks as a map file and the surface of every cell as a tile. Blocks of other
-ranges that touch the range are fused along with it, for the triangles at its border, and left out of the file.
+The world is cut into cells of 16x16x16 blocks, which are octree nodes and so have consecutive Morton codes. A range is
+a sequence of cells with about ``RANGE_BLOCKS`` blocks with voxels. A worker fuses a range by itself: it adds the maps
+that reach into it one after the other, writes the blocks as a map file and the surface of every cell as a tile. Blocks
+of other ranges that touch the range are fused along with it, for the triangles at its border, and left out of the file.
 """
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +15,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.fleet.inputs import MapHeader
+from dudmap.fleet.open_maps import open_map, reached_blocks
 from dudmap.fleet.tiles import Tile, write_tile
 from dudmap.fleet.workers import Workers
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging import morton
 from dudmap.merging.map_fusion import FusedRange, RangeFusion, ReachedBlocks
-from dudmap.places.saved_map import MAP_FILE
 
 CELL_BITS = 12
 """Bits of the code of a block within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""
 RANGE_BLOCKS = 6000
 """Blocks with voxels at which a range ends: 110 MB of sums, and half as many again for the blocks around it."""
-OPEN_MAPS = 2
-"""Maps that a worker keeps in memory for its next range."""
 MAP_FOLDER = "map"
 """Folder of the map files of the ranges."""
 _AROUND = np.stack(np.meshgrid(*[np.arange(-1, 2)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -87,19 +84,20 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
             blocks[cell] = blocks.get(cell, 0) + count
         for cell in cells.tolist():
             reached.setdefault(cell, set()).add(number)
-    out: list[CellRange] = []
-    first, total, numbers = None, 0, set[int]()
-    cells = sorted(reached)
-    around = _with_neighbours(np.array(cells, np.int64), CELL_BITS // 3)
-    for cell, neighbours in zip(cells, around.tolist(), strict=True):
+    groups: list[list[int]] = []
+    total = 0
+    for cell in sorted(reached):
         held = min(blocks.get(cell, 0), 1 << CELL_BITS)
-        if first is not None and total + held > limit:
-            out.append(CellRange(first, last, tuple(sorted(numbers))))
-            first, total, numbers = None, 0, set()
-        first, last, total = (cell if first is None else first), cell, total + held
-        numbers |= set().union(*(reached.get(other, ()) for other in neighbours))
-    if first is not None:
-        out.append(CellRange(first, last, tuple(sorted(numbers))))
+        if not groups or total + held > limit:
+            groups.append([])
+            total = 0
+        groups[-1].append(cell)
+        total += held
+    out = []
+    for group in groups:
+        around = np.unique(_with_neighbours(np.array(group, np.int64), CELL_BITS // 3)).tolist()
+        numbers = set[int]().union(*(reached.get(cell, ()) for cell in around))
+        out.append(CellRange(group[0], group[-1], tuple(sorted(numbers))))
     return out
 
 
@@ -107,7 +105,7 @@ def fuse_range(job: RangeJob) -> RangeResult:
     """Fuse a range, write its map file and the tiles of its cells."""
     like = job.like.volume()
     low, high = job.range.first << CELL_BITS, (job.range.last + 1) << CELL_BITS
-    reached = [_reached(run.folder, run.T_world_run.tobytes()) for run in job.runs]
+    reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in job.runs]
     inside = [one.within(low, high) for one in reached]
     near = _union([one.near for one in inside])
     empty = np.setdiff1d(_union([one.empty for one in inside]), near)
@@ -118,7 +116,7 @@ def fuse_range(job: RangeJob) -> RangeResult:
     for run, one in zip(job.runs, reached, strict=True):
         part = ReachedBlocks(np.intersect1d(one.near, wanted), np.intersect1d(one.empty, wanted))
         if len(part.near) or len(part.empty):
-            fusion.add(_volume(run.folder), run.T_world_run, part)
+            fusion.add(open_map(run.folder), run.T_world_run, part)
     fused = fusion.fused()
     own = fused.chosen((fused.codes >= low) & (fused.codes < high))
     name = f"{MAP_FOLDER}/{job.range.first:013x}.npz"
@@ -156,7 +154,7 @@ def _entry(name: str, cells: CellRange, own: FusedRange, block_size: float) -> d
 
 def _occupied_cells(run: PlacedRun) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Cells that the voxels of a run reach, blocks in each, and all cells that it reaches."""
-    reached = _reached(run.folder, run.T_world_run.tobytes())
+    reached = reached_blocks(run.folder, run.T_world_run.tobytes())
     near, counts = np.unique(reached.near >> CELL_BITS, return_counts=True)
     return near, counts, np.union1d(near, reached.empty >> CELL_BITS)
 
@@ -169,16 +167,3 @@ def _with_neighbours(codes: NDArray[np.int64], level: int) -> NDArray[np.int64]:
 
 def _union(parts: Sequence[NDArray[np.int64]]) -> NDArray[np.int64]:
     return np.unique(np.concatenate([np.zeros(0, np.int64), *parts]))
-
-
-@lru_cache(maxsize=64)
-def _reached(folder: Path, pose: bytes) -> ReachedBlocks:
-    """Blocks that a run at a pose (its 128 bytes) reaches."""
-    header = MapHeader.read(folder / MAP_FILE)
-    T = np.frombuffer(pose).reshape(4, 4)
-    return ReachedBlocks.of(header.coords, header.has_voxels, T, header.volume().block_size)
-
-
-@lru_cache(maxsize=OPEN_MAPS)
-def _volume(folder: Path) -> TsdfVolume:
-    return TsdfVolume.load(folder / MAP_FILE)

@@ -116,7 +116,9 @@ def load_part(world: str | Path, low: NDArray[np.float64], high: NDArray[np.floa
     """
     tree = read_world(world)
     touching = [
-        one for one in tree["ranges"] if np.all(np.array(one["low_m"]) <= high) and np.all(np.array(one["high_m"]) >= low)
+        one
+        for one in tree["ranges"]
+        if np.all(np.array(one["low_m"]) <= high) and np.all(np.array(one["high_m"]) >= low)
     ]
     if not touching:
         raise MapError(f"nothing of the world {world} lies in the box from {low.tolist()} to {high.tolist()} m")
@@ -233,4 +235,3 @@ def _sentences(graph: RunGraph, folders: Sequence[Path]) -> list[str]:
 def _write_json(path: Path, tree: dict[str, Any]) -> None:
     with atomic_file(path) as file:
         file.write((json.dumps(tree, indent=1) + "\n").encode())
-

@@ -2,24 +2,21 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.fleet.inputs import MapHeader
+from dudmap.fleet.open_maps import keyframes_of, surface_of
 from dudmap.fleet.workers import Workers
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, MapSurface, decided, suggested_poses
+from dudmap.merging.agreement import PROPOSED
+from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided, suggested_poses
 from dudmap.merging.place_index import PARTNERS, TRAINING, candidate_pairs, described, learnt_words
-from dudmap.places.place_recognition import Keyframe
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap, load_keyframes
+from dudmap.places.saved_map import MAP_FILE
 
 ALL_PAIRS = PARTNERS + 2
 """Number of runs up to which all pairs are compared: the index would leave out next to none."""
-OPEN_MAPS = 3
-"""Maps that a worker keeps in memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,12 +60,14 @@ def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], worke
 def _sample(job: tuple[Path, int]) -> NDArray[np.float32]:
     """At most so many features (n, 128) of a run, evenly spread."""
     path, count = job
-    features = np.concatenate([keyframe.features.descriptors for keyframe in _keyframes(path)] or [np.zeros((0, 128))])
+    features = np.concatenate(
+        [keyframe.features.descriptors for keyframe in keyframes_of(path)] or [np.zeros((0, 128))]
+    )
     return features[:: max(1, len(features) // count)][:count].astype(np.float32)
 
 
 def _described(job: tuple[Path, NDArray[np.float32]]) -> NDArray[np.float32]:
-    return described(_keyframes(job[0]), job[1])
+    return described(keyframes_of(job[0]), job[1])
 
 
 def _compare(job: tuple[Path, list[Path]]) -> list[MapPair]:
@@ -79,17 +78,7 @@ def _compare(job: tuple[Path, list[Path]]) -> list[MapPair]:
 
 
 def _compare_two(a: Path, b: Path, header: MapHeader) -> MapPair:
-    found = suggested_poses(_keyframes(a), _keyframes(b), header.camera, header.sensor)
+    found = suggested_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor)
     if not found:
         return MapPair(None, NOT_RECOGNISED)
-    return decided(_surface(a), _surface(b), found)
-
-
-@lru_cache(maxsize=32)
-def _keyframes(folder: Path) -> list[Keyframe]:
-    return load_keyframes(folder / KEYFRAME_FILE)[0]
-
-
-@lru_cache(maxsize=OPEN_MAPS)
-def _surface(folder: Path) -> MapSurface:
-    return MapSurface.of(SavedMap(TsdfVolume.load(folder / MAP_FILE), _keyframes(folder)))
+    return decided(surface_of(a), surface_of(b), found, PROPOSED)

@@ -22,7 +22,7 @@ from dudmap.geometry.mesh_simplification import clustered
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
-"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn, so that a tile has the axes of the map."""
+"""glTF is y up and readers of 3D Tiles turn it to z up; this undoes the turn: a tile then has the axes of the map."""
 T_ZUP_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
 """The map has the axes of the first camera, x to the right and y down; the tileset is z up."""
 BITS_PER_LEVEL = 3
@@ -59,9 +59,7 @@ class _ParentJob:
     work: Path
 
 
-def write_tile(
-    mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()
-) -> Tile:
+def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
     """Write the GLB file of a tile, and its mesh for its parent."""
     with atomic_file(out / TILE_FOLDER / f"{name}.glb") as file:
         file.write(encoded(mesh, T_GLTF_MAP))

@@ -44,9 +44,15 @@ class BlockSums:
     @classmethod
     def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
         """Sums over no map."""
-        n = len(coords)
-        flat = [np.zeros((n, VOXELS), kind) for kind in (np.int32, np.int64, np.int32, np.int32, np.int32)]
-        return cls(coords, *flat, np.zeros((n, VOXELS, 3), np.int32), np.zeros(n, np.int64))
+        shape = len(coords), VOXELS
+
+        def zeros(*shape: int, kind: type = np.int32) -> NDArray:
+            return np.zeros(shape, kind)
+
+        return cls(
+            coords, zeros(*shape), zeros(*shape, kind=np.int64), zeros(*shape), zeros(*shape), zeros(*shape),
+            zeros(*shape, 3), zeros(len(coords), kind=np.int64),
+        )  # fmt: skip
 
     def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
         """Sums over some of the blocks."""

@@ -6,6 +6,7 @@ are added one after the other in any order, so that neither all maps nor the who
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +165,7 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
     near = np.unique(np.concatenate([one.near for one in reached]))
     borders = [0, *near[RANGE_BLOCKS::RANGE_BLOCKS].tolist(), np.iinfo(np.int64).max]
     parts = []
-    for low, high in zip(borders, borders[1:], strict=False):
+    for low, high in pairwise(borders):
         inside = [one.within(low, high) for one in reached]
         here = near[slice(*np.searchsorted(near, [low, high]))]
         empty = np.setdiff1d(np.concatenate([one.empty for one in inside]), here)

@@ -11,7 +11,7 @@ from dudmap.config import SensorConfig
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.agreement import Agreement, agreement
+from dudmap.merging.agreement import NAMED, Agreement, Limits, agreement
 from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
@@ -100,12 +100,12 @@ def suggested_poses(
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
 
-def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis]) -> MapPair:
+def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], limits: Limits = NAMED) -> MapPair:
     """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
     is taken."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a.volume, b.volume, a.points, b.points, hypothesis)
+        pair = _checked(a, b, hypothesis, limits)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -118,18 +118,18 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _checked(a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, hypothesis: Hypothesis) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, limits: Limits) -> MapPair:
     """Refine a relative pose and check what follows from it."""
-    aligned = align_maps(a, b, of_a, of_b, hypothesis.T_a_b)
+    aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
         return MapPair(None, "their surfaces do not settle on each other", hypothesis, aligned)
     if aligned.stiffness < MIN_STIFFNESS:
         return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
     correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b
-    middle = of_b.points.mean(axis=0)
+    middle = b.points.points.mean(axis=0)
     moved = np.linalg.norm(correction[:3, :3] @ middle + correction[:3, 3] - middle)
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
-    checked = agreement(a, b, of_a, of_b, aligned.T_a_b)
-    reason = checked.rejection_reason()
+    checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
+    reason = checked.rejection_reason(limits)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

@@ -44,10 +44,10 @@ def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
 def described(keyframes: Sequence[Keyframe], words: NDArray[np.float32]) -> NDArray[np.float32]:
     """VLAD descriptors (keyframes, words * 128), unit length."""
     out = np.zeros((len(keyframes), *words.shape), np.float32)
-    for row, keyframe in zip(out, keyframes, strict=True):
+    for number, keyframe in enumerate(keyframes):
         features = keyframe.features.descriptors
         word = np.argmax(features @ words.T - np.square(words).sum(axis=1) / 2, axis=1)  # the nearest
-        np.add.at(row, word, features - words[word])
+        np.add.at(out[number], word, features - words[word])
     out /= np.maximum(np.linalg.norm(out, axis=2, keepdims=True), 1e-9)
     flat = out.reshape(len(keyframes), -1)
     return flat / np.maximum(np.linalg.norm(flat, axis=1, keepdims=True), 1e-9)

@@ -25,6 +25,7 @@ CHI_SQUARE = 22.46
 """99.9 % quantile of the chi-square distribution with 6 degrees of freedom: limit of the squared error of a cycle, and
 of a relative pose, in standard deviations."""
 
+
 @dataclass(frozen=True, eq=False)
 class Join:
     """Relative pose of two runs: ``T_a_b`` (4, 4) brings the world of run b to that of run a."""
