@@ -183,7 +183,11 @@ def _poses(walk: Walk, times: NDArray[np.float64], rng: np.random.Generator) -> 
             ahead = on_ring(s + 1.8) - eye[:2]
         else:
             eye = np.array([-0.4 if walk.kind == "entry" else -1.2, 1.2, z + 1.45])
-            eye += np.array([1.8 * part, 0, 0]) if walk.kind == "entry" else np.array([0, 0, STOREY * part])
+            eye += (
+                np.array([1.8 * part, 0, 0])
+                if walk.kind == "entry"
+                else np.array([0, 0, STOREY * (3 * part**2 - 2 * part**3)])
+            )
             ahead = np.array([1.8, 0.0])
         angle = turn[k] * (1.0 if walk.kind != "lift" else 0.4)
         c, s = np.cos(angle), np.sin(angle)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dudmap.fleet.inputs import MapHeader
 from dudmap.fleet.open_maps import keyframes_of, surface_of
 from dudmap.fleet.workers import Workers
-from dudmap.merging.agreement import PROPOSED
+from dudmap.merging.agreement import MANY_COLOR_SHARE
 from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided, suggested_poses
 from dudmap.merging.place_index import PARTNERS, TRAINING, candidate_pairs, described, learnt_words
 from dudmap.places.saved_map import MAP_FILE
@@ -81,4 +81,4 @@ def _compare_two(a: Path, b: Path, header: MapHeader) -> MapPair:
     found = suggested_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor)
     if not found:
         return MapPair(None, NOT_RECOGNISED)
-    return decided(surface_of(a), surface_of(b), found, PROPOSED)
+    return decided(surface_of(a), surface_of(b), found, MANY_COLOR_SHARE)

@@ -11,7 +11,7 @@ from dudmap.config import SensorConfig
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.agreement import NAMED, Agreement, Limits, agreement
+from dudmap.merging.agreement import MIN_COLOR_SHARE, Agreement, agreement
 from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
@@ -100,12 +100,14 @@ def suggested_poses(
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
 
-def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], limits: Limits = NAMED) -> MapPair:
+def decided(
+    a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], min_color_share: float = MIN_COLOR_SHARE
+) -> MapPair:
     """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
     is taken."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a, b, hypothesis, limits)
+        pair = _checked(a, b, hypothesis, min_color_share)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -118,7 +120,7 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, limits: Limits) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, min_color_share: float) -> MapPair:
     """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
@@ -131,5 +133,5 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, limits: Limit
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
     checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
-    reason = checked.rejection_reason(limits)
+    reason = checked.rejection_reason(min_color_share)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)
