@@ -18,7 +18,7 @@ from dudmap.fleet import fusion
 from dudmap.fleet.fusion import PlacedRun, RangeJob, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
 from dudmap.fleet.merge import load_part, merge_fleet, read_world
-from dudmap.fleet.tiles import T_GLTF_MAP, write_tileset, write_tree
+from dudmap.fleet.tiles import T_GLTF_MAP, write_tile, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
@@ -234,8 +234,6 @@ def test_bad_input_is_named_before_anything_is_computed(places, tmp_path):
 def test_a_world_of_one_tile_has_a_tileset(tmp_path):
     for name in ("tiles", "work"):
         (tmp_path / name).mkdir()
-    from dudmap.fleet.tiles import write_tile
-
     triangle = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
     mesh = Mesh(triangle, np.array([[0, 1, 2]], np.int32), np.zeros((3, 3), np.uint8), np.zeros((3, 3), np.float32))
     leaf = write_tile(mesh, f"{5:013x}", 0, tmp_path, tmp_path / "work")
