@@ -15,7 +15,7 @@ from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided, suggest
 from dudmap.merging.place_index import PARTNERS, TRAINING, candidate_pairs, described, learnt_words
 from dudmap.places.saved_map import MAP_FILE
 
-ALL_PAIRS = PARTNERS + 2
+ALL_PAIRS = PARTNERS
 """Number of runs up to which all pairs are compared: the index would leave out next to none."""
 
 

@@ -23,7 +23,7 @@ TRAINING = 50_000
 """Features that the words are learnt from, at most; 3000 for each word."""
 NEIGHBOURS = 10
 """Keyframes of other runs that a keyframe votes for."""
-PARTNERS = 6
+PARTNERS = 8
 """Runs that each run is compared with; several, since look-alikes compete with the neighbours of a run."""
 
 
