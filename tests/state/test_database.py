@@ -8,8 +8,9 @@ import pytest
 from dudmap.errors import DudmapError, StateError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
-from dudmap.mapping.morton import MAP_SHIFT, block_coords, block_keys, morton_codes
+from dudmap.mapping import morton
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.state.block_keys import BITS, MAP_SHIFT, block_coords, block_keys
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.system import differences, restore, take_snapshot
 
@@ -63,7 +64,7 @@ def assert_same(tmp_path, a, b):
 
 def test_morton_codes_interleave_the_bits_of_the_coordinates():
     coords = np.random.default_rng(0).integers(-(1 << 15), 1 << 15, (500, 3)).astype(np.int16)
-    for code, block in zip(morton_codes(coords).tolist(), coords.tolist(), strict=True):
+    for code, block in zip(morton.encode(coords, BITS).tolist(), coords.tolist(), strict=True):
         bits = [f"{value + (1 << 15):016b}" for value in block]
         assert code == int("".join(x + y + z for x, y, z in zip(*bits, strict=True)), 2)
     for number in (0, 1, (1 << 15) - 1):

@@ -21,7 +21,7 @@ COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
     "view": "Show a run folder in the browser.",
     "report": "Write one page on a run that opens offline.",
-    "merge": "Join the maps of two runs of one place.",
+    "merge": "Join the maps of two or more runs of one place.",
     "export": "Write the results of a run for another program.",
     "render": "Render the map along a camera path, as a video or a recording.",
     "clean": "Write a recording as it would have been without what moves.",

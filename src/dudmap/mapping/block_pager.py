@@ -12,8 +12,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.mapping import morton
 from dudmap.mapping.memory_limit import MemoryLimit
-from dudmap.mapping.morton import morton_codes
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.voxel_blocks import BlockRecords, VoxelBlocks
 
@@ -271,7 +271,7 @@ def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
     near, _ = _regions_of_entries(blocks)
     stored = np.array(list(() if pager is None else pager.stored_regions), np.int64).reshape(-1, 3)
     regions = np.unique(np.concatenate([near, stored]), axis=0)
-    return [_key(region) for region in regions[np.argsort(morton_codes(regions.astype(np.int16)))]]
+    return [_key(region) for region in regions[np.argsort(morton.encode(regions))]]
 
 
 def _regions_of_entries(blocks: VoxelBlocks) -> tuple[NDArray[np.int64], NDArray[np.intp]]:

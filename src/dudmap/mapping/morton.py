@@ -1,42 +1,43 @@
-"""Morton codes (Z-order) of block coordinates: the keys of the blocks in the database."""
+"""Morton codes of blocks (Morton 1966): the bits of the three coordinates interleaved.
+
+Blocks with neighbouring codes are near each other, and all blocks of a cube of ``2^k`` blocks that begins at a multiple
+of ``2^k`` have one run of codes, those with the same ``code >> 3 k``.
+"""
 
 import numpy as np
 from numpy.typing import NDArray
 
-MAP_SHIFT = 48
-"""Bits of a Morton code of three coordinates of 16 bits; the number of the map stands above them."""
-MAX_MAPS = 1 << 15
-_SPREAD = ((32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
-           (2, 0x1249249249249249))  # fmt: skip
+BITS = 21
+"""Bits of a coordinate: blocks of 0.16 m then reach 168 km to either side."""
+_MASKS = (
+    (32, 0x1F00000000FFFF), (16, 0x1F0000FF0000FF), (8, 0x100F00F00F00F00F), (4, 0x10C30C30C30C30C3),
+    (2, 0x1249249249249249),
+)  # fmt: skip
 
 
-def morton_codes(coords: NDArray[np.int16]) -> NDArray[np.int64]:
-    """Morton codes (n,) of block coordinates (n, 3) int16: bit 3 i of a code is bit i of z, then y, then x.
-
-    The coordinates are shifted by 2^15, so that blocks beside each other in space are near each other in order on both
-    sides of the origin (Morton, "A computer oriented geodetic data base", 1966).
-    """
-    shifted = coords.astype(np.int64) + (1 << 15)
-    codes = np.zeros(len(coords), np.int64)
-    for axis in range(3):
-        bits = shifted[:, axis]
-        for shift, kept in _SPREAD:
-            bits = (bits | (bits << shift)) & kept
-        codes |= bits << (2 - axis)
-    return codes
+def encode(coords: NDArray[np.integer], bits: int = BITS) -> NDArray[np.int64]:
+    """Codes (...,) of block coordinates (..., 3) that have at most so many bits, the sign included; x has the highest
+    bit of each triple. The coordinates are shifted to be positive."""
+    x, y, z = (_spread(coords[..., axis].astype(np.int64) + (1 << (bits - 1))) for axis in range(3))
+    return (x << 2) | (y << 1) | z
 
 
-def block_coords(codes: NDArray[np.int64]) -> NDArray[np.int16]:
-    """Block coordinates (n, 3) int16 of Morton codes (n,), which may have the number of a map above them."""
-    out = np.empty((len(codes), 3), np.int64)
-    for axis in range(3):
-        bits = (codes >> (2 - axis)) & _SPREAD[-1][1] & ((1 << MAP_SHIFT) - 1)
-        for (shift, _), kept in zip(reversed(_SPREAD), [*[k for _, k in reversed(_SPREAD)][1:], 0xFFFF], strict=True):
-            bits = (bits | (bits >> shift)) & kept
-        out[:, axis] = bits
-    return (out - (1 << 15)).astype(np.int16)
+def decode(codes: NDArray[np.int64], bits: int = BITS) -> NDArray[np.int32]:
+    """Block coordinates (..., 3) of codes (...,)."""
+    axes = [_gathered(codes >> shift) - (1 << (bits - 1)) for shift in (2, 1, 0)]
+    return np.stack(axes, axis=-1).astype(np.int32)
 
 
-def block_keys(map_number: int, coords: NDArray[np.int16]) -> NDArray[np.int64]:
-    """Keys (n,) of blocks (n, 3) of a map in the database; those of a map are one range, in Morton order."""
-    return morton_codes(coords) | (map_number << MAP_SHIFT)
+def _spread(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Numbers of 21 bits with two zeros between every two bits."""
+    for shift, mask in _MASKS:
+        values = (values | (values << shift)) & mask
+    return values
+
+
+def _gathered(values: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Inverse of ``_spread``; other bits between are ignored."""
+    values = values & _MASKS[-1][1]
+    for (shift, _), (_, mask) in zip(reversed(_MASKS), [*reversed(_MASKS[:-1]), (0, 0x1FFFFF)], strict=True):
+        values = (values | (values >> shift)) & mask
+    return values

@@ -11,9 +11,9 @@ from dudmap.errors import StateError
 from dudmap.kernels import hashing
 from dudmap.mapping.block_pager import Region
 from dudmap.mapping.block_window import BlockWindow
-from dudmap.mapping.morton import MAX_MAPS, block_keys
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
+from dudmap.state.block_keys import MAX_MAPS, block_keys
 
 VOXELS = 2 * BLOCK**3
 """Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""

@@ -1,8 +1,8 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
 Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
-frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The write-ahead
-log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
+frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
+write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
 """
 
 import hashlib
@@ -20,10 +20,10 @@ from numpy.typing import NDArray
 
 from dudmap.errors import StateError
 from dudmap.mapping.block_pager import Region
-from dudmap.mapping.morton import MAP_SHIFT
 from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
 from dudmap.mapping.voxel_blocks import BlockRecords
 from dudmap.places.frame_store import EncodedFrame
+from dudmap.state.block_keys import MAP_SHIFT
 from dudmap.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.state.frames import FrameSnapshot, StoredFrames
 from dudmap.state.tree import Snapshot, lines
