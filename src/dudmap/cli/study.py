@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from dudmap.extras import STUDY, need
+
 if TYPE_CHECKING:
     from dudmap.study.conduct import Progress
     from dudmap.study.executor import Executor
@@ -49,9 +51,9 @@ def run(
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
     from dudmap.study.plan import load_plan
-    from dudmap.study.study import need_libraries, run_study
+    from dudmap.study.study import run_study
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / design.stem
     typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
@@ -75,10 +77,10 @@ def thesis(
     cluster: ClusterOption = "",
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
-    from dudmap.study.study import need_libraries, run_study
+    from dudmap.study.study import run_study
     from dudmap.study.thesis import published_report, thesis_plan
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     if published:
         out = out or Path("runs/study/thesis-published")
         typer.echo(published_report(out))
@@ -99,10 +101,9 @@ def tune(
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
     from dudmap.study.plan import load_plan
-    from dudmap.study.study import need_libraries
     from dudmap.study.tune import run_tune
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / f"{design.stem}-tune"
     typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=_show))

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DudmapError
+from dudmap.extras import extra
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.mapping.incremental_mesh import Chunk
@@ -30,19 +31,6 @@ MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124),
 PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
 
 
-def load_viser() -> Any:  # noqa: ANN401 - the module of an optional package
-    """The package viser.
-
-    Raises:
-        DudmapError: It is not installed.
-    """
-    try:
-        import viser  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise DudmapError(f"the viewer needs viser ({error}); install it with: pip install 'dudmap[view]'") from None
-    return viser
-
-
 class Window:
     """The page; safe to use from several threads.
 
@@ -52,11 +40,13 @@ class Window:
         title: Title of the page.
 
     Raises:
-        DudmapError: viser is not installed, or the port is in use.
+        MissingExtraError: viser is not installed.
+        DudmapError: The port is in use.
     """
 
     def __init__(self, host: str, port: int, title: str) -> None:
-        viser = load_viser()
+        with extra("view", "the page in the browser"):
+            import viser  # pyright: ignore[reportMissingImports]
         _check_port(host, port)
         self._lock = threading.RLock()
         with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
