@@ -138,8 +138,8 @@ def optional_imports(tree):
 
 
 def test_optional_libraries_are_imported_in_one_way_only():
-    """Inside of ``with extra(...)``, or behind it: the study's commands ask for all of its extra at once, and the library
-    of bags is asked for when one is opened."""
+    """Inside of ``with extra(...)``, or behind it: a study asks for all of its extra at once, and rosbags is asked for
+    when a bag is opened."""
     behind = {"study": set(STUDY), "sequences": {"rosbags"}, "cameras": {"rosbags"}}
     root = Path(dudmap.__file__).parent
     for path in root.rglob("*.py"):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
+from dudmap.cli.output import JsonOption
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 
 if TYPE_CHECKING:
@@ -36,7 +37,6 @@ app = typer.Typer(
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
 PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
 OutOption = Annotated[
     Path | None,

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.run import JsonOption, QuietOption, free_folder
+from dudmap.cli.output import JsonOption, answer
+from dudmap.cli.run import QuietOption, free_folder
 
 app = typer.Typer(add_completion=False)
 
@@ -23,17 +24,13 @@ def merge(
     Writes map.npz, keyframes.npz, mesh.ply, config.toml, merge.json and the trajectories of both runs in the world
     frame of the first.
     """
-    import json
-
     from dudmap.pipeline.merge import merge_runs
 
     report = merge_runs(first, second, out or free_folder(Path("runs") / f"{first.name}-{second.name}"))
-    if as_json:
-        typer.echo(json.dumps(report.tree))
-    elif not quiet:
-        found = report.tree
-        typer.echo(
-            f"merged by {found['features']} features of {found['keyframes']} keyframes: {found['area']:.1f} m2 of "
-            f"common surface, {found['denied']:.1%} denied by free space, colour correlation "
-            f"{found['color_correlation']:.2f}\nwritten to {report.out}"
-        )
+    found = report.tree
+    text = (
+        f"merged by {found['features']} features of {found['keyframes']} keyframes: {found['area']:.1f} m2 of "
+        f"common surface, {found['denied']:.1%} denied by free space, colour correlation "
+        f"{found['color_correlation']:.2f}\nwritten to {report.out}"
+    )
+    answer(found, text, as_json=as_json, quiet=quiet)
