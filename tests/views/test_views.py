@@ -12,12 +12,12 @@ from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting.run_content import RunContent
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
+from dudmap.geometry.lens import Lens
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import open_sequence
 from dudmap.sequences.images import read_mask
 from dudmap.views.background import BackgroundRenderer, continued, exposure_gain
 from dudmap.views.cleaning import clean_recording
-from dudmap.views.lens import Lens
 from dudmap.views.rendering import looking_at, orbit, render_run
 from dudmap.views.video import VideoWriter
 from exported_runs import CAMERA, make_run
@@ -93,12 +93,12 @@ def test_exposure_of_the_frame_is_kept(made, run):
     renderer = BackgroundRenderer(run.volume, CAMERA, CAMERA)
     Ts = run.trajectory.Ts_world_camera
     for index in range(0, 20, 2):
-        renderer.add(sequence[index], sequence.mask(index), Ts[index])
+        renderer.add(sequence[index], sequence.mask(index), Ts[index], Ts[index])
     frame, moving = sequence[9], np.zeros(CAMERA.shape, bool)
     moving[40:80, 60:100] = True
     dark = Frame(frame.timestamp, frame.depth, (frame.color // 2).astype(np.uint8))
-    as_it_is = renderer.render(frame, moving, Ts[9], Ts[9])
-    half = renderer.render(dark, moving, Ts[9], Ts[9])
+    as_it_is = renderer.render(frame, moving, moving, Ts[9], renderer.colors(frame, moving, Ts[9]))
+    half = renderer.render(dark, moving, moving, Ts[9], renderer.colors(dark, moving, Ts[9]))
     known = moving & as_it_is.known & half.known
     ratio = as_it_is.color[known].mean() / half.color[known].mean()
     assert ratio == pytest.approx(2, rel=0.05)

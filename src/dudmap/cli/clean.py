@@ -14,7 +14,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def clean(
-    sequence: Annotated[Path, typer.Argument(help="Recording, with colour registered to depth.")],
+    sequence: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")],
     out: Annotated[Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.")],
     run: Annotated[
         Path | None,
@@ -35,12 +35,12 @@ def clean(
 
     from dudmap.cli.progress import counted
     from dudmap.exporting.run_content import RunContent
-    from dudmap.exporting.view_synthesis import open_recording
     from dudmap.pipeline.calibration import calibrate_start
     from dudmap.pipeline.run import run as run_sequence
+    from dudmap.sequences import open_sequence
     from dudmap.views.cleaning import clean_recording
 
-    recording = open_recording(sequence, camera)
+    recording = open_sequence(sequence, camera)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
