@@ -204,3 +204,11 @@ def test_a_live_window_grows(browser, window):
     assert window._shown == 12
     assert window._slider.max == 12
     assert window._state.content.endswith("50% moves")
+
+
+def test_the_window_tells_a_browser_without_webgl(driver, window):
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    page = browser.new_page()
+    page.goto(window.url)
+    page.wait_for_selector("text=WebGL is unavailable", timeout=30000)
+    browser.close()
