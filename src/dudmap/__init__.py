@@ -18,6 +18,7 @@ _HOMES = {
     "FrameResult": "result",
     "MapError": "errors",
     "Mesh": "geometry.mesh",
+    "MissingExtraError": "errors",
     "Mover": "objects.object_tracker",
     "RunObserver": "pipeline.observer",
     "Sequence": "sequences",
@@ -42,6 +43,7 @@ __all__ = [
     "FrameResult",
     "MapError",
     "Mesh",
+    "MissingExtraError",
     "Mover",
     "RunObserver",
     "Sequence",
@@ -56,7 +58,15 @@ __all__ = [
 
 if TYPE_CHECKING:
     from dudmap.config import Config
-    from dudmap.errors import CameraError, ConfigError, DatasetError, DudmapError, FrameError, MapError
+    from dudmap.errors import (
+        CameraError,
+        ConfigError,
+        DatasetError,
+        DudmapError,
+        FrameError,
+        MapError,
+        MissingExtraError,
+    )
     from dudmap.exporting.exporters import export_run
     from dudmap.frames.frame import Frame
     from dudmap.geometry.calibration import Calibration
