@@ -145,12 +145,16 @@ class Cleaner:
         T_world_color = self._color_pose(frame)
         replaced = self.moving(index, frame)
         moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
-        wide = grown(moving, REACH * moving.shape[1])
-        color, known = self._renderer.colors(frame, wide, T_world_color)
-        left = unlike(frame.color, color, wide & ~moving & known)
+        behind = self._renderer.map_depth(T_world_camera)
+        asked, surely = grown(moving, REACH * moving.shape[1]), None
+        if self.registered:  # what is too near for the sensor has no readings, and its colours tell it
+            asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
+            surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
+        color, known = self._renderer.colors(frame, asked, T_world_color)
+        left = unlike(frame.color, color, asked & ~moving & known, surely)
         if self.registered:
             replaced = replaced | left
-        replaced = with_shadow(replaced, frame.depth, self._renderer.map_depth(T_world_camera))
+        replaced = with_shadow(replaced, frame.depth, behind)
         moving = moving | left
         background = self._renderer.render(frame, replaced, moving, T_world_camera, (color, known))
         return Cleaned(frame, moving, replaced, background)
@@ -168,29 +172,45 @@ def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
     return cv2.dilate(mask.astype(np.uint8), disk) > 0
 
 
+def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (H, W) with the other pixels that are connected with it through such pixels."""
+    import cv2
+
+    _, pieces = cv2.connectedComponents((mask | others).astype(np.uint8), connectivity=8)
+    touched = np.unique(pieces[mask])
+    return np.isin(pieces, touched[touched > 0])
+
+
 def with_shadow(
     moving: NDArray[np.bool_], depth: NDArray[np.float32], behind: NDArray[np.float32]
 ) -> NDArray[np.bool_]:
     """Mask (H, W) with the pixels that touch it, have no reading, and whose background (H, W) is known: the sensor's
     projector does not reach them past what moves."""
+    return connected(moving, grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0))
+
+
+def unlike(
+    image: NDArray[np.uint8],
+    expected: NDArray[np.uint8],
+    where: NDArray[np.bool_],
+    surely: NDArray[np.bool_] | None = None,
+) -> NDArray[np.bool_]:
+    """Pixels (h, w) of an image whose colours differ from the expected ones more than is usual; single ones and lines
+    are edges that are a pixel off, and left out.
+
+    Args:
+        image, expected: (h, w, 3) uint8.
+        where: The pixels that are asked.
+        surely: Pixels that show what is expected, by which "usual" is judged; None for all that are asked.
+    """
     import cv2
 
-    dark = grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0)
-    _, pieces = cv2.connectedComponents((moving | dark).astype(np.uint8), connectivity=8)
-    touched = np.unique(pieces[moving])
-    return np.isin(pieces, touched[touched > 0])
-
-
-def unlike(image: NDArray[np.uint8], expected: NDArray[np.uint8], where: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels (h, w) of an image whose colours differ from the expected ones more than others do; single ones and lines
-    are edges that are a pixel off, and left out."""
-    import cv2
-
-    if not where.any():
+    judged = where if surely is None or not (where & surely).any() else where & surely
+    if not judged.any():
         return where
     difference = np.abs(image.astype(np.float32) - expected).max(axis=2)
-    usual = float(np.median(difference[where]))
-    spread = 1.48 * float(np.median(np.abs(difference[where] - usual)))
+    usual = float(np.median(difference[judged]))
+    spread = 1.48 * float(np.median(np.abs(difference[judged] - usual)))
     far = where & (difference > max(usual + LEFT_OVER * spread, LEAST_DIFFERENCE))
     blobs = cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
     return where & grown(blobs > 0, 1)
