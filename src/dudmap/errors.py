@@ -36,6 +36,10 @@ class FrameError(DatasetError):
     """One frame of a recording cannot be read; the other frames may be valid."""
 
 
+class MissingExtraError(ConfigError):
+    """A library of an extra is not installed; the sentence names the extra."""
+
+
 class CameraError(DudmapError):
     """A camera or its driver is missing, or the camera stopped to deliver frames."""
 

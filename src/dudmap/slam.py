@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.errors import ConfigError
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.frame import Frame
+from dudmap.frames.frame import Frame, FrameArrays
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
@@ -229,17 +230,26 @@ class Slam:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
         return frame
 
-    def process(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
+    def process(
+        self,
+        frame: Frame | FrameView | None = None,
+        dynamic_mask: NDArray[np.bool_] | None = None,
+        **arrays: Unpack[FrameArrays],
+    ) -> FrameResult:
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
 
         Args:
             frame: Depth and colour with a timestamp later than all before; prepared or not, the result is the same.
             dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
                 from the first registration on.
+            arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
+                per metre (1000 unless set: millimetres), 0 = no reading; ``rgb`` (H, W, 3) uint8; ``timestamp`` in s.
 
         Raises:
-            DatasetError: The images do not fit the camera or each other.
+            ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
+            DatasetError: The images have another shape or type, or do not fit the camera or each other.
         """
+        frame = self._given(frame, arrays)
         view = self.color_motion.predicted(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
@@ -271,6 +281,12 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _given(self, frame: Frame | FrameView | None, arrays: FrameArrays) -> Frame | FrameView:
+        """The frame as it was given, or made of arrays."""
+        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""

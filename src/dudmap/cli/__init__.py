@@ -91,7 +91,6 @@ app = typer.Typer(
     name="dudmap",
     cls=CommandGroup,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Dense RGB-D SLAM in dynamic scenes: estimates the camera trajectory and a mesh of the static scene.",
 )

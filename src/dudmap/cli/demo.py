@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption
 from dudmap.cli.run import (
     HostOption,
-    JsonOption,
     PortOption,
     QuietOption,
     ReportOption,

@@ -5,10 +5,10 @@ from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, camera_names
 from dudmap.cli.run import (
     ConfigOption,
     HostOption,
-    JsonOption,
     LogOption,
     PortOption,
     PresetOption,
@@ -35,6 +35,7 @@ def live(
             help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="NAME",
+            autocompletion=camera_names,
         ),
     ] = None,
     record: Annotated[

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.run import JsonOption, QuietOption, free_folder
+from dudmap.cli.output import JsonOption, answer
+from dudmap.cli.run import QuietOption, free_folder
 
 app = typer.Typer(add_completion=False)
 
@@ -33,8 +34,6 @@ def merge(
     in the world frame of the first. More runs become a world: map/ (parts of the map), tileset.json and tiles/ (3D
     Tiles), world.json and the trajectories; it needs dudmap[fleet].
     """
-    import json
-
     if len(runs) == 2 and not world:
         from dudmap.pipeline.merge import merge_runs
 
@@ -60,7 +59,4 @@ def merge(
             f"{len(found['runs'])} of {len(runs)} runs joined: {found['map_blocks']} blocks in {len(found['ranges'])} "
             f"parts, {found['tiles']} tiles\nwritten to {fleet.out}"
         )
-    if as_json:
-        typer.echo(json.dumps(found))
-    elif not quiet:
-        typer.echo(text)
+    answer(found, text, as_json=as_json, quiet=quiet)

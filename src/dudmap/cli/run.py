@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer, parameter_names, preset_names
 from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
 
@@ -24,7 +25,10 @@ TopicsOption = Annotated[
     ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
-PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
+PresetOption = Annotated[
+    str | None,
+    typer.Option("--preset", help="Preset of the parameters: default or thesis.", autocompletion=preset_names),
+]
 CalibrationOption = Annotated[
     str,
     typer.Option(
@@ -36,10 +40,14 @@ CalibrationOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
+    typer.Option(
+        "--set",
+        help="Set a parameter, e.g. tracker.huber=0.02; repeatable.",
+        metavar="KEY=VALUE",
+        autocompletion=parameter_names,
+    ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
 ]
@@ -244,9 +252,7 @@ def free_folder(wanted: Path) -> Path:
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
     """Print the metrics to stdout: as one JSON object, as a table, or not at all."""
     if as_json:
-        import json
-
-        typer.echo(json.dumps(metrics))
+        answer(metrics, "", as_json=True)
     elif not quiet:
         from rich.console import Console
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, open_arrays
 from dudmap.mapping.map_file import FORMAT
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE
@@ -50,7 +51,7 @@ class MapHeader:
             MapError: The file is damaged or not a map of this version.
         """
         try:
-            with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
+            with open_arrays(path) as data:
                 if str(data["format"]) != FORMAT:
                     raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
                 fx, fy, cx, cy = (float(value) for value in data["camera"])
@@ -63,7 +64,7 @@ class MapHeader:
                     Camera(fx, fy, cx, cy, width, height), VolumeConfig.model_validate_json(str(data["config"])),
                     SensorConfig.model_validate_json(str(data["sensor"])), float(data["depth_max"]), coords, has_voxels,
                 )  # fmt: skip
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
+        except DAMAGE as error:
             raise MapError(f"{path} is not a readable map file: {error}") from error
 
     def volume(self) -> TsdfVolume:

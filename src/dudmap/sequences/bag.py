@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
+from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
@@ -57,7 +58,8 @@ class RosBag:
         topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
 
     Raises:
-        DatasetError: The package rosbags is missing, the bag is damaged, topics are missing, or the intrinsics or the
+        MissingExtraError: The package rosbags is missing.
+        DatasetError: The bag is damaged, topics are missing, or the intrinsics or the
             place of the colour camera are not known.
     """
 
@@ -301,14 +303,9 @@ def starts_with(path: Path, magic: bytes) -> bool:
 
 
 def _open(path: Path) -> "AnyReader":
-    try:
+    with extra("ros-bags", f"the ROS bag {path}"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise DatasetError(
-            f"{path} is a ROS bag, for which the package rosbags is needed; install it with pip install "
-            "'dudmap[ros-bags]'"
-        ) from None
     try:
         check_bag(path)
         limit_decompression()

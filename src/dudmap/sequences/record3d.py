@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
+from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
@@ -152,10 +153,6 @@ def largest_unpacked(packed: bytes) -> int:
 
 
 def _lzfse(path: Path) -> Any:  # noqa: ANN401 - an optional package
-    try:
+    with extra("record3d", f"the recording {path}"):
         import lzfse  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise DatasetError(
-            f"{path} needs the package lzfse for its depth images; install it with pip install 'dudmap[record3d]'"
-        ) from None
     return lzfse

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DudmapError
+from dudmap.extras import extra
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.mapping.incremental_mesh import Chunk
@@ -32,19 +33,6 @@ MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124),
 PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
 
 
-def load_viser() -> Any:  # noqa: ANN401 - the module of an optional package
-    """The package viser.
-
-    Raises:
-        DudmapError: It is not installed.
-    """
-    try:
-        import viser  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise DudmapError(f"the viewer needs viser ({error}); install it with: pip install 'dudmap[view]'") from None
-    return viser
-
-
 class Window:
     """The page; safe to use from several threads.
 
@@ -58,11 +46,13 @@ class Window:
         access: Who may see it.
 
     Raises:
-        DudmapError: viser is not installed, the port is in use, or the token is invalid.
+        MissingExtraError: viser is not installed.
+        DudmapError: The port is in use, or the token is invalid.
     """
 
     def __init__(self, host: str, port: int, title: str, token: str | None = None) -> None:
-        viser = load_viser()
+        with extra("view", "the page in the browser"):
+            import viser  # pyright: ignore[reportMissingImports]
         self.access = PageAccess(host, port, token)
         _check_port(host, port)
         self._lock = threading.RLock()
