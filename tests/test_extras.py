@@ -62,6 +62,8 @@ CASES = [
     *(("study", module, ["study", "design.toml"]) for module in STUDY),
     ("study", "optuna", ["study", "tune", "design.toml"]),
     ("study", "pandas", ["study", "thesis", "--published"]),
+    ("fleet", "faiss", ["merge", "run", "run", "run"]),
+    ("fleet", "gtsam", ["merge", "run", "run", "run"]),
     ("cluster", "ray", ["study", "thesis", "--cluster", "auto"]),
 ]
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
 from dudmap.errors import DudmapError, MapError
+from dudmap.extras import need
 from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, RangeJob, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
 from dudmap.fleet.registration import RegisteredPair, proposed_pairs, register_pairs
@@ -65,10 +66,12 @@ def merge_fleet(
         note: Told what is being done, a sentence at a time.
 
     Raises:
-        ConfigError: A run is named twice, the voxels differ in size, or a package is missing.
+        MissingExtraError: A library is not installed.
+        ConfigError: A run is named twice, or the voxels differ in size.
         MapError: A run folder is incomplete, or no two runs can be joined.
         DudmapError: ``out`` cannot be used.
     """
+    need("fleet", "the merging of more than two runs", ("faiss", "gtsam"))
     folders, out = [Path(run) for run in runs], Path(out)
     like = check_runs(folders, out)
     _check_out(out)

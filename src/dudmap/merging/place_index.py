@@ -7,14 +7,12 @@ compared in seconds.
 """
 
 from collections.abc import Sequence
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import ConfigError
+from dudmap.extras import extra
 from dudmap.places.place_recognition import Keyframe
 
 WORDS = 16
@@ -31,7 +29,7 @@ def learnt_words(features: NDArray[np.float32]) -> NDArray[np.float32]:
     """Visual words (WORDS, 128) of features (n, 128); the same for the same features.
 
     Raises:
-        ConfigError: faiss is not installed.
+        MissingExtraError: faiss is not installed.
     """
     kmeans = _faiss().Kmeans(
         features.shape[1], min(WORDS, len(features)), niter=20, seed=1, min_points_per_centroid=1,
@@ -82,6 +80,6 @@ def candidate_pairs(runs: Sequence[NDArray[np.float32]], partners: int = PARTNER
 
 
 def _faiss() -> Any:  # noqa: ANN401
-    if find_spec("faiss") is None:
-        raise ConfigError("more than two runs need the package faiss; install it with: pip install 'dudmap[fleet]'")
-    return import_module("faiss")
+    with extra("fleet", "the merging of more than two runs"):
+        import faiss
+    return faiss

@@ -9,14 +9,12 @@ al. 2020), which gives up those that still contradict the others, and once more 
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import ConfigError
+from dudmap.extras import extra
 from dudmap.geometry import se3
 
 SIGMA_DISTANCE, SIGMA_ANGLE_DEG = 0.01, 0.2
@@ -64,7 +62,7 @@ def solve(count: int, joins: Sequence[Join]) -> RunGraph:
     """Poses of ``count`` runs.
 
     Raises:
-        ConfigError: GTSAM is not installed.
+        MissingExtraError: GTSAM is not installed.
     """
     kept = consistent(joins)
     Ts = np.tile(np.eye(4), (count, 1, 1))
@@ -187,9 +185,9 @@ def _chained(start: int, joins: Sequence[Join]) -> dict[int, NDArray[np.float64]
 
 
 def _gtsam() -> Any:  # noqa: ANN401
-    if find_spec("gtsam") is None:
-        raise ConfigError("more than two runs need the package gtsam; install it with: pip install 'dudmap[fleet]'")
-    return import_module("gtsam")
+    with extra("fleet", "the merging of more than two runs"):
+        import gtsam
+    return gtsam
 
 
 def _problem(nodes: Sequence[int], joins: Sequence[Join], Ts: dict[int, NDArray[np.float64]], robust: bool) -> tuple:
