@@ -10,14 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.parameters import MeshArrays, MeshParameters
+from dudmap.kernels.surface import crossing, mixed_channel, slope
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.kernels.threads import bands, kernel, run_bands
 
 BAND = 256
 """Blocks of one band."""
-MIN_OFFSET = np.float32(1e-3)
-"""Smallest distance of a vertex from a voxel, as a share of the edge: where sdf is 0 at a voxel, the vertices of the
-edges around it stay distinct, and no triangle degenerates."""
 
 
 @kernel
@@ -182,13 +180,8 @@ def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
 
 @kernel
 def _slope(words, n, step):
-    """Derivative of sdf at voxel ``n`` of flat ``words``: central difference, one-sided beside unseen voxels."""
-    here, above, below = words[n], words[n + step], words[n - step]
-    has_above, has_below = (above & 0xFF00) != 0, (below & 0xFF00) != 0
-    high = above >> 16 if has_above else here >> 16
-    low = below >> 16 if has_below else here >> 16
-    span = np.float32(0.5) if has_above and has_below else np.float32(1)
-    return span * np.float32(high - low)
+    """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
+    return slope(words[n], words[n + step], words[n - step])
 
 
 @kernel
@@ -199,7 +192,6 @@ def _write_vertices(
     """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
-    half = np.float32(0.5)
     for row in range(start, stop):
         number = begin[row]
         if number == begin[row + 1]:
@@ -218,7 +210,7 @@ def _write_vertices(
                     continue
                 step = 100 if axis == 0 else (10 if axis == 1 else 1)
                 a, b = np.float32(flat[here] >> 16), np.float32(flat[here + step] >> 16)
-                t = min(max(a / (a - b), MIN_OFFSET), np.float32(1) - MIN_OFFSET)
+                t = crossing(a, b)
                 ex, ey, ez = x + (axis == 0), y + (axis == 1), z + (axis == 2)
                 vertices[number, 0] = voxel_size * (8 * coords[slot, 0] + x + (t if axis == 0 else 0.0))
                 vertices[number, 1] = voxel_size * (8 * coords[slot, 1] + y + (t if axis == 1 else 0.0))
@@ -229,18 +221,17 @@ def _write_vertices(
                 for channel in range(3):
                     shift = 20 - 10 * channel
                     low, high = np.float32((c >> shift) & 1023), np.float32((e >> shift) & 1023)
-                    value = (low + (high - low) * t) * np.float32(0.25) + half
-                    vertex_colors[number, channel] = np.uint8(min(value, np.float32(255)))
+                    vertex_colors[number, channel] = np.uint8(mixed_channel(low, high, t))
                 square = np.float32(1e-20)
                 for direction in range(3):
                     across = 100 if direction == 0 else (10 if direction == 1 else 1)
                     if direction == axis:
-                        slope = b - a
+                        steepness = b - a
                     else:
                         low = _slope(flat, here, across)
-                        slope = low + (_slope(flat, here + step, across) - low) * t
-                    normals[number, direction] = slope
-                    square += slope * slope
+                        steepness = low + (_slope(flat, here + step, across) - low) * t
+                    normals[number, direction] = steepness
+                    square += steepness * steepness
                 scale = np.float32(1) / np.sqrt(square)
                 for direction in range(3):
                     normals[number, direction] *= scale

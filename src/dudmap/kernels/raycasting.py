@@ -11,7 +11,7 @@ from dudmap.kernels.neighbors import load_corners
 from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.kernels.pixel import project, ray
 from dudmap.kernels.residual import trilinear
-from dudmap.kernels.threads import bands, kernel, run_bands, scalar
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar, written_out
 from dudmap.kernels.voxel import sdf_steps
 
 TILE = 8
@@ -109,10 +109,22 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
 
 
 @kernel
-def _to_block_boundary(p, d, inverse):
+def to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
     return (block + np.float32(8) - p) * inverse if d > np.float32(0) else (block - p) * inverse
+
+
+@written_out
+def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
+    """Gradient of the trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
+    one = np.float32(1)
+    wy, wz = one - fy, one - fz
+    wx = one - fx
+    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
+    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
+    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
+    return gx, gy, gz
 
 
 @kernel
@@ -153,8 +165,8 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
         i, j, k = np.int64(x + half), np.int64(y + half), np.int64(z + half)
         slot = window[np.uintp(((i >> 3) * size_y + (j >> 3)) * size_z + (k >> 3))]
         if slot < 0:
-            steps = min(_to_block_boundary(x + half, dx, rx), _to_block_boundary(y + half, dy, ry))
-            t += min(steps, _to_block_boundary(z + half, dz, rz)) + nudge
+            steps = min(to_block_boundary(x + half, dx, rx), to_block_boundary(y + half, dy, ry))
+            t += min(steps, to_block_boundary(z + half, dz, rz)) + nudge
             before = -one
             continue
         word = geometry[np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
@@ -217,11 +229,7 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     s2, s3 = sdf_steps(corners[2, 0]), sdf_steps(corners[3, 0])
     s4, s5 = sdf_steps(corners[4, 0]), sdf_steps(corners[5, 0])
     s6, s7 = sdf_steps(corners[6, 0]), sdf_steps(corners[7, 0])
-    wy, wz = one - fy, one - fz
-    wx = one - fx
-    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
-    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
-    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
+    gx, gy, gz = corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz)
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     scale = one / length if length > np.float32(0) else np.float32(0)
     normal[0], normal[1], normal[2] = gx * scale, gy * scale, gz * scale
