@@ -38,6 +38,12 @@ SetOption = Annotated[
     list[str] | None,
     typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
 ]
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--device", help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU."
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
 ReportOption = Annotated[
@@ -98,6 +104,7 @@ def run(
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
     rerun: RerunOption = None,
+    device: DeviceOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -114,7 +121,7 @@ def run(
 
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
-    parameters = read_config(config, preset, assignments or [])
+    parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:

@@ -6,9 +6,12 @@ owns, and, once the offset of each block is known, vertices and triangles. The t
 global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.mirror import Mirror, on_host
 from dudmap.kernels.parameters import MeshArrays, MeshParameters
 from dudmap.kernels.surface import crossing, mixed_channel, slope
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
@@ -307,34 +310,38 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
 
 
 def extract(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
 ) -> MeshArrays:
     """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
-    vertices, faces, vertex_colors, normals, _ = _surface(
+    vertices, faces, vertex_colors, normals, _ = extract_surface(
         geometry, colors, slots, coords, neighbours, parameters, len(slots)
     )
     return MeshArrays(vertices, faces, vertex_colors, normals)
 
 
 def extract_chunks(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
+    surface: Callable[..., tuple[NDArray, ...]] | None = None,
 ) -> list[MeshArrays]:
-    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
+    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``.
+
+    ``surface`` does the work of ``extract_surface``, which None takes.
+    """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
-    vertices, faces, vertex_colors, normals, first_face = _surface(
+    vertices, faces, vertex_colors, normals, first_face = (surface or extract_surface)(
         geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
@@ -351,9 +358,9 @@ def extract_chunks(
     return out
 
 
-def _surface(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+def extract_surface(
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
@@ -362,14 +369,8 @@ def _surface(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
     """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
     face (n + 1,) of each block."""
-    n = len(slots)
-    slots = np.ascontiguousarray(slots, dtype=np.int32)
-    row_of = np.empty(len(geometry), dtype=np.int32)
-    behind = np.empty((n, 8), dtype=np.int32)
-    near = np.ascontiguousarray(neighbours, dtype=np.int32)
-    _link(slots, near, row_of, behind)
-    # blocks that are not among the slots count as absent
-    near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))
+    geometry, colors, n = on_host(geometry), on_host(colors), len(slots)
+    slots, near, behind, row_of = links(slots, neighbours, len(geometry))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.empty((n, 512), dtype=np.uint8)
@@ -401,6 +402,17 @@ def _surface(
         bands(num_meshed, BAND),
     )
     return vertices, faces, vertex_colors, normals, first_face
+
+
+def links(
+    slots: NDArray[np.int32], neighbours: NDArray[np.int32], num_slots: int
+) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    """Slots (n,), slots of the neighbours (n, 8) that are among them, rows (n, 8) of the blocks behind, and the row of
+    each slot; -1 = none. Blocks that are not among the slots count as absent."""
+    slots, near = np.ascontiguousarray(slots, dtype=np.int32), np.ascontiguousarray(neighbours, dtype=np.int32)
+    row_of, behind = np.empty(num_slots, dtype=np.int32), np.empty((len(slots), 8), dtype=np.int32)
+    _link(slots, near, row_of, behind)
+    return slots, np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1)), behind, row_of
 
 
 def _offsets(counts: list[NDArray]) -> NDArray[np.int64]:

@@ -9,6 +9,8 @@ from typing import NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.mirror import Mirror, on_host
+
 BLOCK = 8
 """Voxels along the edge of a block."""
 UNKNOWN, SURFACE, FREE = 0, 1, 2
@@ -174,6 +176,8 @@ class FilterParameters(NamedTuple):
 class VoxelGrid(NamedTuple):
     """The blocks of the map around the view.
 
+    Voxels and window are arrays, or mirrors of arrays of which a back end may keep a copy on a device.
+
     Attributes:
         window: (Wx * Wy * Wz,) int32: slot of the voxels of a block; -1 = unknown; -2 - entry = without voxels.
         shape: (3,) int64 blocks along each axis.
@@ -186,15 +190,20 @@ class VoxelGrid(NamedTuple):
         sdf_unit: Metres per step of the stored distance.
     """
 
-    window: NDArray[np.int32]
+    window: Mirror | NDArray[np.int32]
     shape: NDArray[np.int64]
     origin: NDArray[np.int64]
-    geometry: NDArray[np.int32]
-    colors: NDArray[np.int32]
+    geometry: Mirror | NDArray[np.int32]
+    colors: Mirror | NDArray[np.int32]
     slot_coords: NDArray[np.int16]
     free_count: NDArray[np.uint8]
     voxel_size: float
     sdf_unit: float
+
+    def on_host(self) -> "VoxelGrid":
+        """The grid with plain arrays, up to date."""
+        window, geometry, colors = on_host(self.window), on_host(self.geometry), on_host(self.colors)
+        return self._replace(window=window, geometry=geometry, colors=colors)
 
 
 class DepthTiles(NamedTuple):

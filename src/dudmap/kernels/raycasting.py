@@ -285,17 +285,10 @@ def raycast(
     parameters: RaycastParameters,
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface that each pixel of a camera sees; see ``Backend.raycast``."""
-    voxel_size, shape = grid.voxel_size, grid.shape
+    grid = grid.on_host()
+    shape = grid.shape
     low, high = np.float32(parameters.depth_min), np.float32(parameters.depth_max)
-    corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
-    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    to_camera = np.empty((3, 4), dtype=np.float32)
-    to_camera[:, :3] = rotation.T * (8 * voxel_size)
-    to_camera[:, 3] = rotation.T @ (corner + 4 * voxel_size - position)
-    to_lattice = np.empty((3, 4), dtype=np.float32)
-    to_lattice[:, :3] = rotation / voxel_size
-    to_lattice[:, 3] = (position - corner) / voxel_size
-
+    to_camera, to_lattice, radius = motions(grid, T_world_camera)
     height, width = size
     tiles = (-(-height // TILE), -(-width // TILE))
     window = grid.window.reshape(tuple(shape))
@@ -303,7 +296,6 @@ def raycast(
     nears = np.full((len(ranges), *tiles), INFINITE, dtype=np.float32)
     fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
     image_size = np.array(size, dtype=np.int64)
-    radius = np.float32(4 * np.sqrt(3) * voxel_size)
     run_bands(
         lambda start, stop, near, far: _splat(
             start, stop, window, to_camera, intrinsics, image_size, radius, low, high, near, far
@@ -317,7 +309,7 @@ def raycast(
     depth = np.empty(size, dtype=np.float32)
     color = np.empty((*size, 3), dtype=np.uint8)
     normals = np.empty((*size, 3), dtype=np.float32)
-    unit, least = np.float32(grid.sdf_unit / voxel_size), max(int(parameters.min_weight), 1)
+    unit, least = np.float32(grid.sdf_unit / grid.voxel_size), max(int(parameters.min_weight), 1)
     run_bands(
         lambda start, stop: trace_rows(
             start, stop, grid.window, shape, grid.geometry.reshape(-1), grid.colors.reshape(-1), intrinsics, to_lattice,
@@ -326,3 +318,20 @@ def raycast(
         bands(height, BAND),
     )  # fmt: skip
     return RaycastResult(depth, color, normals)
+
+
+def motions(
+    grid: VoxelGrid, T_world_camera: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], np.float32]:
+    """Motions (3, 4) from blocks of the window to metres in the camera frame and from there to the window's lattice,
+    and the radius of the sphere around a block, metres."""
+    voxel_size = grid.voxel_size
+    corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
+    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    to_camera = np.empty((3, 4), dtype=np.float32)
+    to_camera[:, :3] = rotation.T * (8 * voxel_size)
+    to_camera[:, 3] = rotation.T @ (corner + 4 * voxel_size - position)
+    to_lattice = np.empty((3, 4), dtype=np.float32)
+    to_lattice[:, :3] = rotation / voxel_size
+    to_lattice[:, 3] = (position - corner) / voxel_size
+    return to_camera, to_lattice, np.float32(4 * np.sqrt(3) * voxel_size)

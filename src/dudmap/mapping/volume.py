@@ -183,9 +183,10 @@ class TsdfVolume:
         self.blocks, self.window = other.blocks, other.window
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
-    def for_camera(self, camera: Camera) -> "TsdfVolume":
-        """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
-        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
+    def for_camera(self, camera: Camera, backend: Backend | None = None) -> "TsdfVolume":
+        """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
+        volume must not be used afterwards."""
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=backend or self.backend)
         other.blocks, other._frame_number = self.blocks, self._frame_number
         return other
 
@@ -201,8 +202,7 @@ class TsdfVolume:
         intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
         intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
         colors[known] = other.blocks.colors[there[known]]
-        self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
-        self.blocks.colors[slots] = colors
+        self.blocks.write(slots, (self.blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
         self._frame_number += 1
         self.blocks.written[slots] = self._frame_number
 
@@ -271,7 +271,7 @@ class TsdfVolume:
         slots, blocks = self.active_slots, self.blocks
         return Mesh(
             *self.backend.extract_mesh(
-                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
                 self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
             )
         )  # fmt: skip
@@ -288,7 +288,7 @@ class TsdfVolume:
         """
         blocks = self.blocks
         meshes = self.backend.extract_chunks(
-            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
             self._mesh_parameters(self.config.min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]

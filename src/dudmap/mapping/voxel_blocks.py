@@ -4,9 +4,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import hashing
+from dudmap.kernels.mirror import Mirror, grown
 from dudmap.kernels.parameters import BLOCK
 
-__all__ = ["BLOCK", "VoxelBlocks"]
+__all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
@@ -24,7 +25,8 @@ class VoxelBlocks:
         slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
         free_count: (entries,) uint8 observations of emptiness.
         num_entries: Number of entries.
-        geometry, colors: (slots, 512) int32 packed voxels.
+        geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
+        geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
         slot_coords: (slots, 3) int16 block coordinates by slot.
         written: (slots,) int32 number of the frame that last wrote to a slot.
@@ -38,14 +40,38 @@ class VoxelBlocks:
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
-        self.geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self.colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
+        self.geometry_mirror = Mirror(np.zeros((1 << 10, BLOCK**3), dtype=np.int32))
+        self.colors_mirror = Mirror(np.zeros((1 << 10, BLOCK**3), dtype=np.int32))
         self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
         self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
         self.written = np.zeros(1 << 10, dtype=np.int32)
         self.fused = np.zeros(1 << 10, dtype=np.uint8)
         self.num_slots = 0
         self._released = np.empty(0, dtype=np.int32)
+
+    @property
+    def geometry(self) -> NDArray[np.int32]:
+        """Packed voxels (slots, 512) int32 in the host's memory, up to date."""
+        return self.geometry_mirror.host
+
+    @geometry.setter
+    def geometry(self, array: NDArray[np.int32]) -> None:
+        self.geometry_mirror = Mirror(array)
+
+    @property
+    def colors(self) -> NDArray[np.int32]:
+        """Packed colours (slots, 512) int32 in the host's memory, up to date."""
+        return self.colors_mirror.host
+
+    @colors.setter
+    def colors(self, array: NDArray[np.int32]) -> None:
+        self.colors_mirror = Mirror(array)
+
+    def write(self, slots: NDArray[np.integer], geometry: NDArray[np.int32], colors: NDArray[np.int32]) -> None:
+        """Replace the voxels (n, 512) of slots (n,)."""
+        self.geometry[slots], self.colors[slots] = geometry, colors
+        self.geometry_mirror.wrote(slots)
+        self.colors_mirror.wrote(slots)
 
     @property
     def num_voxel_blocks(self) -> int:
@@ -63,7 +89,8 @@ class VoxelBlocks:
 
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
         """
-        slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
+        voxels = self.geometry_mirror.stale, self.colors_mirror.stale
+        slots = (*voxels, self.slot_coords, self.entry_of, self.written, self.fused)
         return (
             self.num_slots * sum(_row_bytes(array) for array in slots)
             + self.num_entries * self._index_bytes
@@ -104,10 +131,10 @@ class VoxelBlocks:
         kept = max(len(self._released) - len(entries), 0)
         reused, self._released = self._released[kept:][::-1], self._released[:kept]
         needed = self.num_slots + len(entries) - len(reused)
-        if needed > len(self.geometry):
-            capacity = max(needed, len(self.geometry) * 3 // 2)
-            self.geometry = grown(self.geometry, capacity, 0)
-            self.colors = grown(self.colors, capacity, 0)
+        if needed > len(self.entry_of):
+            capacity = max(needed, len(self.entry_of) * 3 // 2)
+            self.geometry_mirror.grow(capacity, 0)
+            self.colors_mirror.grow(capacity, 0)
             self.entry_of = grown(self.entry_of, capacity, -1)
             self.slot_coords = grown(self.slot_coords, capacity, 0)
             self.written = grown(self.written, capacity, 0)
@@ -127,7 +154,8 @@ class VoxelBlocks:
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
         self.entry_of[slots] = -1
-        self.geometry[slots] = self.colors[slots] = 0
+        self.geometry_mirror.fill(slots, 0)
+        self.colors_mirror.fill(slots, 0)
         self._released = np.concatenate([self._released, slots[::-1]])
         return entries
 
@@ -165,14 +193,6 @@ class VoxelBlocks:
         blocks.slot_of = np.full(n, -1, dtype=np.int32)
         blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
         return blocks
-
-
-def grown(array: NDArray, capacity: int, value: int) -> NDArray:
-    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
-    shape = (capacity, *array.shape[1:])
-    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
-    out[: len(array)] = array
-    return out
 
 
 def _row_bytes(array: NDArray) -> int:

@@ -66,7 +66,7 @@ class Atlas:
     def go_on_in(self, saved: SavedMap, camera: Camera) -> None:
         """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera."""
         self.saved = self.current
-        self.volumes[self.current] = saved.volume.for_camera(camera)
+        self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property
