@@ -125,7 +125,7 @@ def _load_warp() -> None:
     """Start Warp without its greeting, and without its warning where there is no driver."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    wp.config.quiet = True
+    wp.config.log_level = wp.LOG_WARNING
     with _silent_stderr(driver_version() is None):
         wp.init()
 

@@ -7,6 +7,7 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.errors import MapError
 from dudmap.gpu.kernels import rows as kernels
 from dudmap.kernels.mirror import Mirror
 
@@ -14,6 +15,30 @@ WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64, np.dtype(np.int32): wp.int32,
     np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
 }  # fmt: skip
+
+
+SPARE = 1.2
+"""Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
+
+
+def free_memory(device: str) -> int | None:
+    """Free bytes of a device; None on the CPU, where the system answers for it."""
+    return wp.get_device(device).free_memory if device.startswith("cuda") else None
+
+
+def check_room(num_bytes: int, device: str) -> None:
+    """Check that an array of the map fits.
+
+    Raises:
+        MapError: It does not.
+    """
+    free = free_memory(device)
+    if free is not None and SPARE * num_bytes > free:
+        factor = (SPARE * num_bytes / max(free, 1)) ** 0.5  # the blocks lie along surfaces
+        raise MapError(
+            f"the map needs {num_bytes / 1e6:.0f} MB more on {device}, which has {free / 1e6:.0f} MB left; set "
+            f"volume.voxel_size to at least {factor:.1f} times its value, or take --device cpu"
+        )
 
 
 class RowCopy:
@@ -25,6 +50,7 @@ class RowCopy:
     """
 
     def __init__(self, host: NDArray[np.int32], device: str) -> None:
+        check_room(host.nbytes, device)
         self.device = device
         self.array = wp.array(host, dtype=wp.int32, device=device)
         self._host = host
@@ -68,6 +94,7 @@ class RowCopy:
     def grow(self, host: NDArray[np.int32], value: int) -> None:
         """See ``mirror.DeviceCopy``."""
         before = self.current
+        check_room(host.nbytes, self.device)
         self._host = host
         self.array = wp.full(host.shape, value, dtype=wp.int32, device=self.device)
         wp.copy(self.array, before, count=before.size)
