@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.gpu.kernels import cubes
 from dudmap.gpu.memory import resident
-from dudmap.kernels import meshing
+from dudmap.kernels.links import links
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import MeshParameters
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
@@ -24,9 +24,9 @@ def extract_surface(
     parameters: MeshParameters,
     num_meshed: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
-    """See ``meshing.surface``. Vertices and faces have the same order as there."""
+    """See ``meshing.extract_surface``. Vertices and faces have the same order as there."""
     n = len(slots)
-    slots, near, behind, row_of = meshing.links(slots, neighbours, len(coords))
+    slots, near, behind, row_of = links(slots, neighbours, len(coords))
 
     def launch(kernel: Any, rows: int, *arguments: Any) -> None:  # noqa: ANN401
         if rows:

@@ -4,7 +4,7 @@ Numba compiles named tuples as they are. Tuples of parameters hold floats only: 
 that the loops calculate with.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -249,6 +249,14 @@ class FusedBlocks(NamedTuple):
     occupied: NDArray[np.int32]
 
 
+class ImageStack(Protocol):
+    """Images of one size by number: an array (n, h, w), or images on a device, each brought over when it is read."""
+
+    def __getitem__(self, number: int, /) -> NDArray[np.float32]:
+        """Image (h, w)."""
+        ...
+
+
 class NormalEquations(NamedTuple):
     """One linearisation of the registration: ``H step = -b``.
 
@@ -270,7 +278,7 @@ class NormalEquations(NamedTuple):
     readings: float
     weight: float
     chi_square: float
-    residuals: NDArray[np.float32]
+    residuals: ImageStack
 
 
 class MapSample(NamedTuple):

@@ -70,7 +70,8 @@ class BlockWindow:
             return
         assert self.origin is not None
         entries = blocks.release(slots, free_count)
-        cells = np.ravel_multi_index(tuple((blocks.coords[entries] - self.origin).T), tuple(self.shape))
+        coords = tuple((blocks.coords[entries] - self.origin).T)
+        cells = np.asarray(np.ravel_multi_index(coords, tuple(self.shape)))
         self._set(cells, -2 - entries)
         self.near = self.near[blocks.entry_of[self.near] >= 0]
 
