@@ -91,6 +91,14 @@ class RowCopy:
         self._move(kernels.gather, rows, self._rows(), buffer)
         self._wide(host)[rows] = buffer.numpy()
 
+    def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.int32]:
+        """See ``mirror.DeviceCopy``."""
+        places = wp.array(np.stack([rows, columns], axis=1).astype(np.int32), device=self.device)
+        out = wp.empty(len(rows), dtype=wp.int32, device=self.device)
+        if len(rows):
+            wp.launch(kernels.take, dim=len(rows), inputs=[places, self.current], outputs=[out], device=self.device)
+        return out.numpy().copy()
+
     def grow(self, host: NDArray[np.int32], value: int) -> None:
         """See ``mirror.DeviceCopy``."""
         before = self.current

@@ -17,6 +17,10 @@ class DeviceCopy(Protocol):
         """Bring the host's array up to date with what the device wrote."""
         ...
 
+    def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray:
+        """Elements (n,) in the host's memory."""
+        ...
+
     def grow(self, host: NDArray, value: int) -> None:
         """Follow the host's array to more rows, the new ones holding ``value``."""
         ...
@@ -49,6 +53,10 @@ class Mirror:
     def stale(self) -> NDArray:
         """The array without what only the device has written."""
         return self._array
+
+    def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray:
+        """Elements (n,) at rows and columns (n,), without bringing whole rows over."""
+        return self._array[rows, columns] if self.copy is None else self.copy.take(rows, columns)
 
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
         """Rows (n,), or all of them, have been written in the host's memory."""

@@ -247,7 +247,8 @@ class TsdfVolume:
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
         slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
-        words = self.blocks.geometry[np.maximum(slots, 0), (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]]
+        numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+        words = self.blocks.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
         out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
