@@ -12,10 +12,11 @@ from dudmap.kernels.cpu import CpuBackend
 def machine(monkeypatch):
     """A machine with a driver, GPUs and Warp, or without."""
 
-    def make(driver=(13, 0), gpus=2, warp=True):
+    def make(driver=(13, 0), gpus=2, warp=True, supported=2):
         monkeypatch.setattr(device, "driver_version", lambda: driver)
         monkeypatch.setattr(device, "num_gpus", lambda: gpus)
         monkeypatch.setattr(device, "_has_warp", lambda: warp)
+        monkeypatch.setattr(device, "supported_gpus", lambda: supported)
         device.resolve.cache_clear()
 
     yield make
@@ -25,7 +26,7 @@ def machine(monkeypatch):
 def test_automatic_choice(machine):
     machine()
     assert device.resolve("auto") == "cuda:0"
-    for without in ({"driver": None}, {"driver": (12, 8)}, {"gpus": 0}, {"warp": False}):
+    for without in ({"driver": None}, {"driver": (12, 8)}, {"gpus": 0}, {"warp": False}, {"supported": 0}):
         machine(**without)
         assert device.resolve("auto") == "cpu"
         assert isinstance(device.make_backend("auto"), CpuBackend)
@@ -46,6 +47,7 @@ def test_gpus_by_number(machine):
         ({"driver": (12, 8)}, "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later"),
         ({"gpus": 0}, "finds no GPU"),
         ({"warp": False}, r"pip install 'dudmap\[gpu\]'"),
+        ({"supported": 0}, "compute capability 7.5 or later"),
     ],
 )
 def test_what_is_missing_is_said(machine, without, reason):

@@ -22,6 +22,8 @@ OLDEST_DRIVER = (13, 0)
 """Version of CUDA that the driver must support for the wheels of Warp from 1.19 on."""
 OLDEST_RELEASE = 580
 """First driver that supports it."""
+OLDEST_GPU = 75
+"""Oldest compute capability, times ten, that CUDA 13 compiles for."""
 
 
 def make_backend(device: str) -> Backend:
@@ -82,7 +84,13 @@ def obstacle() -> str:
         )
     if num_gpus() == 0:
         return "the NVIDIA driver finds no GPU"
-    return "" if _has_warp() else "Warp is not installed (pip install 'dudmap[gpu]')"
+    if not _has_warp():
+        return "Warp is not installed (pip install 'dudmap[gpu]')"
+    return (
+        ""
+        if supported_gpus()
+        else f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    )
 
 
 def _driver() -> ctypes.CDLL | None:
@@ -109,6 +117,14 @@ def num_gpus() -> int:
     if library is None or library.cuInit(0) != 0 or library.cuDeviceGetCount(ctypes.byref(count)) != 0:
         return 0
     return count.value
+
+
+def supported_gpus() -> int:
+    """GPUs that Warp finds and supports."""
+    _load_warp()
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    return sum(gpu.arch >= OLDEST_GPU for gpu in wp.get_cuda_devices())
 
 
 def _has_warp() -> bool:

@@ -14,6 +14,7 @@ from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.gpu.device import resolve
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.sequences import is_recording
@@ -123,6 +124,7 @@ def write_run_folder(
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
+        metrics["device"] = resolve(config.device)
         metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
         (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
 
