@@ -86,11 +86,9 @@ def obstacle() -> str:
         return "the NVIDIA driver finds no GPU"
     if not _has_warp():
         return "Warp is not installed (pip install 'dudmap[gpu]')"
-    return (
-        ""
-        if supported_gpus()
-        else f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
-    )
+    if supported_gpus() == 0:
+        return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    return ""
 
 
 def _driver() -> ctypes.CDLL | None:
