@@ -34,7 +34,7 @@ def test_filtered_depth_without_smoothing_is_equal(cpu, gpu, depth):
 def test_intensity_and_halving_are_those_of_the_cpu(cpu, gpu, recording, depth):
     rgb = np.ascontiguousarray(recording[0].color)
     expected, found = cpu.intensity(rgb), gpu.intensity(rgb)
-    np.testing.assert_allclose(found, expected, atol=2e-7)
+    assert (found != expected).mean() < 1e-4  # all, on processors with fused multiplication and addition
     for a, b in zip(gpu.halve(depth, expected, 0.02), cpu.halve(depth, expected, 0.02), strict=True):
         np.testing.assert_allclose(a, b, atol=1e-6)
 

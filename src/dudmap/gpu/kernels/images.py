@@ -127,12 +127,21 @@ def bilateral_line(depth: Image, alpha: wp.float32, spatial: wp.array(dtype=wp.f
     out[v, u] = z + numerator / denominator
 
 
+@wp.func
+def fused_sum(a: wp.float32, b: wp.float32, c: wp.float32):
+    """a b + c, rounded once as by the CPU's instruction for it; products of two float32 are exact in float64."""
+    return wp.float32(wp.float64(a) * wp.float64(b) + wp.float64(c))
+
+
 @wp.kernel
 def intensities(rgb: wp.array3d(dtype=wp.uint8), red: wp.float32, green: wp.float32, blue: wp.float32, out: Image):
-    """Intensity in 0..1 of colours (H, W, 3)."""
+    """Intensity in 0..1 of colours (H, W, 3), to the bit that of the CPU.
+
+    Corners and optical flow cut intensities to whole grey levels, which those of grey pixels are within a rounding.
+    """
     v, u = wp.tid()
     r, g, b = wp.float32(rgb[v, u, 0]), wp.float32(rgb[v, u, 1]), wp.float32(rgb[v, u, 2])
-    out[v, u] = red * r + green * g + blue * b
+    out[v, u] = fused_sum(blue, b, fused_sum(green, g, red * r))
 
 
 @wp.kernel
