@@ -62,6 +62,7 @@ CASES = [
     *(("study", module, ["study", "design.toml"]) for module in STUDY),
     ("study", "optuna", ["study", "tune", "design.toml"]),
     ("study", "pandas", ["study", "thesis", "--published"]),
+    ("gpu", "warp", ["run", "desk", "--device", "warp-cpu"]),
     ("fleet", "faiss", ["merge", "run", "run", "run"]),
     ("fleet", "gtsam", ["merge", "run", "run", "run"]),
     ("cluster", "ray", ["study", "thesis", "--cluster", "auto"]),
@@ -140,9 +141,15 @@ def optional_imports(tree):
 
 
 def test_optional_libraries_are_imported_in_one_way_only():
-    """Inside of ``with extra(...)``, or behind it: a study asks for all of its extra at once, and rosbags is asked for
-    when a bag is opened."""
-    behind = {"study": set(STUDY), "sequences": {"rosbags"}, "cameras": {"rosbags"}}
+    """Inside of ``with extra(...)``, or behind it: a study asks for all of its extra at once, rosbags
+    is asked for when a bag is opened, and Warp when a device is chosen."""
+    behind = {
+        "gpu": {"warp"},
+        "benchmark": {"warp"},
+        "study": set(STUDY),
+        "sequences": {"rosbags"},
+        "cameras": {"rosbags"},
+    }
     root = Path(dudmap.__file__).parent
     for path in root.rglob("*.py"):
         package = path.relative_to(root).parts[0]

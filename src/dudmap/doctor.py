@@ -4,7 +4,6 @@ import os
 import platform
 import re
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -114,17 +113,14 @@ def _threads() -> Check:
 
 
 def _gpu() -> Check:
-    program = shutil.which("nvidia-smi")
-    if program is None:
+    from dudmap.gpu.device import driver_version, obstacle
+
+    found = obstacle()
+    if not found:
+        return Check("GPU", "good", "works, and is used unless --device cpu is given")
+    if driver_version() is None:
         return Check("GPU", "good", "none of NVIDIA found; none is needed")
-    try:
-        asked = [program, "--query-gpu=name,driver_version", "--format=csv,noheader"]
-        done = subprocess.run(asked, capture_output=True, text=True, timeout=10, check=False)
-    except (OSError, subprocess.TimeoutExpired) as error:
-        return Check("GPU", "note", f"nvidia-smi does not answer: {error}", "none is needed; check its driver")
-    if done.returncode:
-        return Check("GPU", "note", f"nvidia-smi: {done.stdout.strip()[:200]}", "none is needed; check its driver")
-    return Check("GPU", "good", done.stdout.strip().replace("\n", "; "))
+    return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, mend this")
 
 
 def kernel_cache() -> Path:

@@ -5,6 +5,9 @@ is delegated to the CPU's back end by name: ``color_pixels`` and ``footprint_col
 division of a mesh into chunks.
 """
 
+# Warp's annotations name float where any type of number is meant
+# pyright: reportArgumentType=false, reportReturnType=false
+
 from typing import Any
 
 import numpy as np

@@ -12,6 +12,7 @@ from functools import cache
 from typing import TYPE_CHECKING
 
 from dudmap.errors import ConfigError
+from dudmap.extras import need
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 
@@ -85,7 +86,7 @@ def obstacle() -> str:
     if num_gpus() == 0:
         return "the NVIDIA driver finds no GPU"
     if not _has_warp():
-        return "Warp is not installed (pip install 'dudmap[gpu]')"
+        return 'Warp is not installed (pip install "dudmap[gpu]")'
     if supported_gpus() == 0:
         return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
     return ""
@@ -130,8 +131,7 @@ def _has_warp() -> bool:
 
 
 def _need_warp(device: str) -> None:
-    if not _has_warp():
-        raise ConfigError(f"device {device} needs Warp, which is not installed: pip install 'dudmap[gpu]'")
+    need("gpu", f"device {device}", ("warp",))
 
 
 @cache

@@ -1,5 +1,8 @@
 """Arrays of a device: copies of the map that stay there, and of images that are not uploaded twice."""
 
+# Warp's annotations name float where any type of number is meant
+# pyright: reportArgumentType=false, reportReturnType=false
+
 import weakref
 from typing import Any
 

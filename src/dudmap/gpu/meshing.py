@@ -1,5 +1,8 @@
 """Marching cubes on a device: the passes of ``kernels/meshing.py``, with running sums instead of lists of blocks."""
 
+# Warp's annotations name float where any type of number is meant
+# pyright: reportArgumentType=false, reportReturnType=false
+
 from typing import Any
 
 import numpy as np
