@@ -10,6 +10,12 @@ from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 MARGIN = 3
 """Blocks that the view may move before the window follows; the window is larger by as many on each side."""
 
+LOCAL_GRID = 4096
+"""Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
+where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
+MAX_COORDINATE = 1 << 20
+"""Bound of a block's coordinates; those of merged maps and of meshes are packed into 21 bits each."""
+
 
 class BlockWindow:
     """Dense copy of the hash table, which stays the authoritative index, around the view.
@@ -46,6 +52,12 @@ class BlockWindow:
         cells = self.cells.reshape(tuple(self.shape))
         hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries)
         self.near = np.sort(self.cells[self.cells >= 0])
+
+    @property
+    def local_origin(self) -> NDArray[np.int64]:
+        """Blocks (3,) from the origin of the map to the local origin that is nearest to the window."""
+        assert self.origin is not None
+        return LOCAL_GRID * np.rint((self.origin + self.shape // 2) / LOCAL_GRID).astype(np.int64)
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
@@ -86,11 +98,11 @@ class BlockWindow:
         """
         assert self.origin is not None
         coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
-        if np.abs(coords).max(initial=0) >= 1 << 15:
-            farthest = (1 << 15) * self.block_size
+        if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
+            farthest = MAX_COORDINATE * self.block_size
             raise MapError(
                 f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
                 f"{self.block_size / BLOCK} m it cannot be larger: set volume.voxel_size to a larger value"
             )
         unknown = int(np.count_nonzero(self.cells[cells] == -1))
-        return blocks.entries_at(coords.astype(np.int16), unknown)
+        return blocks.entries_at(coords.astype(np.int32), unknown)

@@ -20,13 +20,13 @@ class VoxelBlocks:
 
     Attributes:
         table: Hash table of entry numbers (``kernels/hashing.py``).
-        coords: (entries, 3) int16 block coordinates.
+        coords: (entries, 3) int32 block coordinates.
         slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
         free_count: (entries,) uint8 observations of emptiness.
         num_entries: Number of entries.
         geometry, colors: (slots, 512) int32 packed voxels.
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
-        slot_coords: (slots, 3) int16 block coordinates by slot.
+        slot_coords: (slots, 3) int32 block coordinates by slot.
         written: (slots,) int32 number of the frame that last wrote to a slot.
         fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
         num_slots: Number of slots in use or released.
@@ -34,14 +34,14 @@ class VoxelBlocks:
 
     def __init__(self) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
-        self.coords = np.empty((1 << 12, 3), dtype=np.int16)
+        self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
         self.geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
         self.colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
         self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
-        self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
+        self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int32)
         self.written = np.zeros(1 << 10, dtype=np.int32)
         self.fused = np.zeros(1 << 10, dtype=np.uint8)
         self.num_slots = 0
@@ -84,7 +84,7 @@ class VoxelBlocks:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
         return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
 
-    def entries_at(self, coords: NDArray[np.int16], unknown: int) -> NDArray[np.int32]:
+    def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
         """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
         needed = self.num_entries + unknown
         if needed > len(self.coords):
@@ -156,7 +156,7 @@ class VoxelBlocks:
         """Blocks of a map file: all entries, and entry and voxels of each slot."""
         blocks, n, m = cls(), len(coords), len(entries)
         blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
-        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n
+        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int32), free_count.copy(), n
         hashing.rebuild(blocks.table, blocks.coords, n)
         blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
         blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
