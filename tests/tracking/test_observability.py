@@ -17,7 +17,7 @@ from dudmap.tracking.tracker import Tracker
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
 X, Y = (U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy
-CONFIG = Config()
+CONFIG = Config().override(["volume.voxel_size=0.03"])  # wider than a pixel on the farthest surfaces that count
 
 
 def wall(offset):
@@ -26,10 +26,10 @@ def wall(offset):
 
 
 def tunnel(offset):
-    """Depth of an endless tunnel, 1.6 m wide and 2 m high."""
+    """Depth of an endless tunnel, 1.2 m wide and 1 m high."""
     with np.errstate(divide="ignore"):
-        across = np.where(X > 0, 0.8 - offset[0], 0.8 + offset[0]) / np.abs(X)
-        down = np.where(Y > 0, 1.0 - offset[1], 1.0 + offset[1]) / np.abs(Y)
+        across = np.where(X > 0, 0.6 - offset[0], 0.6 + offset[0]) / np.abs(X)
+        down = np.where(Y > 0, 0.5 - offset[1], 0.5 + offset[1]) / np.abs(Y)
     depth = np.minimum(across, down)
     return np.where(depth < CONFIG.preprocess.depth_max, depth, 0)
 

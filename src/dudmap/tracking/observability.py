@@ -16,6 +16,11 @@ INTENSITY_SIGMA = 1 / 255
 """Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
 """Readings across the image from which the noise of H is computed, and how many of all must lie on the map."""
+INTERPOLATED = 2 * (2 / 3) ** 2
+"""Variance of a component of the gradient of the trilinear interpolation of independent values of variance 1, per cell:
+a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
+STEEPEST = 9.5
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
 REGULAR = 1e-6
 """Share by which the diagonal of the noise is raised."""
 AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
@@ -120,6 +125,7 @@ def gradient_noise(
     weights: NDArray[np.float32],
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
+    map_width: int,
     color_weight: float,
     config: TrackerConfig,
     sensor: SensorConfig,
@@ -128,8 +134,11 @@ def gradient_noise(
 
     Noise of standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient variance
     sigma^2 a^2 / (8 pi s^4) (variance sigma^2 a^2 / (4 pi s^2) over 2 s^2); s is that of the filter and of half a voxel
-    together. Intensities of neighbouring voxels are independent: 2 sigma_I^2 / voxel^2. The noise is isotropic, so that
-    a reading at p from the camera's centre contributes its variance times J' J with J = [I, -hat(p)].
+    together. A voxel takes the reading of the nearest pixel, which on a slanted surface is wrong by a uniform share of
+    the step g between two pixels, in each voxel by another: the trilinear interpolation of distances of variance
+    g^2 / 12 has the gradient variance 2 (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent:
+    2 (2/3)^2 sigma_I^2 / voxel^2. The noise is isotropic, so that a reading at p from the camera's centre contributes
+    its variance times J' J with J = [I, -hat(p)].
 
     Args:
         level: The image.
@@ -137,6 +146,7 @@ def gradient_noise(
         weights: (h, w) static weights.
         R_world_camera: (3, 3).
         voxel_size: Metres.
+        map_width: Width of the images that the map was made of, pixels.
         color_weight: Weight of the intensities.
         config, sensor: The weights of the residuals.
 
@@ -161,12 +171,23 @@ def gradient_noise(
     width = np.hypot(FILTER_PX * camera.width / 640 * pixel, voxel_size / 2)
     static = stride**2 * weights[v, u].astype(np.float64)
     w = static * robust * scale**2
-    w_noise = w * sigma**2 * pixel**2 / (8 * np.pi * width**4)
+    steps = _depth_steps(level.depth, v, u, pixel) * camera.width / map_width
+    w_noise = w * (sigma**2 * pixel**2 / (8 * np.pi * width**4) + INTERPOLATED * steps**2 / 12 / voxel_size**2)
     w_color = color_weight * static * config.color_huber / np.maximum(difference, config.color_huber)
-    color_variance = 2 * (INTENSITY_SIGMA / voxel_size) ** 2 if color_weight > 0 else 0.0
+    color_variance = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if color_weight > 0 else 0.0
     distances, intensities = _isotropic(w_noise, p), _isotropic(w_color * color_variance, p)
     variance = float(w_noise.sum() / max(w.sum(), 1e-12))
     return GradientNoise(distances, intensities, (max(variance, 1e-12), color_variance), float(z.mean()))
+
+
+def _depth_steps(
+    depth: NDArray[np.float32], v: NDArray[np.intp], u: NDArray[np.intp], pixel: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Change (n,) of the depth from a pixel to the next, metres, at most that of the steepest surface."""
+    h, w = depth.shape
+    across = depth[v, np.minimum(u + 1, w - 1)] - depth[v, np.maximum(u - 1, 0)]
+    down = depth[np.minimum(v + 1, h - 1), u] - depth[np.maximum(v - 1, 0), u]
+    return np.minimum(np.hypot(across, down) / 2, STEEPEST * pixel)
 
 
 def _isotropic(w: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:

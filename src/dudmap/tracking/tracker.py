@@ -160,7 +160,15 @@ class Tracker:
         if config.min_information == 0:
             return COMPLETE
         noise = gradient_noise(
-            level, system.residuals, weights, R, volume.voxel_size, color_weight, config, self.sensor
+            level,
+            system.residuals,
+            weights,
+            R,
+            volume.voxel_size,
+            volume.camera.width,
+            color_weight,
+            config,
+            self.sensor,
         )
         if noise is None or noise.is_exceeded(system.H, config.min_information):
             return COMPLETE
