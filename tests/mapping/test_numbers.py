@@ -1,5 +1,7 @@
 """Voxels and counters saturate and never wrap; a map far from the origin is as accurate as one at it."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -115,6 +117,14 @@ def test_sums_are_wide_enough_to_be_added():
     for _ in range(14):
         sums = sums + sums
     assert sums.color.min() == 255 * 1020 * 2**14
+
+
+@pytest.mark.parametrize("operation", [lambda x: 1 / x, lambda x: np.log(x - 1), lambda x: np.exp(x + 1000)])
+def test_float_errors_are_errors_in_tests(operation):
+    with pytest.raises(FloatingPointError):
+        operation(np.zeros(3))
+    with ThreadPoolExecutor(1) as pool, pytest.raises((FloatingPointError, RuntimeWarning)):
+        pool.submit(operation, np.zeros(3)).result()
 
 
 # -- far from the origin -----------------------------------------------------------------------------------------------

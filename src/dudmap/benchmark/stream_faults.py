@@ -144,7 +144,7 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
         elif result.T_world_camera is None:
             lost += 1
         else:
-            T_true = truth[delivery.index]
+            T_true = truth[delivery.number]
             anchor = anchors.setdefault(result.submap, T_true @ se3.inverse(result.T_world_camera))
             errors[-1] = float(np.linalg.norm((anchor @ result.T_world_camera - T_true)[:3, 3]))
     return FaultRun(fault, rejected, lost, len(slam.maps), np.array(errors))

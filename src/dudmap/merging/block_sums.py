@@ -134,11 +134,11 @@ def _sums(
     free: NDArray[np.int64],
 ) -> BlockSums:
     """Sums of a single map from its values; an intensity or colour of 0 is unknown."""
-    weight = weight.astype(np.int64)
-    shade_weight = weight * (shade > 0)
-    color_weight = weight * np.any(color > 0, axis=-1)
+    wide = weight.astype(np.int64)
+    shade_weight = wide * (shade > 0)
+    color_weight = wide * np.any(color > 0, axis=-1)
     return BlockSums(
-        coords, weight, weight * distance, shade_weight, shade_weight * shade, color_weight,
+        coords, wide, wide * distance, shade_weight, shade_weight * shade, color_weight,
         color_weight[..., None] * color, free,
     )  # fmt: skip
 

@@ -31,12 +31,12 @@ class Delivery(NamedTuple):
     """One frame as it arrives.
 
     Attributes:
-        index: Number of the frame in the recording.
+        number: Its number in the recording.
         timestamp: Stamp that it carries, seconds.
         alter: What happens to its images; None leaves them.
     """
 
-    index: int
+    number: int
     timestamp: float
     alter: Alteration | None = None
 
@@ -87,7 +87,7 @@ class FaultyStream:
 
     def __getitem__(self, index: int) -> Frame:
         delivery = self.deliveries[index]
-        frame = replace(self.recording[delivery.index], timestamp=delivery.timestamp, color_timestamp=None)
+        frame = replace(self.recording[delivery.number], timestamp=delivery.timestamp, color_timestamp=None)
         return frame if delivery.alter is None else delivery.alter(frame)
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
@@ -110,17 +110,17 @@ def _plain(times: NDArray[np.float64]) -> list[Delivery]:
 def _altered(times: NDArray[np.float64], alter: Alteration) -> list[Delivery]:
     """All frames of the span altered in the same way."""
     first, stop = _span(times)
-    return [item._replace(alter=alter) if first <= item.index < stop else item for item in _plain(times)]
+    return [item._replace(alter=alter) if first <= item.number < stop else item for item in _plain(times)]
 
 
 def _dropped(times: NDArray[np.float64]) -> list[Delivery]:
     missing = np.random.default_rng(0).random(len(times)) < 0.3
     missing[0] = False
-    return [item for item in _plain(times) if not missing[item.index]]
+    return [item for item in _plain(times) if not missing[item.number]]
 
 
 def _duplicated(times: NDArray[np.float64]) -> list[Delivery]:
-    return [item for item in _plain(times) for _ in range(2 if item.index % 3 == 2 else 1)]
+    return [item for item in _plain(times) for _ in range(2 if item.number % 3 == 2 else 1)]
 
 
 def _out_of_order(times: NDArray[np.float64]) -> list[Delivery]:
@@ -146,9 +146,9 @@ def _missing(times: NDArray[np.float64], gap: float) -> list[Delivery]:
     """The frames of the span never arrive, and it lasts ``gap`` seconds longer: the camera moves meanwhile."""
     first, stop = _span(times)
     return [
-        item._replace(timestamp=item.timestamp + gap * (item.index >= stop))
+        item._replace(timestamp=item.timestamp + gap * (item.number >= stop))
         for item in _plain(times)
-        if not first <= item.index < stop
+        if not first <= item.number < stop
     ]
 
 
@@ -156,12 +156,12 @@ def _later(times: NDArray[np.float64], step: float) -> list[Delivery]:
     """The stamps of all frames from the span on are later by ``step`` seconds: a pause of a camera at rest, or a clock
     that is set."""
     first, _ = _span(times)
-    return [item._replace(timestamp=item.timestamp + step * (item.index >= first)) for item in _plain(times)]
+    return [item._replace(timestamp=item.timestamp + step * (item.number >= first)) for item in _plain(times)]
 
 
 def _one_wrong_stamp(times: NDArray[np.float64]) -> list[Delivery]:
     first, _ = _span(times)
-    return [item._replace(timestamp=item.timestamp + CLOCK_STEP * (item.index == first)) for item in _plain(times)]
+    return [item._replace(timestamp=item.timestamp + CLOCK_STEP * (item.number == first)) for item in _plain(times)]
 
 
 def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Delivery]:

@@ -116,7 +116,7 @@ def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[ND
     """Generalised eigenvalues (6,) of ``H v = mu noise v``, ascending, and eigenvectors in the columns of (6, 6)."""
     factor = np.linalg.inv(np.linalg.cholesky(noise))
     ratios, vectors = np.linalg.eigh(factor @ H @ factor.T)
-    return ratios, factor.T @ vectors
+    return ratios, np.asarray(factor.T @ vectors, dtype=np.float64)
 
 
 def gradient_noise(
