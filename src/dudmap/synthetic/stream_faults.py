@@ -87,12 +87,15 @@ class FaultyStream:
 
     def __getitem__(self, index: int) -> Frame:
         delivery = self.deliveries[index]
-        frame = replace(self.recording[delivery.number], timestamp=delivery.timestamp, color_timestamp=None)
+        frame = self.recording[delivery.number]
+        color = frame.color_timestamp
+        color = None if color is None else delivery.timestamp + (color - frame.timestamp)
+        frame = replace(frame, timestamp=delivery.timestamp, color_timestamp=color)
         return frame if delivery.alter is None else delivery.alter(frame)
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame if known."""
-        return self.recording.mask(self.deliveries[index].index)
+        return self.recording.mask(self.deliveries[index].number)
 
 
 # -- schedules ---------------------------------------------------------------------------------------------------------
