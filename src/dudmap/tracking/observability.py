@@ -151,7 +151,8 @@ def gradient_noise(
         config, sensor: The weights of the residuals.
 
     Returns:
-        None without enough readings on the map.
+        None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
+        neighbouring voxels take the same reading, and the noise is another one.
     """
     stride = max(1, level.camera.width // SAMPLES_ACROSS)
     part = np.s_[stride // 2 :: stride, stride // 2 :: stride]
@@ -163,6 +164,8 @@ def gradient_noise(
     p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
     distance, difference = np.abs(residuals[:, v, u]).astype(np.float64)
     sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
+    if float(pixel.mean()) * camera.width / map_width > voxel_size:
+        return None
     scale = np.minimum(sensor.sigma(1.0) / sigma, 1) if config.noise_weighting else np.ones_like(z)
     if config.robust == "tukey":
         robust = (1 - np.minimum(distance * scale / config.tukey, 1) ** 2) ** 2
