@@ -14,6 +14,7 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from dudmap.atomic_file import write_text
 from dudmap.errors import ConfigError
 from dudmap.presets import PRESETS
 
@@ -402,7 +403,7 @@ class Config(ConfigSection):
 
     def save(self, path: str | Path) -> None:
         """Write all values as TOML."""
-        Path(path).write_text(self.to_toml(), encoding="utf-8")
+        write_text(path, self.to_toml())
 
 
 def keys() -> list[str]:

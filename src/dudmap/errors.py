@@ -35,3 +35,7 @@ class CameraError(DudmapError):
 
 class MapError(DudmapError):
     """A map or mesh is invalid, or cannot be loaded or saved."""
+
+
+class StateError(DudmapError):
+    """The stored state of a run is missing, damaged or of another version, or the run cannot be continued."""

@@ -2,6 +2,7 @@
 
 import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,7 @@ class Slam:
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
         self.preprocess = Preprocessor(camera, config.preprocess, calibration=given, voxel_size=voxel_size)
         self.camera = self.preprocess.camera
+        self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed, repeats_are_valid=config.sensor.repeats)
         self.tracker = Tracker(config.tracker, config.sensor)
@@ -176,6 +178,29 @@ class Slam:
         main = self.atlas.by_size()[0]
         poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
         return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)
+
+    def save(self, path: str | Path) -> None:
+        """Write the whole state, from which ``resume`` goes on, replacing an older file at the end.
+
+        Raises:
+            StateError: The file cannot be written.
+        """
+        from dudmap.state.system import save_system
+
+        save_system(self, Path(path))
+
+    @classmethod
+    def resume(cls, path: str | Path) -> "Slam":
+        """A system in the state that ``save`` wrote: the frames that follow give the same results, bit for bit.
+
+        The file stays open and must stay as it is while the system lives: stored frames are read from it.
+
+        Raises:
+            StateError: The file is missing, damaged, or was written by another version.
+        """
+        from dudmap.state.system import resume_system
+
+        return resume_system(Path(path))
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.

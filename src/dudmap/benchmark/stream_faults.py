@@ -34,6 +34,7 @@ class FaultRun:
         lost: Frames whose registration was rejected.
         maps: Submaps in the end.
         errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a pose.
+        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind`` or ``uncertain``.
     """
 
     fault: str
@@ -41,10 +42,12 @@ class FaultRun:
     lost: int
     maps: int
     errors: NDArray[np.float64]
+    flagged: NDArray[np.bool_]
 
-    def silent(self, clean: "FaultRun") -> int:
-        """Poses that are wrong although the run calls them tracked."""
-        return int(np.count_nonzero(self.errors > max(SILENT_ERROR, SILENT_RATIO * np.nanmax(clean.errors))))
+    def wrong(self, clean: "FaultRun") -> tuple[int, int]:
+        """Poses that are wrong although the run calls them tracked: without a word, and those it calls doubtful."""
+        wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
+        return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
 
     def frames_to_recovery(self) -> int | None:
         """Longest run of frames that arrived without getting a pose; None if the last LAST_FRAMES have none."""
@@ -56,7 +59,7 @@ class FaultRun:
 
     def outcome(self, clean: "FaultRun") -> str:
         """What happened, in words; it begins with FAILED where a wrong pose was called tracked, or none came back."""
-        if self.silent(clean):
+        if self.wrong(clean)[0]:
             return "FAILED: wrong poses are called tracked"
         if self.frames_to_recovery() is None:
             return "FAILED: lost to the end"
@@ -131,9 +134,10 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
     slam = Slam(stream.camera, config, calibration=stream.calibration)
     truth = _true_poses(stream)
     rejected: dict[str, int] = {}
-    errors, anchors, lost = [], {}, 0
+    errors, flagged, anchors, lost = [], [], {}, 0
     for number, delivery in enumerate(stream.deliveries):
         errors.append(np.nan)
+        flagged.append(False)
         try:
             result = slam.process(stream[number])
         except FrameError as error:
@@ -144,10 +148,11 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
         elif result.T_world_camera is None:
             lost += 1
         else:
+            flagged[-1] = result.blind or bool(result.uncertain)
             T_true = truth[delivery.number]
             anchor = anchors.setdefault(result.submap, T_true @ se3.inverse(result.T_world_camera))
             errors[-1] = float(np.linalg.norm((anchor @ result.T_world_camera - T_true)[:3, 3]))
-    return FaultRun(fault, rejected, lost, len(slam.maps), np.array(errors))
+    return FaultRun(fault, rejected, lost, len(slam.maps), np.array(errors), np.array(flagged))
 
 
 def _true_poses(stream: FaultyStream) -> list[NDArray[np.float64]]:
@@ -162,7 +167,7 @@ def table_head(name: str, frames: int) -> str:
     """Caption and head of the Markdown table."""
     return (
         f"{name}, {frames} frames:\n\n"
-        "| fault | what happens | outcome | frames | rejected | lost | RMSE, mm | largest, mm | silent errors "
+        "| fault | what happens | outcome | frames | rejected | lost | RMSE, mm | largest, mm | wrong: silent, flagged "
         "| frames to recovery |\n"
         "|---|---|---|---|---|---|---|---|---|---|"
     )
@@ -172,9 +177,9 @@ def fault_row(run: FaultRun, clean: FaultRun) -> str:
     """Line of the table: errors are those of the poses said to be tracked."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
     errors = 1000 * run.errors[np.isfinite(run.errors)]
-    recovery = run.frames_to_recovery()
+    recovery, (silent, flagged) = run.frames_to_recovery(), run.wrong(clean)
     return (
         f"| {run.fault} | {FAULTS[run.fault].description} | {run.outcome(clean)} | {len(run.errors)} | {kinds} "
-        f"| {run.lost} | {np.sqrt(np.mean(errors**2)):.1f} | {errors.max():.1f} | {run.silent(clean)} "
+        f"| {run.lost} | {np.sqrt(np.mean(errors**2)):.1f} | {errors.max():.1f} | {silent}, {flagged} "
         f"| {'never' if recovery is None else recovery} |"
     )

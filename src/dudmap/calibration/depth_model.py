@@ -7,6 +7,7 @@ import numpy as np
 from numpy.polynomial.legendre import leg2poly, legvander
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file
 from dudmap.errors import DatasetError
 from dudmap.frames.depth_correction import FARTHEST, MIDDLE, NEAREST, ORDER, DepthCorrection
 from dudmap.geometry.camera import Camera
@@ -66,7 +67,9 @@ class DepthModel:
         Raises:
             OSError: The file cannot be written.
         """
-        np.savez(path, terms=TERMS, state=self.state, covariance=self.covariance, extent=self.extent, views=self.views)
+        values = {"state": self.state, "covariance": self.covariance, "extent": self.extent, "views": self.views}
+        with atomic_file(path) as file:
+            np.savez(file, terms=TERMS, **values)
 
     @classmethod
     def load(cls, path: Path) -> "DepthModel":

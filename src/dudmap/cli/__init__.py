@@ -5,6 +5,8 @@ called, so that ``dudmap --help`` is fast. Errors are printed as one sentence. E
 usage, 130 for Ctrl-C.
 """
 
+import io
+import sys
 from importlib import import_module
 from typing import Annotated, Any
 
@@ -103,4 +105,7 @@ def _dudmap(
 
 def main() -> None:
     """Entry point of the program ``dudmap``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a character, as on Windows
     app()

@@ -57,8 +57,8 @@ RerunOption = Annotated[
 @app.command()
 def run(
     sequence: Annotated[
-        Path, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
-    ],
+        Path | None, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
@@ -93,6 +93,18 @@ def run(
     localize: Annotated[
         bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", help="Go on with the interrupted run in this folder; alone.", metavar="RUN"),
+    ] = None,
+    checkpoint_every: Annotated[
+        float | None,
+        typer.Option(
+            "--checkpoint-every",
+            help="Seconds from one checkpoint to the next; 0 for none. Default: as often as takes 2 % of the time.",
+            min=0,
+        ),
+    ] = None,
     report: ReportOption = True,
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
@@ -110,8 +122,16 @@ def run(
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
+    from dudmap.pipeline.storing import Storing
     from dudmap.sequences import open_sequence
 
+    if resume is not None:
+        if sequence is not None or out is not None:
+            raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
+        _resume(resume, page=(host, port) if view else None, rerun=rerun, quiet=quiet, as_json=as_json)
+        return
+    if sequence is None:
+        raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
     parameters = read_config(config, preset, assignments or [])
@@ -128,12 +148,24 @@ def run(
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
+    opened = {"path": str(sequence.resolve()), "camera": camera, "topics": topics}
+    storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
     with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
             depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
+            storing=storing,
         )  # fmt: skip
+        print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
+
+
+def _resume(folder: Path, *, page: tuple[str, int] | None, rerun: Path | None, quiet: bool, as_json: bool) -> None:
+    """Go on with an interrupted run."""
+    from dudmap.pipeline.resume import resume, wants_report
+
+    with observers(report=wants_report(folder), page=page, rerun=rerun) as watching:
+        done = resume(folder, progress=not quiet, observers=watching)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_path
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
@@ -185,6 +186,7 @@ def _rules(axes: "Axes", levels: dict[str, float]) -> None:
 
 def _save(figure: "Figure", path: Path) -> None:
     try:
-        figure.savefig(path)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary)
     except OSError as error:
         raise DudmapError(f"cannot write the plot {path}: {error.strerror or error}") from error

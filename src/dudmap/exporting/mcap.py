@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dudmap.atomic_file import put_in_place
 from dudmap.errors import ConfigError
 from dudmap.exporting import ros_messages as ros
 from dudmap.exporting.options import ExportOptions
@@ -46,7 +47,7 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], round(seconds * 1e9), store.serialize_cdr(message, kind))
-        (bag / "run.mcap").replace(path)
+        put_in_place(bag / "run.mcap", path)
 
 
 def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:

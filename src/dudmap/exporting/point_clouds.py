@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.atomic_file import atomic_file
+from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.errors import ConfigError
 from dudmap.exporting.mesh_editing import edited
 from dudmap.exporting.options import ExportOptions
@@ -95,11 +95,7 @@ def write_e57(run: RunContent, path: Path, options: ExportOptions) -> None:
     x, y, z = points.vertices.astype(np.float64).T
     red, green, blue = points.colors.T
     scan = {"cartesianX": x, "cartesianY": y, "cartesianZ": z, "colorRed": red, "colorGreen": green, "colorBlue": blue}
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        file = pye57.E57(str(partial), mode="w")
+    with atomic_path(path) as temporary:
+        file = pye57.E57(str(temporary), mode="w")
         file.write_scan_raw({name: np.ascontiguousarray(values) for name, values in scan.items()}, name="map")
         file.close()
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

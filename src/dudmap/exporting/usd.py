@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from dudmap.atomic_file import put_in_place
 from dudmap.errors import ConfigError
 from dudmap.exporting.gltf import linear_light
 from dudmap.exporting.gravity import up_of, y_up
@@ -54,4 +55,4 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
         packed = Path(folder) / "packed.usdz"
         if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(layer)), str(packed)):
             raise OSError(f"usd-core could not write {path}")
-        packed.replace(path)
+        put_in_place(packed, path)

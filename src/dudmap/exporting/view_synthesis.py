@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting.mesh_editing import edited
 from dudmap.exporting.options import ExportOptions
@@ -81,7 +82,7 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
         "cy": camera.cy + PIXEL, "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 0.001,
         "ply_file_path": "points.ply", "frames": frames,
     }  # fmt: skip
-    path.write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(tree, indent=2) + "\n")
 
 
 def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
@@ -107,12 +108,12 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
         numbers = " ".join(f"{value:.9f}" for value in (w, x, y, z, *T[:3, 3]))
         images += [f"{number} {numbers} 1 {name}", ""]
-    (folder / "images.txt").write_text("\n".join(images) + "\n", encoding="utf-8")
+    write_text(folder / "images.txt", "\n".join(images) + "\n")
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     for number, (xyz, rgb) in enumerate(zip(seeds.vertices.tolist(), seeds.colors.tolist(), strict=True), start=1):
         points.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
-    (folder / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
-    path.write_text(f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n", encoding="utf-8")
+    write_text(folder / "points3D.txt", "\n".join(points) + "\n")
+    write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n")
 
 
 def _colmap_camera(camera: Camera) -> str:
@@ -190,4 +191,4 @@ def _save(path: Path, image: NDArray) -> None:
     import cv2
 
     data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1]
-    path.write_bytes(data.tobytes())
+    write_bytes(path, data.tobytes(), sync=False)

@@ -70,7 +70,7 @@ class StreamCheck:
         self._contradicting: list[float] = []  # stamps of the frames since then
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
         self._arrived: float | None = None  # stamp of the last frame, valid or not
-        self._before: Observation | None = None  # the last frame, used or not
+        self._before: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None  # depth, colour of the last frame
         self._compared: tuple[float, NDArray[np.float32]] | None = None  # stamp and depth of the last with readings
         self._unit = 0.0  # logarithm of the factor by which the unit has changed
 
@@ -134,13 +134,13 @@ class StreamCheck:
     # -- images --------------------------------------------------------------------------------------------------------
 
     def _frozen(self, observation: Observation) -> Rejection | None:
-        before, self._before = self._before, observation
+        before, self._before = self._before, (observation.depth, observation.as_recorded.color)
         self.color_is_frozen = False
         if before is None or self.repeats_are_valid:
             return None
-        if _equal(before.depth, observation.depth) and observation.depth.any():
+        if _equal(before[0], observation.depth) and observation.depth.any():
             return Rejection("frozen", "the depth image is bit for bit that of the frame before: the sensor hangs")
-        self.color_is_frozen = _equal(before.as_recorded.color, observation.as_recorded.color)
+        self.color_is_frozen = _equal(before[1], observation.as_recorded.color)
         return None
 
     def _changed_unit(self, observation: Observation) -> Rejection | None:

@@ -9,6 +9,7 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_text
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
@@ -128,7 +129,7 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write a TOML file."""
         text = "# Colour camera relative to the depth camera: metres, radians, pixels, seconds\n"
-        Path(path).write_text(text + tomli_w.dumps(self.tree()), encoding="utf-8")
+        write_text(path, text + tomli_w.dumps(self.tree()))
 
     @classmethod
     def load(cls, path: str | Path) -> "Calibration":

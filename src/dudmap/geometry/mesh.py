@@ -3,10 +3,12 @@
 import re
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.errors import MapError
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
@@ -46,9 +48,11 @@ class Mesh:
             raise MapError(f"cannot write a mesh as {path.name!r}; the ending must be one of {', '.join(FORMATS)}")
         try:
             if path.suffix.lower() == ".ply":
-                self._save_ply(path)
+                with atomic_file(path) as file:
+                    self._save_ply(file)
             else:
-                self._as_trimesh().export(path)
+                with atomic_path(path) as temporary:
+                    self._as_trimesh().export(temporary)
         except OSError as error:
             raise MapError(f"cannot write the mesh to {path}: {error}") from error
 
@@ -59,16 +63,15 @@ class Mesh:
             self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=self.colors, process=False
         )
 
-    def _save_ply(self, path: Path) -> None:
+    def _save_ply(self, file: IO[bytes]) -> None:
         """Binary PLY with float32 normals; trimesh's exporter is three times slower on a million faces."""
         vertex = np.empty(len(self.vertices), _PLY_VERTEX)
         vertex["xyz"], vertex["normal"], vertex["rgb"] = self.vertices, self.normals, self.colors
         face = np.empty(len(self.faces), _PLY_FACE)
         face["count"], face["indices"] = 3, self.faces
-        with path.open("wb") as file:
-            file.write(_ply_header(len(vertex), len(face)).encode("ascii"))
-            file.write(vertex.tobytes())
-            file.write(face.tobytes())
+        file.write(_ply_header(len(vertex), len(face)).encode("ascii"))
+        file.write(vertex.tobytes())
+        file.write(face.tobytes())
 
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":

@@ -13,8 +13,10 @@ MARGIN = 3
 LOCAL_GRID = 4096
 """Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
 where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
-MAX_COORDINATE = 1 << 20
-"""Bound of a block's coordinates; those of merged maps and of meshes are packed into 21 bits each."""
+COORDINATE_BITS = 18
+"""Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
+MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
+"""Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
 
 
 class BlockWindow:

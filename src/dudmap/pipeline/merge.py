@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import DudmapError, MapError
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
@@ -61,11 +62,11 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     mesh = merged.volume.extract_mesh()
     mesh.save(out / "mesh.ply")
     if (a / "config.toml").is_file():
-        (out / "config.toml").write_bytes((a / "config.toml").read_bytes())
+        write_bytes(out / "config.toml", (a / "config.toml").read_bytes())
     tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
     tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
     tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
-    (out / MERGE_FILE).write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
     return MergeReport(out, pair, tree)
 
 

@@ -1,9 +1,9 @@
 """Metrics of a run, collected frame by frame."""
 
 import csv
+import io
 import json
 import time
-from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file, write_text
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 from dudmap.pipeline.environment import peak_rss_mb
 
@@ -44,7 +45,7 @@ class RunRecord:
     rows: list[dict[str, Any]] = field(default_factory=list)
     lost: list[dict[str, Any]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
-    rejected: Counter[str] = field(default_factory=Counter)
+    rejected: dict[str, int] = field(default_factory=dict)
     mask_ious: list[float] = field(default_factory=list)
     movers: list[dict[str, Any]] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
@@ -60,6 +61,14 @@ class RunRecord:
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
+
+    def elapsed(self) -> tuple[float, float]:
+        """Seconds, and seconds of processor time, since the run began."""
+        return time.perf_counter() - self._wall_start, time.process_time() - self._cpu_start
+
+    def continue_from(self, wall_s: float, cpu_s: float) -> None:
+        """Count the time on from that of a process that ended."""
+        self._wall_start, self._cpu_start = time.perf_counter() - wall_s, time.process_time() - cpu_s
 
     def add(
         self,
@@ -99,7 +108,7 @@ class RunRecord:
         self.uncertain += bool(result.uncertain)
         self.degenerate += len(result.unobservable) > 0
         if result.rejected:
-            self.rejected[result.rejected] += 1
+            self._reject(result.rejected)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -114,19 +123,23 @@ class RunRecord:
     def skip(self, error: "FrameError") -> None:
         """Count a frame that cannot be read or used."""
         self.unreadable.append(str(error))
-        self.rejected[error.kind] += 1
+        self._reject(error.kind)
+
+    def _reject(self, kind: str) -> None:
+        self.rejected[kind] = self.rejected.get(kind, 0) + 1
 
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, restval=0)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, columns, restval=0)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_text(path, text.getvalue())
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
-        path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
+        write_text(path, "".join(json.dumps(line) + "\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:
         """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
@@ -140,7 +153,8 @@ class RunRecord:
             return
         edges = np.linspace(0, MAX_RESIDUAL, BINS + 1)
         mixture = fit_mixture(self.residuals, edges)
-        np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
+        with atomic_file(path) as file:
+            np.savez(file, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
         """Counts and times of all frames, under the keys of metrics.json."""

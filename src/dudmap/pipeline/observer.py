@@ -18,6 +18,10 @@ class RunObserver:
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """A pass over ``count`` frames (None: unknown) begins with this system; its run folder exists and is empty."""
 
+    def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
+        """A pass that was interrupted goes on at frame number ``first``; by default as if it began."""
+        self.start(slam, out, count)
+
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Frame number ``index`` was read and processed in ``ms`` milliseconds."""
 

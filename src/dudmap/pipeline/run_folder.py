@@ -1,7 +1,8 @@
 """The run folder: creation, cleaning and writing of all result files."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,13 +11,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.pipeline.storing import FILES as STATE_FILES
 from dudmap.sequences import is_recording
+from dudmap.state.run_lock import RunLock
 
 if TYPE_CHECKING:
     from dudmap.cameras import LiveCamera
@@ -52,10 +56,31 @@ class RunReport:
 
 
 def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Write a mask (H, W) as an image, 255 = dynamic."""
+    """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
     import cv2
 
-    path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False)
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other processes from writing into the run folder, which is created if needed.
+
+    What a process that was killed has left half written is removed.
+
+    Raises:
+        DudmapError: Another process writes into the folder, or it cannot be created or written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = RunLock(out)
+    except OSError as error:
+        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+    with lock:
+        for folder in (out, *(out / name for name in ("masks", "movers", "thumbnails"))):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
+        yield
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
@@ -73,9 +98,9 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".dudmap-probe"
-        probe.write_bytes(b"")
+        probe.touch()
         probe.unlink()
-        for name in FILES + SCORES:
+        for name in FILES + SCORES + STATE_FILES:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
@@ -124,7 +149,7 @@ def write_run_folder(
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
         metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
-        (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
     steps: list[Callable[[], None]] = [
         lambda: trajectory.save(out / "trajectory.txt"),

@@ -2,6 +2,7 @@
 
 import io
 import socket
+import sys
 import threading
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -306,7 +307,8 @@ def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
 def _check_port(host: str, port: int) -> None:
     """Check that the page can be served there; viser would take another port without a word."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if sys.platform != "win32":  # where it would let two programs take one port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
         except OSError as error:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import DatasetError, FrameError
 from dudmap.exporting.run_content import RunContent
 from dudmap.exporting.view_synthesis import index_at
@@ -190,7 +191,7 @@ def _write_frame(
         f"unknown/{stamp}.png": (moving & _unknown(background)).astype(np.uint8) * 255,
     }
     for name, image in images.items():
-        (out / name).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+        write_bytes(out / name, cv2.imencode(".png", image)[1].tobytes(), sync=False)
     return color_stamp, stamp
 
 
@@ -203,11 +204,11 @@ def _write_lists(out: Path, run: RunContent, sequence: "Sequence", lines: list[t
     }
     for name, rows in lists.items():
         text = "\n".join([f"# {sequence.name} without what moves, by dudmap clean", *rows])
-        (out / name).write_text(text + "\n", encoding="utf-8")
+        write_text(out / name, text + "\n")
     keys = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
     numbers = [f"{key} {getattr(camera, key)}" for key in keys]
     numbers += [f"{key} {value}" for key, value in zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False)]
-    (out / "intrinsics.txt").write_text("\n".join(numbers) + "\n", encoding="utf-8")
+    write_text(out / "intrinsics.txt", "\n".join(numbers) + "\n")
     run.trajectory.save(out / "trajectory.txt")
     if sequence.ground_truth is not None:
         sequence.ground_truth.save(out / "groundtruth.txt")
