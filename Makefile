@@ -16,7 +16,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --for
 # than a few processes gain nothing
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all check docs package processors lock clean
+.PHONY: demo test test-all check docs package processors fuzz fuzz-guided audit licences lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -48,6 +48,26 @@ package: .venv/developed
 
 processors: .venv/developed
 	$(BIN)/python benchmarks/processors.py
+
+# hostile files for all loaders: make fuzz SECONDS=60 LOADERS="bag,map", see docs/reliability.md
+SECONDS ?= 60
+LOADERS ?=
+fuzz: .venv/developed
+	$(BIN)/python tests/fuzz/campaign.py --seconds $(SECONDS) --loaders "$(LOADERS)"
+
+# the same for one loader, guided by coverage: make fuzz-guided LOADER=sens
+LOADER ?= sens
+fuzz-guided: .venv/developed
+	$(PIP) install --quiet atheris
+	$(BIN)/python tests/fuzz/guided.py "$(LOADER)" -max_total_time=$(SECONDS)
+
+# known weaknesses of the packages in the lock file; asks the service of PyPI or OSV, so it needs the network
+audit: $(BIN)/python
+	$(PIP) install --quiet pip-audit
+	$(BIN)/pip-audit --requirement requirements/run.txt --require-hashes --disable-pip
+
+licences: .venv/installed
+	$(BIN)/dudmap doctor --licences
 
 lock: $(BIN)/python
 	$(PIP) install --quiet --upgrade uv

@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from dudmap.atomic_file import write_text
 from dudmap.errors import ConfigError
+from dudmap.input_files import parse_toml, read_toml
 from dudmap.presets import PRESETS
 
 
@@ -348,7 +349,7 @@ class Config(ConfigSection):
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
         """
         try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"cannot read the configuration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
@@ -435,6 +436,6 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 def _value(text: str) -> Any:  # noqa: ANN401 - TOML values have many types
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text

@@ -3,6 +3,7 @@
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,13 +16,14 @@ from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.errors import ConfigError
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.frame import Frame
+from dudmap.frames.frame import Frame, FrameArrays
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
 from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
 from dudmap.objects.object_map import RigidObject
@@ -67,6 +69,8 @@ class Slam:
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
+        max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
+            disk. It changes no result. None keeps all in memory.
     """
 
     def __init__(
@@ -79,7 +83,9 @@ class Slam:
         live: bool = False,
         saved_map: SavedMap | None = None,
         localize: bool = False,
+        max_blocks: int | MemoryLimit | None = None,
     ) -> None:
+        self.max_blocks = max_blocks
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
@@ -116,7 +122,7 @@ class Slam:
         self.objects = MovingObjects(config)
         self.localize = localize
         if saved_map is not None:
-            self.atlas.go_on_in(saved_map, self.camera)
+            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.restore(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
@@ -227,7 +233,12 @@ class Slam:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
         return frame
 
-    def process(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
+    def process(
+        self,
+        frame: Frame | FrameView | None = None,
+        dynamic_mask: NDArray[np.bool_] | None = None,
+        **arrays: Unpack[FrameArrays],
+    ) -> FrameResult:
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
 
         Args:
@@ -235,11 +246,15 @@ class Slam:
                 stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
             dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
                 from the first registration on.
+            arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
+                per metre (1000 unless set: millimetres), 0 = no reading; ``rgb`` (H, W, 3) uint8; ``timestamp`` in s.
 
         Raises:
+            ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
+            DatasetError: The arrays have another shape or type.
             FrameError: The images do not fit the camera or each other; the frame changed nothing.
         """
-        view = self.prepare(frame, dynamic_mask)
+        view = self.prepare(self._given(frame, arrays), dynamic_mask)
         if rejection := self.stream.rejection(view.observation):
             return self._reject(view, rejection)
         view = self.color_motion.predicted(self._resumed(view))
@@ -273,6 +288,12 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _given(self, frame: Frame | FrameView | None, arrays: FrameArrays) -> Frame | FrameView:
+        """The frame as it was given, or made of arrays."""
+        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""
@@ -458,4 +479,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
+        config = self.config
+        return TsdfVolume(
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, max_blocks=self.max_blocks
+        )

@@ -9,6 +9,7 @@ import typer
 from typer.core import TyperGroup
 
 from dudmap.atomic_file import write_text
+from dudmap.cli.output import JsonOption
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 
 if TYPE_CHECKING:
@@ -37,7 +38,6 @@ app = typer.Typer(
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
 PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
 OutOption = Annotated[
     Path | None,

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.view import observers
+from dudmap.cli.output import JsonOption, answer, parameter_names, preset_names
+from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +25,10 @@ TopicsOption = Annotated[
     ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
-PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
+PresetOption = Annotated[
+    str | None,
+    typer.Option("--preset", help="Preset of the parameters: default or thesis.", autocompletion=preset_names),
+]
 CalibrationOption = Annotated[
     str,
     typer.Option(
@@ -36,10 +40,14 @@ CalibrationOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
+    typer.Option(
+        "--set",
+        help="Set a parameter, e.g. tracker.huber=0.02; repeatable.",
+        metavar="KEY=VALUE",
+        autocompletion=parameter_names,
+    ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
 ]
@@ -51,6 +59,9 @@ PortOption = Annotated[int, typer.Option("--port", help="Port of the page of --v
 RerunOption = Annotated[
     Path | None,
     typer.Option("--rerun", help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd"),
+]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", help="File for one JSON object per line and event of the run.", metavar="FILE")
 ]
 
 
@@ -93,6 +104,12 @@ def run(
     localize: Annotated[
         bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            "--max-memory", help="Largest memory of the process, such as 1GB; the rest of the map waits on disk."
+        ),
+    ] = None,
     resume: Annotated[
         Path | None,
         typer.Option("--resume", help="Go on with the interrupted run in this folder; alone.", metavar="RUN"),
@@ -109,7 +126,9 @@ def run(
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
+    log: LogOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -128,7 +147,8 @@ def run(
     if resume is not None:
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
-        _resume(resume, page=(host, port) if view else None, rerun=rerun, quiet=quiet, as_json=as_json)
+        page = (host, port, token) if view else None
+        _resume(resume, page=page, rerun=rerun, log=log, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
@@ -150,21 +170,43 @@ def run(
         parameters = parameters.override(["sensor.self_calibration=false"])
     opened = {"path": str(sequence.resolve()), "camera": camera, "topics": topics}
     storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
-            storing=storing,
+            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
+            max_memory=None if max_memory is None else memory_size(max_memory), observers=watching, storing=storing,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
-def _resume(folder: Path, *, page: tuple[str, int] | None, rerun: Path | None, quiet: bool, as_json: bool) -> None:
+def memory_size(text: str) -> int:
+    """Number of bytes of a text such as 1GB or 800MB.
+
+    Raises:
+        ConfigError: It is no amount of memory.
+    """
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    try:
+        return int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
+
+
+def _resume(
+    folder: Path,
+    *,
+    page: tuple[str, int, str | None] | None,
+    rerun: Path | None,
+    log: Path | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
     """Go on with an interrupted run."""
     from dudmap.pipeline.resume import resume, wants_report
 
-    with observers(report=wants_report(folder), page=page, rerun=rerun) as watching:
+    with observers(report=wants_report(folder), page=page, rerun=rerun, log=log) as watching:
         done = resume(folder, progress=not quiet, observers=watching)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
@@ -210,9 +252,7 @@ def free_folder(wanted: Path) -> Path:
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
     """Print the metrics to stdout: as one JSON object, as a table, or not at all."""
     if as_json:
-        import json
-
-        typer.echo(json.dumps(metrics))
+        answer(metrics, "", as_json=True)
     elif not quiet:
         from rich.console import Console
 

@@ -12,6 +12,7 @@ from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
 from dudmap.evaluation.trajectory import AteResult, RpeResult
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -91,9 +92,9 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
         DatasetError: The file does not hold these arrays.
     """
     try:
-        with np.load(residuals) as data:
+        with open_arrays(residuals) as data:
             edges, counts, prior, sigma = (data[key].astype(float) for key in ("edges", "counts", "prior", "sigma"))
-    except (OSError, ValueError, KeyError) as error:
+    except DAMAGE as error:
         raise DatasetError(f"{residuals} does not hold edges, counts, prior and sigma of residuals: {error}") from error
     widths, r = np.diff(edges), np.linspace(edges[0], edges[-1], 600)
     axes.bar(

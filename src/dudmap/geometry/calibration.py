@@ -13,6 +13,7 @@ from dudmap.atomic_file import write_text
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, read_toml
 
 PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
@@ -139,7 +140,7 @@ class Calibration:
             DatasetError: The file is missing, not TOML, or lacks a value or holds an invalid one.
         """
         try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"cannot read the calibration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
@@ -157,5 +158,5 @@ class Calibration:
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
-        except (TypeError, ValueError, AttributeError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"cannot understand the calibration {path}: {error}") from error

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.atomic_file import write_text
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
+from dudmap.input_files import read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,7 +74,7 @@ class Trajectory:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"cannot read the trajectory {path}: {error}") from error
         rows: list[list[float]] = []

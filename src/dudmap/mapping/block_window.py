@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import MapError
 from dudmap.kernels import hashing
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.mapping.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
 
 MARGIN = 3
 """Blocks that the view may move before the window follows; the window is larger by as many on each side."""
@@ -13,10 +13,6 @@ MARGIN = 3
 LOCAL_GRID = 4096
 """Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
 where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
-COORDINATE_BITS = 18
-"""Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
-MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
-"""Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
 
 
 class BlockWindow:
@@ -31,7 +27,7 @@ class BlockWindow:
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
         stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
         near: (n,) int32, the slots inside.
-        origin: (3,) int64 coordinates of the first block; None before the first ``look_at``.
+        origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
     """
 
     def __init__(self, block_size: float, cells: int) -> None:
@@ -43,11 +39,15 @@ class BlockWindow:
         self.near = np.empty(0, dtype=np.int32)
         self.origin: NDArray[np.int64] | None = None
 
-    def look_at(self, middle: NDArray[np.float64], blocks: VoxelBlocks) -> None:
-        """Centre the window on a point (3,), metres, if its centre is more than ``MARGIN`` blocks away."""
+    def moved(self, middle: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
+        away, so that the window can stay."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
-        if self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN:
-            return
+        stays = self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN
+        return None if stays else origin
+
+    def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
+        """Place the window at an origin (3,)."""
         self.origin = origin
         self.cells.fill(-1)
         self.stamps.fill(0)

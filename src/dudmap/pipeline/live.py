@@ -65,7 +65,7 @@ def run_live(
     out, calibration = Path(out), calibration or camera.calibration
     metrics = RunRecord(dropped=0)
     slam = Slam(camera.camera, config, calibration=calibration)
-    stopped = ""
+    stopped, defect = "", False
     with locked(out), RunProgress(max_frames or camera.length, bar=progress) as display:
         prepare_run_folder(out, None, save_masks=save_masks)
         recorder = None if record is None else Recorder(Path(record), camera.camera, camera.calibration)
@@ -87,12 +87,12 @@ def run_live(
             stopped = str(error)
             raise type(error)(f"{stopped}; the trajectory and the map up to there are in {out}") from error
         except BaseException as error:
-            stopped = repr(error)
+            stopped, defect = repr(error), not isinstance(error, OSError)
             raise
         finally:
             camera.close()
             display.working("writing")
-            report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map)
+            report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map, defect=defect)
             for observer in observers:
                 observer.finish(out)
             _finish(recorder, display)

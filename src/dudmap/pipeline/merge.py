@@ -52,7 +52,7 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     if pair.T_a_b is None:
         raise MapError(f"{a} and {b} are not merged: {pair.reason}")
     merged = merged_map(*maps, pair.T_a_b)
-    trajectories = [*_trajectories(a, np.eye(4)), *_trajectories(b, pair.T_a_b)]
+    trajectories = [*run_trajectories(a, np.eye(4)), *run_trajectories(b, pair.T_a_b)]
     prepare_run_folder(out, None, save_masks=False)
     names = ["trajectory.txt", *(f"trajectory-{number}.txt" for number in range(2, len(trajectories) + 1))]
     for name, trajectory in zip(names, trajectories, strict=True):
@@ -70,7 +70,7 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     return MergeReport(out, pair, tree)
 
 
-def _trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
+def run_trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
     """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several."""
     names = ["trajectory.txt"]
     if (folder / MERGE_FILE).is_file():

@@ -1,7 +1,7 @@
 """What watches a run without taking part in it: viewers, logs, pictures."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from dudmap.pipeline.frame_source import FrameRead
@@ -24,6 +24,9 @@ class RunObserver:
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Frame number ``index`` was read and processed in ``ms`` milliseconds."""
+
+    def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
+        """Something else happened, such as an unreadable frame, with its figures."""
 
     def finish(self, out: Path) -> None:
         """The run is over, also by an error or an interrupt, and its run folder is written."""

@@ -41,6 +41,7 @@ def resume(
             dudmap wrote it, or it is damaged.
         DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
     """
+    from dudmap.mapping.memory_limit import MemoryLimit
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -57,7 +58,8 @@ def resume(
             display = RunProgress(options["count"] * options["passes"], bar=progress)
             try:
                 store = RunStore(out, options["every"], display.note)
-                state = restored(reader, store, *(Slam(sequence.camera, config) for _ in range(2)))
+                limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
+                state = restored(reader, store, *(Slam(sequence.camera, config, max_blocks=limit) for _ in range(2)))
             except sqlite3.Error as error:
                 raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
             job = Job(

@@ -42,6 +42,7 @@ def run(
     calibration: "Calibration | None" = None,
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
+    max_memory: int | None = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
     storing: Storing | None = None,
@@ -80,6 +81,8 @@ def run(
         calibration: Of the colour camera; None takes that of the recording.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
+        max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
+            wait on disk. None keeps the whole map in memory. It changes no result.
         observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
         storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
@@ -92,6 +95,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.calibration.depth_model import DepthModel
+    from dudmap.mapping.memory_limit import MemoryLimit
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -106,6 +110,8 @@ def run(
         )
     if saved_map is None and localize:
         raise ConfigError("there is nothing to localize in; name the run folder of a saved map (--map)")
+    if max_memory is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a memory limit, but two passes need two maps; expected 1 pass")
     if saved_map is not None and passes == 2:
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     if storing is not None and live:
@@ -115,7 +121,7 @@ def run(
     calibration = calibration or sequence.calibration
     slam = Slam(
         sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
-        localize=localize,
+        localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
     )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     state = RunState(slam, record, calibration, model)
@@ -143,6 +149,7 @@ def run(
                 "recording": storing.recording, "report": storing.report, "every": storing.every, "count": count,
                 "masks": None if masks is None else str(Path(masks).resolve()), "save_masks": save_masks,
                 "save_map": save_map, "ahead": ahead, "passes": passes, "config": config.model_dump_json(),
+                "max_memory": max_memory,
             }  # fmt: skip
             store.begin(state, sequence, options)
         return job.carry_out(state, store)
@@ -168,7 +175,7 @@ class Job:
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
-        out, display, stopped = self.out, self.display, ""
+        out, display, stopped, defect = self.out, self.display, "", False
         with display:
             try:
                 if self.live:
@@ -186,10 +193,10 @@ class Job:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
             except BaseException as error:
-                stopped = repr(error)
+                stopped, defect = repr(error), not isinstance(error, OSError)
                 raise
             finally:
-                report = self._finish(state, store, stopped)
+                report = self._finish(state, store, stopped, defect=defect)
         record = state.record
         if record.rows and not len(report.trajectory):
             raise DudmapError(
@@ -243,7 +250,7 @@ class Job:
             calibration=state.calibration,
         )  # fmt: skip
 
-    def _finish(self, state: RunState, store: RunStore | None, stopped: str) -> RunReport:
+    def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
         self.display.working("writing")
         slam, record = state.slam, state.record
@@ -252,7 +259,7 @@ class Job:
         complete = False
         try:
             report = write_run_folder(
-                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map
+                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map, defect=defect
             )
             for observer in self.observers:
                 observer.finish(self.out)
@@ -301,6 +308,8 @@ def process_source(
     if isinstance(read.frame, FrameError):
         record.skip(read.frame)
         display.note(f"skipped: {read.frame}")
+        for observer in observers:
+            observer.event("unreadable", frame=index, reason=str(read.frame))
         return
     true_mask = read.true_mask
     if isinstance(true_mask, FrameError):

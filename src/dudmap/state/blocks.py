@@ -1,6 +1,7 @@
 """Blocks of the maps on their way into the database and back: only those that changed are copied and written."""
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -8,10 +9,11 @@ from numpy.typing import NDArray
 
 from dudmap.errors import StateError
 from dudmap.kernels import hashing
+from dudmap.mapping.block_pager import Region
 from dudmap.mapping.block_window import BlockWindow
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
-from dudmap.state.morton import MAP_SHIFT, MAX_MAPS, block_keys
+from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
+from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
 
 VOXELS = 2 * BLOCK**3
 """Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""
@@ -27,6 +29,8 @@ class MapSnapshot:
         slots: (n,) int32 slots that were written.
         keys: (n,) int64 keys of their blocks; -1 for a slot that was released.
         voxels: (n, VOXELS) int32.
+        away: Number of the content of each region that has left the memory.
+        regions: Those of them that the database lacks.
     """
 
     number: int
@@ -35,15 +39,19 @@ class MapSnapshot:
     slots: NDArray[np.int32]
     keys: NDArray[np.int64]
     voxels: NDArray[np.int32]
+    away: dict[Region, int] = field(default_factory=dict)
+    regions: list[tuple[Region, BlockRecords]] = field(default_factory=list)
 
 
 @dataclass(eq=False)
 class StoredMap:
-    """What is known of a map in the database: its number, the frame that it was stored after, the keys by slot."""
+    """What is known of a map in the database: its number, the frame that it was stored after, the keys by slot, and the
+    numbers of the contents of its regions."""
 
     number: int
     frame: int
     keys: NDArray[np.int64]
+    regions: dict[Region, int] = field(default_factory=dict)
 
     def replaced(self, changed: MapSnapshot) -> NDArray[np.int64]:
         """Keys (n,) that are no longer those of a slot that changed."""
@@ -59,7 +67,7 @@ class StoredMap:
             grown[: len(self.keys)] = self.keys
             self.keys = grown
         self.keys[changed.slots] = changed.keys
-        self.frame = changed.frame
+        self.frame, self.regions = changed.frame, changed.away
 
 
 class StoredMaps:
@@ -89,8 +97,16 @@ class StoredMaps:
         keys = np.where(blocks.entry_of[slots] >= 0, block_keys(number, blocks.slot_coords[slots]), -1)
         voxels = np.empty((len(slots), VOXELS), np.int32)
         voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :] = blocks.geometry[slots], blocks.colors[slots]
-        changed = MapSnapshot(number, volume.map_id, volume.num_integrated, slots, keys, voxels)
-        return _index(volume), changed
+        away, known = {}, {} if stored is None else stored.regions
+        regions = []
+        if volume.pager is not None:
+            away = volume.pager.away()
+            unknown = [region for region, (serial, *_) in away.items() if known.get(region) != serial]
+            regions = [(region, volume.pager.records(region)) for region in unknown]
+        serials = {region: serial for region, (serial, *_) in away.items()}
+        frame = volume.num_integrated
+        changed = MapSnapshot(number, volume.map_id, frame, slots, keys, voxels, serials, regions)
+        return _index(volume) | {"away": _away_rows(away)}, changed
 
     def commit(self, maps: list[MapSnapshot]) -> None:
         """The blocks of these maps are in the database, and no other maps."""
@@ -105,7 +121,8 @@ class StoredMaps:
         blocks = volume.blocks
         coords = blocks.slot_coords[: blocks.num_slots]
         keys = np.where(blocks.entry_of[: blocks.num_slots] >= 0, block_keys(number, coords), -1)
-        self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, keys)
+        regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
+        self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, keys, regions)
 
     def _free_number(self, map_id: int) -> int:
         """Number for a map that is not in the database; the same until the next ``commit``."""
@@ -130,8 +147,18 @@ def _index(volume: TsdfVolume) -> dict[str, Any]:
     }  # fmt: skip
 
 
+def _away_rows(away: dict[Region, tuple[int, int, int]]) -> NDArray[np.int64]:
+    """Coordinates, number of the content, and numbers of blocks (n, 6) of regions that have left the memory."""
+    return np.array([(*region, *numbers) for region, numbers in away.items()], np.int64).reshape(-1, 6)
+
+
 def restore_map(
-    volume: TsdfVolume, index: dict[str, Any], keys: NDArray[np.int64], slots: NDArray[np.int64], voxels: NDArray
+    volume: TsdfVolume,
+    index: dict[str, Any],
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    voxels: NDArray,
+    read_region: Callable[[Region], BlockRecords],
 ) -> None:
     """Fill a map, whose other attributes are set.
 
@@ -139,6 +166,7 @@ def restore_map(
         volume: The map.
         index: Its part of the tree.
         keys, slots, voxels: (n,), (n,), (n, VOXELS) of all its rows in the database.
+        read_region: Reads a region from there that has left the memory.
 
     Raises:
         StateError: The rows do not fit the index.
@@ -164,11 +192,18 @@ def restore_map(
     blocks.coords, blocks.free_count, blocks.slot_of = index["coords"], index["free_count"], index["slot_of"]
     blocks.entry_of, blocks.slot_coords = index["entry_of"], index["slot_coords"]
     blocks.written, blocks.fused, blocks._released = index["written"], index["fused"], index["released"]
-    blocks.geometry, blocks.colors = np.zeros((2, m, BLOCK**3), np.int32)
+    capacity = max(m, len(volume.blocks.geometry)) if volume.pager is not None else m
+    for name in ("slot_coords", "written", "fused"):
+        setattr(blocks, name, grown(getattr(blocks, name), capacity, 0))
+    blocks.entry_of = grown(blocks.entry_of, capacity, -1)
+    blocks.geometry, blocks.colors = (np.zeros((capacity, BLOCK**3), np.int32) for _ in range(2))
     blocks.geometry[slots], blocks.colors[slots] = voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :]
     blocks.table = np.full(index["table"], hashing.EMPTY, dtype=np.int32)
     hashing.rebuild(blocks.table, blocks.coords, n)
     volume.blocks = blocks
+    if volume.pager is not None:
+        away = {(x, y, z): (serial, count, owning) for x, y, z, serial, count, owning in index["away"].tolist()}
+        volume.pager.continue_from(away, read_region)
     _restore_window(volume.window, blocks, index)
 
 

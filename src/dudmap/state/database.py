@@ -1,8 +1,8 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables: ``blocks`` (voxels by map and Morton code), ``frames`` (stored frames), ``chunks`` (parts of arrays by their
-content), ``state`` (the tree), ``meta`` (what the run is). The write-ahead log makes a checkpoint whole or absent after
-a crash, and lets others read while it is written.
+Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
+frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
+write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
 """
 
 import hashlib
@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import StateError
+from dudmap.mapping.block_pager import Region
+from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
+from dudmap.mapping.voxel_blocks import BlockRecords
 from dudmap.places.frame_store import EncodedFrame
+from dudmap.state.block_keys import MAP_SHIFT
 from dudmap.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.state.frames import FrameSnapshot, StoredFrames
-from dudmap.state.morton import MAP_SHIFT
 from dudmap.state.tree import Snapshot, lines
 
 APPLICATION = 0x44554453
@@ -37,6 +40,8 @@ CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
 CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
 CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
+CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, crc INTEGER NOT NULL, coords BLOB, free_count BLOB,
+                      owners BLOB, geometry BLOB, colors BLOB, fused BLOB, PRIMARY KEY (map, x, y, z));
 CREATE TABLE frames (store INTEGER, number INTEGER, depth BLOB NOT NULL, color BLOB NOT NULL, mask BLOB NOT NULL,
                      PRIMARY KEY (store, number));
 """
@@ -129,10 +134,15 @@ class StateDatabase:
         gone = {stored.number for map_id, stored in self.maps.by_id.items() if map_id not in current}
         for number in gone:
             self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
+            self._execute("DELETE FROM regions WHERE map = ?", number)
         for changed in maps:
             stored = known.get(changed.number)
             if stored is not None:
                 run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
+                back = ((changed.number, *region) for region in stored.regions.keys() - changed.away.keys())
+                run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
+            rows = ((changed.number, *region, *_region_row(records)) for region, records in changed.regions)
+            run(f"INSERT OR REPLACE INTO regions VALUES ({', '.join('?' * 11)})", rows)
             run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
 
     def _write_frames(self, frames: list[FrameSnapshot]) -> None:
@@ -235,6 +245,21 @@ class StateReader:
             voxels[n : n + ROWS] = np.frombuffer(part, np.int32).reshape(-1, VOXELS)
         return np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64), voxels
 
+    def region(self, map_number: int, region: Region) -> BlockRecords:
+        """Blocks of a region of a map that had left the memory.
+
+        Raises:
+            StateError: They are missing, or the database is damaged.
+        """
+        select = f"SELECT crc, {', '.join(COLUMNS)} FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?"
+        rows = list(self._rows(select, map_number, *region))
+        try:
+            if not rows or _checksum(rows[0][1:]) != rows[0][0]:
+                raise ValueError("it is missing or not as it was written")
+            return records_of(rows[0][1:])
+        except ValueError as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
+
     def frame(self, store: int, number: int) -> EncodedFrame:
         """A stored frame: depth, colour and mask as files.
 
@@ -268,6 +293,19 @@ class StateReader:
 
 
 _HEADER = "application_id", "user_version"
+
+
+def _region_row(records: BlockRecords) -> list[Any]:
+    """Checksum and arrays of a region."""
+    blobs = blobs_of(records)
+    return [_checksum(blobs), *blobs]
+
+
+def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
+    crc = 0
+    for blob in blobs:
+        crc = zlib.crc32(blob, crc)
+    return crc
 
 
 def _key_range(number: int) -> tuple[int, int]:

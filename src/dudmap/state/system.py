@@ -53,7 +53,7 @@ def restore(reader: StateReader, current: object, database: StateDatabase | None
     tree, arrays, records = stored
 
     def load_map(volume: TsdfVolume, number: int, index: dict[str, Any]) -> None:
-        restore_map(volume, index, *reader.blocks(number))
+        restore_map(volume, index, *reader.blocks(number), lambda region: reader.region(number, region))
         if database is not None:
             database.maps.add(volume, number)
 

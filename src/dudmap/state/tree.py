@@ -321,6 +321,7 @@ class TreeReader:
 def _defaults(cls: type) -> dict[str, Any]:
     """Values of the attributes that are not stored, of an object that is made without its constructor."""
     made: dict[str, dict[str, Any]] = {
+        "BlockPager": {"_store": None, "_executor": None},
         "CpuBackend": {"_padded": np.empty((0, 0), np.float32), "_limited": np.empty((0, 0), np.float32),
                        "_pixels": np.empty((0, 2), np.int32)},
         "FrameStore": {"registered": None, "_file": None, "_encoder": None, "_pending": deque()},

@@ -9,6 +9,17 @@ PACKAGES = (
 """Parts of this package whose classes hold state; no other class is ever made from a database."""
 REBUILT = {
     "Atlas": ("make_volume",),  # a method of Slam
+    "BlockPager": (  # the regions have a table
+        "_store",
+        "_executor",
+        "_away",
+        "_writing",
+        "_reading",
+        "_unchanged_since",
+        "_serial",
+        "_archived",
+        "_archive",
+    ),
     "CpuBackend": ("_padded", "_limited", "_pixels"),  # buffers that every call fills anew
     "FrameStore": ("registered", "_offsets", "_file", "_encoder", "_pending", "archived"),  # the frames have a table
     "KeyframeDatabase": ("_sift",),

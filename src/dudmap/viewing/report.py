@@ -63,7 +63,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
 
 def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
-    about, mesh = (None, "") if run.mesh is None else packed(simplified(run.mesh, TRIANGLES))
+    found = run.mesh
+    about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
     parts = {
         "version": __version__,
         "title": escape(str(run.metrics.get("sequence") or run.folder.name)),
