@@ -196,12 +196,10 @@ class Window:
         self._point = gui.add_markdown("click on the map for a point, again for a distance")
         empty = np.zeros((48, 64, 3), dtype=np.uint8)
         self._pictures = {kind: gui.add_image(empty, label=kind, format="jpeg") for kind in KINDS}
-        nothing = (np.zeros(1), np.zeros(1))
-        self._time_plot = gui.add_uplot(
-            nothing, ({"label": "s"}, _series("ms per frame")), title="time, ms", height=150
-        )
+        nothing, seconds = (np.zeros(1), np.zeros(1)), _series("s")
+        self._time_plot = gui.add_uplot(nothing, (seconds, _series("ms per frame")), title="time, ms", height=150)
         self._residual_plot = gui.add_uplot(
-            nothing, ({"label": "s"}, _series("residual")), title="residual at 1 m, mm", height=150
+            nothing, (seconds, _series("residual")), title="residual at 1 m, mm", height=150
         )
 
     def _slide(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
