@@ -112,11 +112,14 @@ def test_merged_sums_of_many_maps_saturate(maps, steps, weight, shade):
 
 
 def test_sums_are_wide_enough_to_be_added():
-    full = np.full((1, 512), 255 * 1020, np.int64)
-    sums = BlockSums(np.zeros((1, 3), np.int32), full, full, full, full, full, full[..., None], np.zeros(1, np.int64))
-    for _ in range(14):
-        sums = sums + sums
-    assert sums.color.min() == 255 * 1020 * 2**14
+    coords = np.zeros((1, 3), np.int32)
+    sums, one = BlockSums.zeros(coords), BlockSums.zeros(coords)
+    one.color[:], one.weight[:], one.distance[:] = 2**20 * 255 * 1020, 2**20 * 255, 2**20 * 255 * -MAX_STEPS
+    for _ in range(20):
+        sums.add(np.arange(1), one)
+    assert sums.color.min() == 20 * 2**20 * 255 * 1020
+    assert sums.weight.min() == 20 * 2**20 * 255
+    assert sums.distance.max() == 20 * 2**20 * 255 * -MAX_STEPS
 
 
 @pytest.mark.parametrize("operation", [lambda x: 1 / x, lambda x: np.log(x - 1), lambda x: np.exp(x + 1000)])

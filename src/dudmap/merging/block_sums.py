@@ -46,15 +46,9 @@ class BlockSums:
     @classmethod
     def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
         """Sums over no map."""
-        shape = len(coords), VOXELS
-
-        def zeros(*shape: int, kind: type = np.int32) -> NDArray:
-            return np.zeros(shape, kind)
-
-        return cls(
-            coords, zeros(*shape), zeros(*shape, kind=np.int64), zeros(*shape), zeros(*shape), zeros(*shape),
-            zeros(*shape, 3), zeros(len(coords), kind=np.int64),
-        )  # fmt: skip
+        n = len(coords)
+        shapes = *[(n, VOXELS)] * 5, (n, VOXELS, 3), (n,)
+        return cls(coords, *(np.zeros(shape, np.int64) for shape in shapes))
 
     def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
         """Sums over some of the blocks."""
