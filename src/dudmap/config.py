@@ -330,6 +330,9 @@ class Config(ConfigSection):
 
     preset: Literal["default", "thesis"] = "default"
     """Set of values from which the configuration starts."""
+    device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
+    """Where the frames are computed: cpu, cuda, or cuda:1 for the second GPU (extra gpu); auto takes a GPU where one
+    works; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""
     sensor: SensorConfig = SensorConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     similarity: SimilarityConfig = SimilarityConfig()
@@ -409,7 +412,7 @@ class Config(ConfigSection):
 
 def keys() -> list[str]:
     """All dotted keys."""
-    out = ["preset"]
+    out = ["preset", "device"]
     for part, field in Config.model_fields.items():
         if isinstance(field.default, ConfigSection):
             out += [f"{part}.{key}" for key in type(field.default).model_fields]

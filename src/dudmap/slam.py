@@ -23,6 +23,7 @@ from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.gpu.device import make_backend
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
@@ -90,7 +91,8 @@ class Slam:
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        self.preprocess = Preprocessor(camera, config.preprocess, calibration=given, voxel_size=voxel_size)
+        backend = make_backend(config.device)
+        self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
@@ -479,7 +481,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        config = self.config
+        config, backend = self.config, make_backend(self.config.device)
         return TsdfVolume(
-            self.camera, config.volume, config.sensor, config.preprocess.depth_max, max_blocks=self.max_blocks
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
         )

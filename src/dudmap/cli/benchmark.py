@@ -1,4 +1,4 @@
-"""``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, and speed."""
+"""``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
 import json
 from dataclasses import asdict
@@ -15,7 +15,7 @@ from dudmap.cli.progress import counted
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
-    help="Run a suite of recordings, the accuracy gate, the limit of dynamics, or the speed measurement.",
+    help="Run a suite of recordings, the accuracy gate, the limit of dynamics, or a speed measurement.",
 )
 
 SystemsOption = Annotated[
@@ -361,4 +361,47 @@ def speed(
     (out / "speed.md").write_text(text, encoding="utf-8")
     content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
     (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    _answer(content, text, out, as_json=as_json)
+
+
+@app.command()
+def gpu(
+    device: Annotated[str, typer.Option("--device", help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames of each run.")] = 120,
+    voxels: Annotated[
+        str, typer.Option("--voxels", help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")
+    ] = "2,1,0.5,0.25",
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
+    ] = "640x480,1280x720",
+    recording: Annotated[
+        list[Path] | None, typer.Option("--recording", help="Also measure this recording; repeatable.")
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Output folder for gpu.md and gpu.json.")] = Path(
+        "runs/benchmark/gpu"
+    ),
+    quick: QuickOption = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a GPU and the CPU beside it: time by stage and kernel, memory, and share of the memory bandwidth.
+
+    Without a GPU, only the CPU is measured, and the table says why.
+    """
+    from dudmap.benchmark import gpu as measurements
+    from dudmap.pipeline.environment import machine, versions
+
+    rows = []
+    steps, shapes = measurements.numbers(voxels, sizes)
+    if quick:
+        steps, shapes, frames = steps[:1], [(320, 240)], min(frames, 12)
+    for name, each in measurements.recordings(shapes, frames, recording or []):
+        for step in steps:
+            for one in measurements.devices(device):
+                typer.echo(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
+                rows.append(measurements.measure(name, each, frames, step, one))
+    text = measurements.table(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "gpu.md").write_text(text, encoding="utf-8")
+    content = {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
+    (out / "gpu.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     _answer(content, text, out, as_json=as_json)

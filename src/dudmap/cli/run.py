@@ -47,6 +47,12 @@ SetOption = Annotated[
         autocompletion=parameter_names,
     ),
 ]
+DeviceOption = Annotated[
+    str | None,
+    typer.Option(
+        "--device", help="cpu, cuda or cuda:N (extra gpu); default auto: a GPU where one works, else the CPU."
+    ),
+]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
@@ -129,6 +135,7 @@ def run(
     token: TokenOption = None,
     rerun: RerunOption = None,
     log: LogOption = None,
+    device: DeviceOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -154,7 +161,7 @@ def run(
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
-    parameters = read_config(config, preset, assignments or [])
+    parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:

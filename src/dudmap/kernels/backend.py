@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
     DepthView,
@@ -246,8 +247,8 @@ class Backend(Protocol):
 
     def extract_mesh(
         self,
-        geometry: NDArray[np.int32],
-        colors: NDArray[np.int32],
+        geometry: Mirror | NDArray[np.int32],
+        colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
         neighbours: NDArray[np.int32],
@@ -269,8 +270,8 @@ class Backend(Protocol):
 
     def extract_chunks(
         self,
-        geometry: NDArray[np.int32],
-        colors: NDArray[np.int32],
+        geometry: Mirror | NDArray[np.int32],
+        colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
         neighbours: NDArray[np.int32],

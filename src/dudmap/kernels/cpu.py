@@ -192,6 +192,7 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> NDArray[np.int32]:
         """See ``Backend.touched_cells``."""
+        grid = grid.on_host()
         p, depth = single(parameters), view.depth
         T_blocks_camera = view.T_grid_camera / np.float32(BLOCK)
         ranges = bands(-(-depth.shape[0] // stride), TILE_ROWS)
@@ -219,6 +220,7 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
+        grid = grid.on_host()
         p, depth = single(parameters), view.depth
         slots, repeats = self._visible(grid, view, candidates, fused, turn, p)
         repeats *= count
@@ -279,6 +281,7 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> NDArray[np.int32]:
         """See ``Backend.observe_free``."""
+        grid = grid.on_host()
         p, size = single(parameters), np.array(view.depth.shape, dtype=np.int64)
         ranges = bands(int(grid.shape[0]) // 2, PLANES_PER_BAND)
         found = [np.empty(MAX_FOUND, dtype=np.int32) for _ in ranges]
@@ -305,6 +308,7 @@ class CpuBackend:
         parameters: RegistrationParameters,
     ) -> NormalEquations:
         """See ``Backend.linearize``."""
+        grid = grid.on_host()
         height, width = depth.shape
         ranges = bands(height, -(-PIXELS_PER_BAND // width))
         sums = np.zeros((len(ranges), registration.NUM_SUMS))
@@ -334,6 +338,7 @@ class CpuBackend:
         free_after: int,
     ) -> MapSample:
         """See ``Backend.sample``."""
+        grid = grid.on_host()
         shape, geometry, sdf_unit = depth.shape, grid.geometry.reshape(-1), np.float32(grid.sdf_unit)
         out = MapSample(np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.uint8))
         run_bands(

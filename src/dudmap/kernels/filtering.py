@@ -6,8 +6,9 @@ wrap-around test, and with it the vectorisation (measured: a factor 4).
 
 import numpy as np
 
-from dudmap.kernels.threads import kernel, scalar
+from dudmap.kernels.threads import kernel, scalar, written_out
 
+f32 = np.float32
 ABSENT = np.float32(-1e9)
 """Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
 OUTSIDE = np.float32(-2e9)
@@ -28,7 +29,7 @@ def limit_depth(depth, low, high, out):
 
 
 @scalar
-def _between(z, a, b, gap):
+def between(z, a, b, gap):
     """Whether a reading ``z`` lies between two others by more than ``gap`` of both; none of them may be missing."""
     low, high = min(a, b), max(a, b)
     return (low > np.float32(0)) & (z > low + gap) & (z < high - gap)
@@ -61,13 +62,13 @@ def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
             for u in range(here.size):
                 z = here[u]
                 gap = max(noise_floor, noise * z * z) + steepest * z
-                target[u] = zero if _between(z, before[u], after[u], gap) else target[u]
+                target[u] = zero if between(z, before[u], after[u], gap) else target[u]
             if v >= k and v + k < h:
                 above, below = depth[v - k], depth[v + k]
                 for u in range(w):
                     z = middle[u]
                     gap = max(noise_floor, noise * z * z) + steepest * z
-                    row[u] = zero if _between(z, above[u], below[u], gap) else row[u]
+                    row[u] = zero if between(z, above[u], below[u], gap) else row[u]
 
 
 @kernel
@@ -245,24 +246,29 @@ def halve_intensity(row_start, row_stop, image, out):
             target[u] = quarter * ((upper[k] + upper[j]) + (lower[k] + lower[j]))
 
 
+@written_out
+def foreground_mean(a, b, c, d, band):
+    """Mean of those of four readings that lie within ``max(band, band z)`` behind the nearest z; 0 without any."""
+    zero, one, far = f32(0), f32(1), f32(1e9)
+    a, b = a if a > zero else far, b if b > zero else far
+    c, d = c if c > zero else far, d if d > zero else far
+    near = min(min(a, b), min(c, d))
+    limit = near + band * max(one, near)
+    wa, wb = one if a <= limit else zero, one if b <= limit else zero
+    wc, wd = one if c <= limit else zero, one if d <= limit else zero
+    mean = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
+    return mean if near < far else zero
+
+
 @kernel
 def halve_depth(row_start, row_stop, depth, band, out):
     """Mean of the readings of each 2x2 block that lie within ``max(band, band z)`` behind its nearest reading z.
 
     Foreground and background are never mixed; a block without a reading gives 0.
     """
-    zero, one, far = np.float32(0), np.float32(1), np.float32(1e9)
     for v in range(row_start, row_stop):
         upper, lower, target = depth[2 * v], depth[2 * v + 1], out[v]
         for u in range(target.size):
             k = np.uintp(2 * u)
             j = np.uintp(2 * u + 1)
-            a, b, c, d = upper[k], upper[j], lower[k], lower[j]
-            a, b = a if a > zero else far, b if b > zero else far
-            c, d = c if c > zero else far, d if d > zero else far
-            near = min(min(a, b), min(c, d))
-            limit = near + band * max(one, near)
-            wa, wb = one if a <= limit else zero, one if b <= limit else zero
-            wc, wd = one if c <= limit else zero, one if d <= limit else zero
-            mean = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
-            target[u] = mean if near < far else zero
+            target[u] = foreground_mean(upper[k], upper[j], lower[k], lower[j], band)

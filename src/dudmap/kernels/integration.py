@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.kernels.pixel import band_front, project, ray, sigma
+from dudmap.kernels.pixel import free_depth, project, ray, reading_weight
 from dudmap.kernels.threads import kernel
 from dudmap.kernels.voxel import fuse_color, fuse_voxel, is_occupied, pack_pixel_color, pack_reading
 
@@ -23,8 +23,7 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
         pixels: (H * W + 1, 2) int32 out; the last row is left as it is.
     """
     h, w = depth.shape
-    far, zero = np.float32(1e9), np.float32(0)
-    band = parameters.band
+    far, band = np.float32(1e9), parameters.band
     by_unit = np.float32(1) / parameters.depth_unit
     column = np.full(w + 2, far, np.float32)
     for v in range(row_start, row_stop):
@@ -38,9 +37,7 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
         for u in range(w):
             k = np.uintp(u)
             near = min(min(column[k], column[np.uintp(u + 1)]), column[np.uintp(u + 2)])
-            free = near - min(band_front(near, band), band.limit)
-            free = max(free, zero) if middle[k] > zero else zero
-            row[k, 0] = pack_reading(middle[k], free, by_unit)
+            row[k, 0] = pack_reading(middle[k], free_depth(middle[k], near, band), by_unit)
         for u in range(w):
             r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
             row[u, 1] = pack_pixel_color(r, g, b, gains[u])
@@ -142,9 +139,8 @@ def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out
         out: (H, W) uint8 out, at least 1 where there is a reading.
     """
     h, w = depth.shape
-    zero, half, one, slanted = np.float32(0), np.float32(0.5), np.float32(1), np.float32(0.3)
+    zero = np.float32(0)
     fx, fy, cx, by_fx = intrinsics[0], intrinsics[1], intrinsics[2], np.float32(1) / intrinsics[0]
-    err_one = noise.base + noise.scale
     for v in range(row_start, row_stop):
         y = ray(v, intrinsics[3], fy)
         above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
@@ -155,16 +151,6 @@ def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out
             left, right = middle[np.uintp(u - 1)], middle[np.uintp(u + 1)]
             z, up, down = middle[k], above[k], below[k]
             x = (np.float32(u) - cx) * by_fx
-            # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and
-            # its product with the ray (x, y, 1) is -z
-            gu, gv = half * fx * (right - left), by_rows * (down - up)
-            nz = z + x * gu + y * gv
-            cosine = z / np.sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
-            step = max(abs(left - right), abs(up - down))
-            smooth = (min(min(left, right), min(up, down)) > zero) & (step < np.float32(0.03) * z)
-            cosine = cosine if smooth else slanted  # the angle is not known at a depth edge
-            weight = best * cosine * err_one / sigma(z, noise)
-            weight = min(max(weight + half, one), np.float32(16)) if z > zero else zero
-            row[k] = np.int32(weight)
+            row[k] = np.int32(reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise))
         row[0] = 1 if middle[0] > zero else 0
         row[w - 1] = 1 if middle[w - 1] > zero else 0

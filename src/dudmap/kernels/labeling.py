@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.threads import bands, kernel, run_bands, scalar
 
+f64, exp, sqrt = np.float64, np.exp, np.sqrt
 UPSAMPLING_BAND = 60
 """Image rows per band of the upsampling."""
 DISTANCE_COST = np.float32(1e-4)
 """Cost of one low-resolution pixel of image distance in the upsampling, metres of depth difference: less than a depth
 sensor resolves, so that the distance decides between equal depths only."""
+SMALLEST = np.float64(1e-300)
+"""Least sum of two densities: keeps the quotient of two that vanish finite."""
 MISSING_COST = np.float32(64)
 """Cost of pairing a pixel that has a depth with one that has none, metres: more than any depth difference."""
 
@@ -26,7 +29,7 @@ def half_normal(square, prior, sigma):
         prior: Prior of the component.
         sigma: Its standard deviation.
     """
-    return prior / sigma * np.exp(-0.5 * square / (sigma * sigma))
+    return prior / sigma * exp(f64(-0.5) * square / (sigma * sigma))
 
 
 @scalar
@@ -38,9 +41,9 @@ def dynamic_responsibility(square, prior, static, dynamic):
         prior: Prior of the dynamic component.
         static, dynamic: Standard deviations of the components.
     """
-    p = half_normal(square, 1 - prior, static)
+    p = half_normal(square, f64(1) - prior, static)
     q = half_normal(square, prior, dynamic)
-    return q / max(p + q, 1e-300)
+    return q / max(p + q, SMALLEST)
 
 
 @scalar
@@ -52,7 +55,7 @@ def bounded_sigma(squares, mass, low, high):
         mass: Sum of the responsibilities.
         low, high: Bounds.
     """
-    return min(max(np.sqrt(squares / max(mass, 1e-9)), low), high)
+    return min(max(sqrt(squares / max(mass, f64(1e-9))), low), high)
 
 
 @scalar

@@ -6,18 +6,20 @@ owns, and, once the offset of each block is known, vertices and triangles. The t
 global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.links import links
+from dudmap.kernels.mirror import Mirror, on_host
 from dudmap.kernels.parameters import MeshArrays, MeshParameters
+from dudmap.kernels.surface import crossing, mixed_channel, slope
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.kernels.threads import bands, kernel, run_bands
 
 BAND = 256
 """Blocks of one band."""
-MIN_OFFSET = np.float32(1e-3)
-"""Smallest distance of a vertex from a voxel, as a share of the edge: where sdf is 0 at a voxel, the vertices of the
-edges around it stay distinct, and no triangle degenerates."""
 
 
 @kernel
@@ -182,13 +184,8 @@ def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
 
 @kernel
 def _slope(words, n, step):
-    """Derivative of sdf at voxel ``n`` of flat ``words``: central difference, one-sided beside unseen voxels."""
-    here, above, below = words[n], words[n + step], words[n - step]
-    has_above, has_below = (above & 0xFF00) != 0, (below & 0xFF00) != 0
-    high = above >> 16 if has_above else here >> 16
-    low = below >> 16 if has_below else here >> 16
-    span = np.float32(0.5) if has_above and has_below else np.float32(1)
-    return span * np.float32(high - low)
+    """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
+    return slope(words[n], words[n + step], words[n - step])
 
 
 @kernel
@@ -199,7 +196,6 @@ def _write_vertices(
     """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
     words = np.empty((10, 10, 10), np.int32)
     flat = words.reshape(-1)
-    half = np.float32(0.5)
     for row in range(start, stop):
         number = begin[row]
         if number == begin[row + 1]:
@@ -218,7 +214,7 @@ def _write_vertices(
                     continue
                 step = 100 if axis == 0 else (10 if axis == 1 else 1)
                 a, b = np.float32(flat[here] >> 16), np.float32(flat[here + step] >> 16)
-                t = min(max(a / (a - b), MIN_OFFSET), np.float32(1) - MIN_OFFSET)
+                t = crossing(a, b)
                 ex, ey, ez = x + (axis == 0), y + (axis == 1), z + (axis == 2)
                 vertices[number, 0] = voxel_size * (8 * coords[slot, 0] + x + (t if axis == 0 else 0.0))
                 vertices[number, 1] = voxel_size * (8 * coords[slot, 1] + y + (t if axis == 1 else 0.0))
@@ -229,18 +225,17 @@ def _write_vertices(
                 for channel in range(3):
                     shift = 20 - 10 * channel
                     low, high = np.float32((c >> shift) & 1023), np.float32((e >> shift) & 1023)
-                    value = (low + (high - low) * t) * np.float32(0.25) + half
-                    vertex_colors[number, channel] = np.uint8(min(value, np.float32(255)))
+                    vertex_colors[number, channel] = np.uint8(mixed_channel(low, high, t))
                 square = np.float32(1e-20)
                 for direction in range(3):
                     across = 100 if direction == 0 else (10 if direction == 1 else 1)
                     if direction == axis:
-                        slope = b - a
+                        steepness = b - a
                     else:
                         low = _slope(flat, here, across)
-                        slope = low + (_slope(flat, here + step, across) - low) * t
-                    normals[number, direction] = slope
-                    square += slope * slope
+                        steepness = low + (_slope(flat, here + step, across) - low) * t
+                    normals[number, direction] = steepness
+                    square += steepness * steepness
                 scale = np.float32(1) / np.sqrt(square)
                 for direction in range(3):
                     normals[number, direction] *= scale
@@ -273,20 +268,6 @@ def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, b
 
 
 @kernel
-def _link(slots, near, row_of, behind):
-    """Row of each slot, and the rows (n, 8) of the blocks behind: column 4 dx + 2 dy + dz is at -(dx, dy, dz)."""
-    row_of[:] = -1
-    behind[:, :] = -1
-    for row in range(len(slots)):
-        row_of[slots[row]] = row
-    for row in range(len(slots)):
-        for m in range(8):
-            slot = near[row, m]
-            if slot >= 0 and row_of[slot] >= 0:
-                behind[row_of[slot], m] = row
-
-
-@kernel
 def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
     """Copy shared vertices for each chunk: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
 
@@ -316,34 +297,38 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
 
 
 def extract(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
 ) -> MeshArrays:
     """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
-    vertices, faces, vertex_colors, normals, _ = _surface(
+    vertices, faces, vertex_colors, normals, _ = extract_surface(
         geometry, colors, slots, coords, neighbours, parameters, len(slots)
     )
     return MeshArrays(vertices, faces, vertex_colors, normals)
 
 
 def extract_chunks(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
+    surface: Callable[..., tuple[NDArray, ...]] | None = None,
 ) -> list[MeshArrays]:
-    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
+    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``.
+
+    ``surface`` does the work of ``extract_surface``, which None takes.
+    """
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
-    vertices, faces, vertex_colors, normals, first_face = _surface(
+    vertices, faces, vertex_colors, normals, first_face = (surface or extract_surface)(
         geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
@@ -360,9 +345,9 @@ def extract_chunks(
     return out
 
 
-def _surface(
-    geometry: NDArray[np.int32],
-    colors: NDArray[np.int32],
+def extract_surface(
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
     neighbours: NDArray[np.int32],
@@ -371,14 +356,8 @@ def _surface(
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
     """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
     face (n + 1,) of each block."""
-    n = len(slots)
-    slots = np.ascontiguousarray(slots, dtype=np.int32)
-    row_of = np.empty(len(geometry), dtype=np.int32)
-    behind = np.empty((n, 8), dtype=np.int32)
-    near = np.ascontiguousarray(neighbours, dtype=np.int32)
-    _link(slots, near, row_of, behind)
-    # blocks that are not among the slots count as absent
-    near = np.where((near >= 0) & (row_of[near] >= 0), near, np.int32(-1))
+    geometry, colors, n = on_host(geometry), on_host(colors), len(slots)
+    slots, near, behind, row_of = links(slots, neighbours, len(geometry))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)
     flags = np.empty((n, 512), dtype=np.uint8)

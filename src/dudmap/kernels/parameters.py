@@ -4,10 +4,12 @@ Numba compiles named tuples as they are. Tuples of parameters hold floats only: 
 that the loops calculate with.
 """
 
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dudmap.kernels.mirror import Mirror, on_host
 
 BLOCK = 8
 """Voxels along the edge of a block."""
@@ -174,6 +176,8 @@ class FilterParameters(NamedTuple):
 class VoxelGrid(NamedTuple):
     """The blocks of the map around the view.
 
+    Voxels and window are arrays, or mirrors of arrays of which a back end may keep a copy on a device.
+
     Attributes:
         window: (Wx * Wy * Wz,) int32: slot of the voxels of a block; -1 = unknown; -2 - entry = without voxels.
         shape: (3,) int64 blocks along each axis.
@@ -186,15 +190,20 @@ class VoxelGrid(NamedTuple):
         sdf_unit: Metres per step of the stored distance.
     """
 
-    window: NDArray[np.int32]
+    window: Mirror | NDArray[np.int32]
     shape: NDArray[np.int64]
     origin: NDArray[np.int64]
-    geometry: NDArray[np.int32]
-    colors: NDArray[np.int32]
+    geometry: Mirror | NDArray[np.int32]
+    colors: Mirror | NDArray[np.int32]
     slot_coords: NDArray[np.int32]
     free_count: NDArray[np.uint8]
     voxel_size: float
     sdf_unit: float
+
+    def on_host(self) -> "VoxelGrid":
+        """The grid with plain arrays, up to date."""
+        window, geometry, colors = on_host(self.window), on_host(self.geometry), on_host(self.colors)
+        return self._replace(window=window, geometry=geometry, colors=colors)
 
 
 class DepthTiles(NamedTuple):
@@ -240,6 +249,14 @@ class FusedBlocks(NamedTuple):
     occupied: NDArray[np.int32]
 
 
+class ImageStack(Protocol):
+    """Images of one size by number: an array (n, h, w), or images on a device, each brought over when it is read."""
+
+    def __getitem__(self, number: int, /) -> NDArray[np.float32]:
+        """Image (h, w)."""
+        ...
+
+
 class NormalEquations(NamedTuple):
     """One linearisation of the registration: ``H step = -b``.
 
@@ -261,7 +278,7 @@ class NormalEquations(NamedTuple):
     readings: float
     weight: float
     chi_square: float
-    residuals: NDArray[np.float32]
+    residuals: ImageStack
 
 
 class MapSample(NamedTuple):

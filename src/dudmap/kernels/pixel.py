@@ -6,9 +6,11 @@ A rigid motion (3, 4) is passed as its twelve elements, row by row (``elements``
 
 import numpy as np
 
-from dudmap.kernels.threads import scalar
+from dudmap.kernels.threads import scalar, written_out
 
-f32 = np.float32
+f32, sqrt = np.float32, np.sqrt
+UNKNOWN_COSINE = f32(0.3)
+"""Cosine of the angle of incidence that is assumed at depth edges, where it is not known."""
 
 
 @scalar
@@ -65,3 +67,42 @@ def band_front(z, band):
 def band_behind(z, band):
     """Width of the truncation band behind a reading at depth ``z``, metres."""
     return max(band.behind, band.sigmas * sigma(z, band.noise))
+
+
+@written_out
+def free_depth(z, near, band):
+    """Depth up to which a pixel certainly sees free space: the nearest reading around it less the band there, metres.
+
+    Args:
+        z: Its reading, 0 = none.
+        near: Nearest reading of its neighbourhood.
+        band: TruncationBand.
+    """
+    free = near - min(band_front(near, band), band.limit)
+    return max(free, f32(0)) if z > f32(0) else f32(0)
+
+
+@written_out
+def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
+    """Weight of a reading, 1 to 16, 0 without one: cos(theta) / err(z) (eq. 4.20), ``best`` for a frontal one at 1 m.
+
+    Args:
+        z: The reading, metres.
+        left, right, up, down: Those beside it.
+        x, y: Coordinates of its ray at depth 1.
+        fx: Focal length, pixels.
+        by_rows: Focal length in rows over the rows between ``up`` and ``down``.
+        best: Weight of a frontal reading at one metre.
+        noise: SensorNoise, whose sigma(z) is err(z).
+    """
+    zero, half, one = f32(0), f32(0.5), f32(1)
+    # gradient of the surface z(u, v) in pixels; the normal is (fx dz/du, fy dz/dv, -(z + x fx dz/du + ..)), and
+    # its product with the ray (x, y, 1) is -z
+    gu, gv = half * fx * (right - left), by_rows * (down - up)
+    nz = z + x * gu + y * gv
+    cosine = z / sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
+    step = max(abs(left - right), abs(up - down))
+    smooth = (min(min(left, right), min(up, down)) > zero) & (step < f32(0.03) * z)
+    cosine = cosine if smooth else UNKNOWN_COSINE
+    weight = best * cosine * (noise.base + noise.scale) / sigma(z, noise)
+    return min(max(weight + half, one), f32(16)) if z > zero else zero

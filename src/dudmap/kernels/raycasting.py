@@ -11,7 +11,7 @@ from dudmap.kernels.neighbors import load_corners
 from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.kernels.pixel import project, ray
 from dudmap.kernels.residual import trilinear
-from dudmap.kernels.threads import bands, kernel, run_bands, scalar
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar, written_out
 from dudmap.kernels.voxel import sdf_steps
 
 TILE = 8
@@ -109,10 +109,22 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
 
 
 @kernel
-def _to_block_boundary(p, d, inverse):
+def to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
     return (block + np.float32(8) - p) * inverse if d > np.float32(0) else (block - p) * inverse
+
+
+@written_out
+def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
+    """Gradient of the trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
+    one = np.float32(1)
+    wy, wz = one - fy, one - fz
+    wx = one - fx
+    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
+    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
+    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
+    return gx, gy, gz
 
 
 @kernel
@@ -153,8 +165,8 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
         i, j, k = np.int64(x + half), np.int64(y + half), np.int64(z + half)
         slot = window[np.uintp(((i >> 3) * size_y + (j >> 3)) * size_z + (k >> 3))]
         if slot < 0:
-            steps = min(_to_block_boundary(x + half, dx, rx), _to_block_boundary(y + half, dy, ry))
-            t += min(steps, _to_block_boundary(z + half, dz, rz)) + nudge
+            steps = min(to_block_boundary(x + half, dx, rx), to_block_boundary(y + half, dy, ry))
+            t += min(steps, to_block_boundary(z + half, dz, rz)) + nudge
             before = -one
             continue
         word = geometry[np.uintp(np.int64(slot) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (k & 7)))]
@@ -217,11 +229,7 @@ def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, nor
     s2, s3 = sdf_steps(corners[2, 0]), sdf_steps(corners[3, 0])
     s4, s5 = sdf_steps(corners[4, 0]), sdf_steps(corners[5, 0])
     s6, s7 = sdf_steps(corners[6, 0]), sdf_steps(corners[7, 0])
-    wy, wz = one - fy, one - fz
-    wx = one - fx
-    gx = ((s4 - s0) * wz + (s5 - s1) * fz) * wy + ((s6 - s2) * wz + (s7 - s3) * fz) * fy
-    gy = ((s2 - s0) * wz + (s3 - s1) * fz) * wx + ((s6 - s4) * wz + (s7 - s5) * fz) * fx
-    gz = ((s1 - s0) * wy + (s3 - s2) * fy) * wx + ((s5 - s4) * wy + (s7 - s6) * fy) * fx
+    gx, gy, gz = corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz)
     length = np.sqrt(gx * gx + gy * gy + gz * gz)
     scale = one / length if length > np.float32(0) else np.float32(0)
     normal[0], normal[1], normal[2] = gx * scale, gy * scale, gz * scale
@@ -277,17 +285,10 @@ def raycast(
     parameters: RaycastParameters,
 ) -> RaycastResult:
     """Depth, colour and normals of the first surface that each pixel of a camera sees; see ``Backend.raycast``."""
-    voxel_size, shape = grid.voxel_size, grid.shape
+    grid = grid.on_host()
+    shape = grid.shape
     low, high = np.float32(parameters.depth_min), np.float32(parameters.depth_max)
-    corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
-    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
-    to_camera = np.empty((3, 4), dtype=np.float32)
-    to_camera[:, :3] = rotation.T * (8 * voxel_size)
-    to_camera[:, 3] = rotation.T @ (corner + 4 * voxel_size - position)
-    to_lattice = np.empty((3, 4), dtype=np.float32)
-    to_lattice[:, :3] = rotation / voxel_size
-    to_lattice[:, 3] = (position - corner) / voxel_size
-
+    to_camera, to_lattice, radius = motions(grid, T_world_camera)
     height, width = size
     tiles = (-(-height // TILE), -(-width // TILE))
     window = grid.window.reshape(tuple(shape))
@@ -295,7 +296,6 @@ def raycast(
     nears = np.full((len(ranges), *tiles), INFINITE, dtype=np.float32)
     fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
     image_size = np.array(size, dtype=np.int64)
-    radius = np.float32(4 * np.sqrt(3) * voxel_size)
     run_bands(
         lambda start, stop, near, far: _splat(
             start, stop, window, to_camera, intrinsics, image_size, radius, low, high, near, far
@@ -309,7 +309,7 @@ def raycast(
     depth = np.empty(size, dtype=np.float32)
     color = np.empty((*size, 3), dtype=np.uint8)
     normals = np.empty((*size, 3), dtype=np.float32)
-    unit, least = np.float32(grid.sdf_unit / voxel_size), max(int(parameters.min_weight), 1)
+    unit, least = np.float32(grid.sdf_unit / grid.voxel_size), max(int(parameters.min_weight), 1)
     run_bands(
         lambda start, stop: trace_rows(
             start, stop, grid.window, shape, grid.geometry.reshape(-1), grid.colors.reshape(-1), intrinsics, to_lattice,
@@ -318,3 +318,20 @@ def raycast(
         bands(height, BAND),
     )  # fmt: skip
     return RaycastResult(depth, color, normals)
+
+
+def motions(
+    grid: VoxelGrid, T_world_camera: NDArray[np.float64]
+) -> tuple[NDArray[np.float32], NDArray[np.float32], np.float32]:
+    """Motions (3, 4) from blocks of the window to metres in the camera frame and from there to the window's lattice,
+    and the radius of the sphere around a block, metres."""
+    voxel_size = grid.voxel_size
+    corner = 8 * voxel_size * grid.origin.astype(np.float64)  # of the window, world frame
+    rotation, position = T_world_camera[:3, :3], T_world_camera[:3, 3]
+    to_camera = np.empty((3, 4), dtype=np.float32)
+    to_camera[:, :3] = rotation.T * (8 * voxel_size)
+    to_camera[:, 3] = rotation.T @ (corner + 4 * voxel_size - position)
+    to_lattice = np.empty((3, 4), dtype=np.float32)
+    to_lattice[:, :3] = rotation / voxel_size
+    to_lattice[:, 3] = (position - corner) / voxel_size
+    return to_camera, to_lattice, np.float32(4 * np.sqrt(3) * voxel_size)

@@ -8,8 +8,8 @@ and the last on every CPU.
 import numpy as np
 
 from dudmap.kernels.neighbors import load_row
-from dudmap.kernels.pixel import band_front, elements, rotate, sigma
-from dudmap.kernels.residual import huber_cost, huber_weight, trilinear, tukey_cost, tukey_inlier
+from dudmap.kernels.pixel import elements, rotate
+from dudmap.kernels.residual import normal_terms, trilinear, weigh
 from dudmap.kernels.threads import kernel
 from dudmap.kernels.voxel import intensity_of, sdf_steps
 
@@ -63,18 +63,11 @@ def linearize_rows(
     inside = np.empty(w, np.float32)
 
     zero, one = np.float32(0), np.float32(1)
-    band, huber, tukey = parameters.band, parameters.huber, parameters.tukey
-    color_weight, color_huber = parameters.color_weight, parameters.color_huber
-    sigma_one, noisy = parameters.sigma_at_one_metre, parameters.noise_weighting
     by_unit = sdf_unit / voxel_size
     by_voxel = one / voxel_size
     by_255 = np.float32(1 / 255)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
     cx, cy = intrinsics[2], intrinsics[3]
-    use_tukey = tukey > zero
-    by_tukey = one / tukey if use_tukey else one
-    tukey_limit = tukey * tukey / np.float32(6)
-    worst_color = huber_cost(np.float32(0.3), color_huber)
     last_x, last_y, last_z = np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
     size_y, size_z = shape[1], shape[2]
     t = elements(T)
@@ -131,76 +124,44 @@ def linearize_rows(
             scale_c = by_255 * by_voxel
             kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
 
-            gate = band_front(z, band) * np.float32(0.95)
-            scaled = min(sigma_one / max(sigma(z, band.noise), np.float32(1e-6)), one)
-            scale = noisy * scaled + (one - noisy)
-            static = weights[v, u]
             known = (low > 0) & (inside[u] > zero) & (darkest > zero)  # a corner in the air is not part of a surface
-            valid = known & (abs(r) < gate)
+            valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, weights[v, u], known, parameters)
             residuals[0, v, u] = r if known else np.float32(np.nan)
             residuals[1, v, u] = rc if valid else np.float32(np.nan)
-
-            rn = r * scale
-            a = abs(rn)
-            inlier = tukey_inlier(a, by_tukey)
-            robust = inlier * inlier if use_tukey else huber_weight(a, huber)
-            geometric_cost = tukey_cost(inlier, tukey_limit) if use_tukey else huber_cost(a, huber)
-            worst = tukey_limit if use_tukey else huber_cost(gate * scale, huber)
-            ac = abs(rc)
-            color_robust, color_cost = huber_weight(ac, color_huber), huber_cost(ac, color_huber)
-
-            used = static if valid else zero
-            missing = static - used if z > zero else zero
-            cost += used * (geometric_cost + color_weight * color_cost)
-            cost += missing * (worst + color_weight * worst_color)
+            cost += paid
+            cost += forfeit
             on_map += one if valid else zero
-            readings += static if z > zero else zero
+            readings += weights[v, u] if z > zero else zero
             total_weight += used
-            chi += used * robust * rn * rn
-
-            wg = used * robust * scale * scale
-            wc = used * color_robust * color_weight
-            a00 = wg * gx * gx + wc * kx_ * kx_
-            a01 = wg * gx * gy + wc * kx_ * ky_
-            a02 = wg * gx * gz + wc * kx_ * kz_
-            a11 = wg * gy * gy + wc * ky_ * ky_
-            a12 = wg * gy * gz + wc * ky_ * kz_
-            a22 = wg * gz * gz + wc * kz_ * kz_
-            q0 = wg * gx * r + wc * kx_ * rc
-            q1 = wg * gy * r + wc * ky_ * rc
-            q2 = wg * gz * r + wc * kz_ * rc
-            x, y, zz = px[u], py[u], pz[u]
-            # J = [g, p x g]: with A = w g g', the blocks are A, M = A hat(p)' and N = hat(p) M
-            h00 += a00
-            h01 += a01
-            h02 += a02
-            h11 += a11
-            h12 += a12
-            h22 += a22
-            r00, r01, r02 = a02 * y - a01 * zz, a00 * zz - a02 * x, a01 * x - a00 * y
-            r10, r11, r12 = a12 * y - a11 * zz, a01 * zz - a12 * x, a11 * x - a01 * y
-            r20, r21, r22 = a22 * y - a12 * zz, a02 * zz - a22 * x, a12 * x - a02 * y
-            m00 += r00
-            m01 += r01
-            m02 += r02
-            m10 += r10
-            m11 += r11
-            m12 += r12
-            m20 += r20
-            m21 += r21
-            m22 += r22
-            n00 += y * r20 - zz * r10
-            n01 += y * r21 - zz * r11
-            n02 += y * r22 - zz * r12
-            n11 += zz * r01 - x * r21
-            n12 += zz * r02 - x * r22
-            n22 += x * r12 - y * r02
-            b0 += q0
-            b1 += q1
-            b2 += q2
-            b3 += y * q2 - zz * q1
-            b4 += zz * q0 - x * q2
-            b5 += x * q1 - y * q0
+            chi += square
+            terms = normal_terms(wg, wc, gx, gy, gz, kx_, ky_, kz_, r, rc, px[u], py[u], pz[u])
+            h00 += terms[0]
+            h01 += terms[1]
+            h02 += terms[2]
+            h11 += terms[3]
+            h12 += terms[4]
+            h22 += terms[5]
+            m00 += terms[6]
+            m01 += terms[7]
+            m02 += terms[8]
+            m10 += terms[9]
+            m11 += terms[10]
+            m12 += terms[11]
+            m20 += terms[12]
+            m21 += terms[13]
+            m22 += terms[14]
+            n00 += terms[15]
+            n01 += terms[16]
+            n02 += terms[17]
+            n11 += terms[18]
+            n12 += terms[19]
+            n22 += terms[20]
+            b0 += terms[21]
+            b1 += terms[22]
+            b2 += terms[23]
+            b3 += terms[24]
+            b4 += terms[25]
+            b5 += terms[26]
 
         sums[0] += h00
         sums[1] += h01

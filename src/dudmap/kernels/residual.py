@@ -1,10 +1,15 @@
-"""Scalar mathematics of a residual: trilinear interpolation, robust costs and weights."""
+"""Scalar mathematics of a residual: trilinear interpolation, robust costs and weights, terms of normal equations."""
 
 import numpy as np
 
-from dudmap.kernels.threads import scalar
+from dudmap.kernels.pixel import band_front, sigma
+from dudmap.kernels.threads import scalar, written_out
 
 f32 = np.float32
+GATE = f32(0.95)
+"""Share of the truncation band beyond which a reading is not on the map."""
+WORST_COLOR = f32(0.3)
+"""Intensity residual whose cost a reading off the map pays."""
 
 
 @scalar
@@ -46,3 +51,90 @@ def tukey_inlier(a, by_k):
 def tukey_cost(inlier, limit):
     """Tukey cost of ``tukey_inlier``; ``limit`` = k^2 / 6 is that of an outlier."""
     return limit * (f32(1) - inlier * inlier * inlier)
+
+
+@written_out
+def noise_scale(z, p):
+    """sigma(1 m) / sigma(z), at most 1, where the residuals are weighted by the noise of the sensor, else 1."""
+    scaled = min(p.sigma_at_one_metre / max(sigma(z, p.band.noise), f32(1e-6)), f32(1))
+    return p.noise_weighting * scaled + (f32(1) - p.noise_weighting)
+
+
+@written_out
+def weigh(r, rc, z, static, known, p):
+    """Weights and costs of the residuals of a pixel (thesis eq. 4.43-4.46).
+
+    Args:
+        r, rc: Signed distance, metres, and intensity difference.
+        z: Depth of the reading, metres, 0 = none.
+        static: Static weight of the pixel.
+        known: Whether the map has a distance and an intensity there.
+        p: RegistrationParameters.
+
+    Returns:
+        Whether the reading is on the map; its static weight if so, else 0; its cost; the constant cost of a reading off
+        the map; its weighted squared distance at one metre; weights of the distance and of the intensity.
+    """
+    zero, one = f32(0), f32(1)
+    use_tukey = p.tukey > zero
+    by_tukey = one / p.tukey if use_tukey else one
+    limit = p.tukey * p.tukey / f32(6)
+    gate = band_front(z, p.band) * GATE
+    scale = noise_scale(z, p)
+    valid = known & (abs(r) < gate)
+    rn = r * scale
+    a = abs(rn)
+    inlier = tukey_inlier(a, by_tukey)
+    robust = inlier * inlier if use_tukey else huber_weight(a, p.huber)
+    cost = tukey_cost(inlier, limit) if use_tukey else huber_cost(a, p.huber)
+    worst = limit if use_tukey else huber_cost(gate * scale, p.huber)
+    ac = abs(rc)
+    color_robust, color_cost = huber_weight(ac, p.color_huber), huber_cost(ac, p.color_huber)
+    used = static if valid else zero
+    missing = static - used if z > zero else zero
+    return (
+        valid,
+        used,
+        used * (cost + p.color_weight * color_cost),
+        missing * (worst + p.color_weight * huber_cost(WORST_COLOR, p.color_huber)),
+        used * robust * rn * rn,
+        used * robust * scale * scale,
+        used * color_robust * p.color_weight,
+    )
+
+
+@written_out
+def normal_terms(wg, wc, gx, gy, gz, kx, ky, kz, r, rc, x, y, z):
+    """What a pixel adds to the normal equations (thesis eq. 4.47).
+
+    With J = [g, p x g] and A = w g g', the blocks of J' w J are A, M = A hat(p)' and N = hat(p) M.
+
+    Args:
+        wg, wc: Weights of the distance and of the intensity.
+        gx, gy, gz: Gradient of the distance.
+        kx, ky, kz: Gradient of the intensity, 1/m.
+        r, rc: Residuals.
+        x, y, z: Point about the camera's centre, world axes, metres.
+
+    Returns:
+        6 elements of the upper triangle of A, 9 of M, 6 of the upper triangle of N, and 6 of b, row by row.
+    """
+    a00 = wg * gx * gx + wc * kx * kx
+    a01 = wg * gx * gy + wc * kx * ky
+    a02 = wg * gx * gz + wc * kx * kz
+    a11 = wg * gy * gy + wc * ky * ky
+    a12 = wg * gy * gz + wc * ky * kz
+    a22 = wg * gz * gz + wc * kz * kz
+    q0 = wg * gx * r + wc * kx * rc
+    q1 = wg * gy * r + wc * ky * rc
+    q2 = wg * gz * r + wc * kz * rc
+    r00, r01, r02 = a02 * y - a01 * z, a00 * z - a02 * x, a01 * x - a00 * y
+    r10, r11, r12 = a12 * y - a11 * z, a01 * z - a12 * x, a11 * x - a01 * y
+    r20, r21, r22 = a22 * y - a12 * z, a02 * z - a22 * x, a12 * x - a02 * y
+    return (
+        a00, a01, a02, a11, a12, a22,
+        r00, r01, r02, r10, r11, r12, r20, r21, r22,
+        y * r20 - z * r10, y * r21 - z * r11, y * r22 - z * r12,
+        z * r01 - x * r21, z * r02 - x * r22, x * r12 - y * r02,
+        q0, q1, q2, y * q2 - z * q1, z * q0 - x * q2, x * q1 - y * q0,
+    )  # fmt: skip

@@ -7,11 +7,15 @@ from dudmap.kernels.pixel import elements, ray, transform
 from dudmap.kernels.threads import kernel
 from dudmap.kernels.voxel import intensity_of, sdf_steps
 
+f64 = np.float64
+
 
 @kernel
-def _corner_weight(k, ax, ay, az):
-    """Trilinear weight of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
-    return (ax if k >> 2 else 1 - ax) * (ay if (k >> 1) & 1 else 1 - ay) * (az if k & 1 else 1 - az)
+def corner_weight(k, ax, ay, az):
+    """Trilinear weight, float64, of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
+    one = f64(1)
+    x, y, z = f64(ax), f64(ay), f64(az)
+    return (x if k >> 2 != 0 else one - x) * (y if (k >> 1) & 1 != 0 else one - y) * (z if k & 1 != 0 else one - z)
 
 
 @kernel
@@ -67,7 +71,7 @@ def sample_rows(
                 word = geometry[np.int64(other) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (m & 7))]
                 if (word & 0xFF00) == 0:
                     continue
-                part = _corner_weight(k, ax, ay, az)
+                part = corner_weight(k, ax, ay, az)
                 sdf += part * sdf_steps(word)
                 total += part
                 intensity_part = part if intensity_of(word) > 0 else np.float32(0)

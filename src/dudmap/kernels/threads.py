@@ -22,6 +22,9 @@ _OPTIONS: dict[str, Any] = {
 kernel = njit(**_OPTIONS)
 scalar = njit(**_OPTIONS, forceinline=True)
 """Compiles scalar mathematics: always inlined, since a call ends the vectorisation of the loop around it."""
+written_out = njit(**_OPTIONS, inline="always")
+"""Compiles scalar mathematics as if it were written out where it is called, so that the compiler orders its sums and
+products together with those around it; takes longer to compile than ``scalar``."""
 
 Result = TypeVar("Result")
 

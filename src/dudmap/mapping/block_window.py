@@ -5,6 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import MapError
 from dudmap.kernels import hashing
+from dudmap.kernels.mirror import Mirror
 from dudmap.mapping.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
 
 MARGIN = 3
@@ -25,6 +26,7 @@ class BlockWindow:
     Attributes:
         shape: (3,) int64, blocks along each axis.
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
+        mirror: ``cells`` for back ends, which may hold a copy on a device.
         stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
         near: (n,) int32, the slots inside.
         origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
@@ -35,6 +37,7 @@ class BlockWindow:
         self.block_size = block_size
         self.shape = np.array([size, size, size], dtype=np.int64)
         self.cells = np.full(size**3, -1, dtype=np.int32)
+        self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)
         self.origin: NDArray[np.int64] | None = None
@@ -53,6 +56,7 @@ class BlockWindow:
         self.stamps.fill(0)
         cells = self.cells.reshape(tuple(self.shape))
         hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries)
+        self.mirror.wrote()
         self.near = np.sort(self.cells[self.cells >= 0])
 
     @property
@@ -71,7 +75,7 @@ class BlockWindow:
     def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
         """Allocate voxels for cells (n,) that have none."""
         slots = blocks.allocate(self.entries_of(cells, blocks), frame_number)
-        self.cells[cells] = slots
+        self._set(cells, slots)
         self.near = np.concatenate([self.near, slots])
 
     def release(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
@@ -80,8 +84,9 @@ class BlockWindow:
             return
         assert self.origin is not None
         entries = blocks.release(slots, free_count)
-        cells = np.ravel_multi_index(tuple((blocks.coords[entries] - self.origin).T), tuple(self.shape))
-        self.cells[cells] = -2 - entries
+        coords = tuple((blocks.coords[entries] - self.origin).T)
+        cells = np.asarray(np.ravel_multi_index(coords, tuple(self.shape)))
+        self._set(cells, -2 - entries)
         self.near = self.near[blocks.entry_of[self.near] >= 0]
 
     def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
@@ -89,8 +94,12 @@ class BlockWindow:
         if len(cells) == 0:
             return
         entries = self.entries_of(cells, blocks)
-        self.cells[cells] = -2 - entries
+        self._set(cells, -2 - entries)
         blocks.free_count[entries] = min(free_count, 255)
+
+    def _set(self, cells: NDArray[np.integer], values: NDArray[np.int32]) -> None:
+        self.cells[cells] = values
+        self.mirror.wrote(cells)
 
     def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
         """Entries (n,) of cells (n,); new ones where there is none.

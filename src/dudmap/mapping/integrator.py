@@ -113,8 +113,8 @@ class Integrator:
         """The blocks around the view as a back end takes them; valid until blocks are added."""
         assert window.origin is not None
         return VoxelGrid(
-            window.cells, window.shape, window.origin, blocks.geometry, blocks.colors, blocks.slot_coords,
-            blocks.free_count, self.scale.voxel_size, self.scale.sdf_unit,
+            window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
+            blocks.slot_coords, blocks.free_count, self.scale.voxel_size, self.scale.sdf_unit,
         )  # fmt: skip
 
     def _local_grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:

@@ -192,9 +192,12 @@ class TsdfVolume:
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
-    def for_camera(self, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> "TsdfVolume":
-        """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
-        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, self.backend, max_blocks)
+    def for_camera(
+        self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
+    ) -> "TsdfVolume":
+        """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
+        volume must not be used afterwards."""
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
         return other
 
@@ -214,8 +217,7 @@ class TsdfVolume:
             intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
             intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
             colors[known] = other.blocks.colors[there[known]]
-            self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
-            self.blocks.colors[slots] = colors
+            self.blocks.write(slots, (self.blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
             self.blocks.written[slots] = number
             if self.pager is not None:
                 self.pager.changed(first)
@@ -271,7 +273,8 @@ class TsdfVolume:
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
         slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
-        words = self.blocks.geometry[np.maximum(slots, 0), (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]]
+        numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+        words = self.blocks.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
         out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
@@ -297,7 +300,7 @@ class TsdfVolume:
         slots, blocks = self.active_slots, self.blocks
         return Mesh(
             *self.backend.extract_mesh(
-                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
                 self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
             )
         )  # fmt: skip
@@ -354,7 +357,7 @@ class TsdfVolume:
         """
         blocks = self.blocks
         meshes = self.backend.extract_chunks(
-            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
             self._mesh_parameters(self.config.min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]

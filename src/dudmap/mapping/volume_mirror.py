@@ -50,7 +50,7 @@ class VolumeMirror:
         slots = np.flatnonzero(source.written[: source.num_slots] > self._copied[: source.num_slots])
         if limit is not None and len(slots) > limit:
             slots = np.sort(slots[np.argpartition(self._copied[slots], limit)[:limit]])
-        target.geometry[slots], target.colors[slots] = source.geometry[slots], source.colors[slots]
+        target.write(slots, source.geometry[slots], source.colors[slots])
         for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "fused"):
             setattr(target, name, getattr(source, name).copy())
         target.num_entries, target.num_slots = source.num_entries, source.num_slots

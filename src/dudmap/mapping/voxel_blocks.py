@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import hashing
+from dudmap.kernels.mirror import Mirror, grown
 from dudmap.kernels.parameters import BLOCK
 
-__all__ = ["BLOCK", "VoxelBlocks"]
+__all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
 COORDINATE_BITS = 18
 """Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
@@ -53,7 +54,8 @@ class VoxelBlocks:
         slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
         free_count: (entries,) uint8 observations of emptiness.
         num_entries: Number of entries.
-        geometry, colors: (slots, 512) int32 packed voxels.
+        geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
+        geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
         slot_coords: (slots, 3) int32 block coordinates by slot.
         written: (slots,) int32 number of the frame that last wrote to a slot.
@@ -67,14 +69,38 @@ class VoxelBlocks:
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
-        self.geometry = np.zeros((slots, BLOCK**3), dtype=np.int32)
-        self.colors = np.zeros((slots, BLOCK**3), dtype=np.int32)
+        self.geometry_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
+        self.colors_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
         self.entry_of = np.full(slots, -1, dtype=np.int32)
         self.slot_coords = np.zeros((slots, 3), dtype=np.int32)
         self.written = np.zeros(slots, dtype=np.int32)
         self.fused = np.zeros(slots, dtype=np.uint8)
         self.num_slots = 0
         self._released = np.empty(0, dtype=np.int32)
+
+    @property
+    def geometry(self) -> NDArray[np.int32]:
+        """Packed voxels (slots, 512) int32 in the host's memory, up to date."""
+        return self.geometry_mirror.host
+
+    @geometry.setter
+    def geometry(self, array: NDArray[np.int32]) -> None:
+        self.geometry_mirror = Mirror(array)
+
+    @property
+    def colors(self) -> NDArray[np.int32]:
+        """Packed colours (slots, 512) int32 in the host's memory, up to date."""
+        return self.colors_mirror.host
+
+    @colors.setter
+    def colors(self, array: NDArray[np.int32]) -> None:
+        self.colors_mirror = Mirror(array)
+
+    def write(self, slots: NDArray[np.integer], geometry: NDArray[np.int32], colors: NDArray[np.int32]) -> None:
+        """Replace the voxels (n, 512) of slots (n,)."""
+        self.geometry[slots], self.colors[slots] = geometry, colors
+        self.geometry_mirror.wrote(slots)
+        self.colors_mirror.wrote(slots)
 
     @property
     def num_voxel_blocks(self) -> int:
@@ -97,7 +123,8 @@ class VoxelBlocks:
     @property
     def slot_bytes(self) -> int:
         """Bytes of a slot."""
-        slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
+        voxels = self.geometry_mirror.stale, self.colors_mirror.stale
+        slots = (*voxels, self.slot_coords, self.entry_of, self.written, self.fused)
         return sum(_row_bytes(array) for array in slots)
 
     @property
@@ -134,10 +161,10 @@ class VoxelBlocks:
         kept = max(len(self._released) - len(entries), 0)
         reused, self._released = self._released[kept:][::-1], self._released[:kept]
         needed = self.num_slots + len(entries) - len(reused)
-        if needed > len(self.geometry):
-            capacity = max(needed, len(self.geometry) * 3 // 2)
-            self.geometry = grown(self.geometry, capacity, 0)
-            self.colors = grown(self.colors, capacity, 0)
+        if needed > len(self.entry_of):
+            capacity = max(needed, len(self.entry_of) * 3 // 2)
+            self.geometry_mirror.grow(capacity, 0)
+            self.colors_mirror.grow(capacity, 0)
             self.entry_of = grown(self.entry_of, capacity, -1)
             self.slot_coords = grown(self.slot_coords, capacity, 0)
             self.written = grown(self.written, capacity, 0)
@@ -157,7 +184,8 @@ class VoxelBlocks:
         self.slot_of[entries] = -1
         self.free_count[entries] = np.maximum(self.free_count[entries], observations)
         self.entry_of[slots] = -1
-        self.geometry[slots] = self.colors[slots] = 0
+        self.geometry_mirror.fill(slots, 0)
+        self.colors_mirror.fill(slots, 0)
         self._released = np.concatenate([self._released, slots[::-1]])
         return entries
 
@@ -184,7 +212,8 @@ class VoxelBlocks:
         kept = np.ones(n, dtype=bool)
         kept[entries] = False
         self.entry_of[slots] = -1
-        self.geometry[slots] = self.colors[slots] = 0
+        self.geometry_mirror.fill(slots, 0)
+        self.colors_mirror.fill(slots, 0)
         self.written[slots] = frame_number
         self._released = np.concatenate([self._released, slots[::-1]])
         number = (np.cumsum(kept) - 1).astype(np.int32)
@@ -203,7 +232,7 @@ class VoxelBlocks:
         entries = self.entries_at(records.coords, len(records.coords))
         self.free_count[entries] = records.free_count
         slots = self.allocate(entries[records.owners], frame_number)
-        self.geometry[slots], self.colors[slots] = records.geometry, records.colors
+        self.write(slots, records.geometry, records.colors)
         self.fused[slots] = records.fused
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -268,14 +297,6 @@ def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geom
         raise ValueError("a block lies farther away than block coordinates reach")
     if len(np.unique(coords, axis=0)) != n:
         raise ValueError("a block is there twice")
-
-
-def grown(array: NDArray, capacity: int, value: int) -> NDArray:
-    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
-    shape = (capacity, *array.shape[1:])
-    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
-    out[: len(array)] = array
-    return out
 
 
 def _row_bytes(array: NDArray) -> int:

@@ -73,7 +73,7 @@ class Atlas:
             max_blocks: As of ``TsdfVolume``.
         """
         self.saved = self.current
-        self.volumes[self.current] = saved.volume.for_camera(camera, max_blocks)
+        self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend, max_blocks)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property

@@ -10,7 +10,7 @@ from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels.median import median
-from dudmap.kernels.parameters import RegistrationParameters
+from dudmap.kernels.parameters import ImageStack, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
@@ -46,7 +46,7 @@ class LinearSystem:
     readings: float
     weight: float
     chi_square: float
-    residuals: NDArray[np.float32]
+    residuals: ImageStack
 
 
 @dataclass(frozen=True, eq=False)

@@ -291,7 +291,7 @@ def _mesh_name(key: Chunk) -> str:
     return "/map/{}_{}_{}".format(*key)
 
 
-def _series(label: str) -> dict[str, Any]:
+def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known where viser is installed
     return {"label": label, "stroke": "#c2410c", "width": 1.5}
 
 

@@ -1,0 +1,232 @@
+"""Time per frame and per kernel on a GPU and on the CPU, by image size and voxel size."""
+
+import statistics
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap.benchmark.table import grid
+from dudmap.benchmark.timing import WARM_UP
+from dudmap.config import Config
+from dudmap.errors import ConfigError, MapError
+from dudmap.gpu.device import obstacle, resolve
+from dudmap.sequences import Sequence, open_sequence
+from dudmap.synthetic import sequence as synthetic_sequence
+from dudmap.synthetic.recording import DEFAULT_CAMERA
+
+BYTES_PER_PIXEL = {
+    "limit_depth": 8, "fill_holes": 8, "bilateral_line": 8, "intensities": 7, "halve": 10, "reading_weights": 5,
+    "pack_pixels": 16, "tile_ranges": 4,
+}  # fmt: skip
+"""Bytes that a kernel over the whole image must read and write at least, per pixel: each array once."""
+BYTES_PER_VOXEL = 8
+"""The same for the fusion: the geometry word of each voxel, read and written."""
+COPY_BYTES = 1 << 28
+"""Size of the array whose copy measures the bandwidth of the device."""
+
+
+@dataclass(frozen=True)
+class DeviceRun:
+    """Medians of a recording on a device.
+
+    Attributes:
+        what: Recording and image size.
+        voxel: Voxel size, metres.
+        device: "cpu", "cuda:0", ...
+        frame_ms: Time per frame, milliseconds.
+        stages: Time of each stage, milliseconds.
+        mesh_ms, view_ms: Time of a mesh and of an artificial view of the camera's size.
+        triangles: Of that mesh.
+        map_mb, device_mb: Size of the map, and peak memory of the device where it is known.
+        kernels: Milliseconds per frame of each kernel, by the device's events; empty on the CPU.
+        shares: Share of the device's bandwidth that each memory-bound kernel reaches.
+        error: Why there are no figures.
+    """
+
+    what: str
+    voxel: float
+    device: str
+    frame_ms: float = float("nan")
+    stages: dict[str, float] = field(default_factory=dict)
+    mesh_ms: float = float("nan")
+    view_ms: float = float("nan")
+    triangles: int = 0
+    map_mb: float = float("nan")
+    device_mb: float = float("nan")
+    kernels: dict[str, float] = field(default_factory=dict)
+    shares: dict[str, float] = field(default_factory=dict)
+    error: str = ""
+
+
+def numbers(voxels: str, sizes: str) -> tuple[list[float], list[tuple[int, int]]]:
+    """Voxel sizes in metres, and image sizes, of comma-separated lists as the command line gives them.
+
+    Raises:
+        ConfigError: A list cannot be understood.
+    """
+    try:
+        steps = [float(voxel) / 100 for voxel in voxels.split(",")]
+        pairs = [size.split("x") for size in sizes.split(",") if size]
+        return steps, [(int(width), int(height)) for width, height in pairs]
+    except ValueError:
+        raise ConfigError(
+            f"cannot understand --voxels {voxels!r} and --sizes {sizes!r}; expected centimetres, such as 2,1, and "
+            "pixels, such as 640x480,1280x720"
+        ) from None
+
+
+def recordings(sizes: Iterable[tuple[int, int]], frames: int, paths: Iterable[Path]) -> Iterable[tuple[str, Sequence]]:
+    """Names and recordings: the synthetic room in each size, then those of ``paths``."""
+    for width, height in sizes:
+        camera = replace(DEFAULT_CAMERA.resized(width, width * 3 // 4), height=height, cy=(height - 1) / 2)
+        yield f"room {width}x{height}", synthetic_sequence(frames=frames, camera=camera)
+    for path in paths:
+        recording = open_sequence(path)
+        yield f"{recording.name} {recording.camera.width}x{recording.camera.height}", recording
+
+
+def devices(wanted: str) -> list[str]:
+    """The GPU to measure, if there is one, and the CPU beside it."""
+    device = resolve(wanted)
+    return ["cpu"] if device == "cpu" else [device, "cpu"]
+
+
+def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
+    """Process the first ``frames`` frames; a map that does not fit gives a row that says so."""
+    from dudmap.slam import Slam
+
+    assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
+    try:
+        slam = Slam(recording.camera, Config().override(assignments))
+        times, stages, kernels, fused = [], [], [], []
+        for index in range(min(frames, len(recording))):
+            frame = recording[index]
+            with _kernel_times(device) as measured:
+                start = time.perf_counter()
+                result = slam.process(frame)
+                times.append(1000 * (time.perf_counter() - start))
+            stages.append(result.timings)
+            kernels.append(measured)
+            fused.append(np.count_nonzero(slam.volume.blocks.written == slam.volume.num_integrated))
+        pose = slam.trajectory.Ts_world_camera[-1]
+        slam.volume.extract_mesh(1)
+        mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
+        slam.volume.raycast(pose)
+        view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
+    except MapError as error:
+        return DeviceRun(name, voxel, device, error=str(error))
+    warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
+    per_kernel = _medians(kernels[warm])
+    pixels = recording.camera.width * recording.camera.height
+    shares = _shares(per_kernel, pixels, statistics.median(fused[warm]) * 512, device)
+    return DeviceRun(
+        name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
+        slam.volume.num_bytes / 1e6, _peak_megabytes(device), per_kernel, shares,
+    )  # fmt: skip
+
+
+def _timed(action: Any) -> tuple[float, Any]:  # noqa: ANN401
+    start = time.perf_counter()
+    result = action()
+    return 1000 * (time.perf_counter() - start), result
+
+
+def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
+    keys = list(dict.fromkeys(key for row in rows for key in row))
+    return {key: statistics.median(row.get(key, 0.0) for row in rows) for key in keys}
+
+
+class _kernel_times:  # noqa: N801 - a context manager, named like a function
+    """Dictionary of the milliseconds that each kernel takes within the block, by events of the device."""
+
+    def __init__(self, device: str) -> None:
+        self.on_gpu = device.startswith("cuda")
+        self.times: dict[str, float] = {}
+
+    def __enter__(self) -> dict[str, float]:
+        if self.on_gpu:
+            import warp as wp  # pyright: ignore[reportMissingImports]
+
+            wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+        return self.times
+
+    def __exit__(self, *_: object) -> None:
+        if self.on_gpu:
+            import warp as wp  # pyright: ignore[reportMissingImports]
+
+            add_up(wp.timing_end(), self.times)
+
+
+def add_up(results: Iterable[Any], times: dict[str, float]) -> None:
+    """Add the milliseconds of Warp's timing results to those of each kernel; names lose Warp's prefix and hash."""
+    for result in results:
+        name = result.name.removeprefix("forward kernel ")
+        base, _, tail = name.rpartition("_")
+        name = base if len(tail) == 8 and base else name
+        times[name] = times.get(name, 0.0) + result.elapsed
+
+
+def _shares(kernels: dict[str, float], pixels: float, voxels: float, device: str) -> dict[str, float]:
+    """Share of the measured bandwidth of each memory-bound kernel that ran."""
+    if not device.startswith("cuda"):
+        return {}
+    bandwidth = measured_bandwidth(device)
+    # the filter runs along both axes of the image, in two launches
+    needed = {name: each * pixels * (2 if name == "bilateral_line" else 1) for name, each in BYTES_PER_PIXEL.items()}
+    needed["integrate"] = BYTES_PER_VOXEL * voxels
+    return {name: needed[name] / (1e-3 * ms) / bandwidth for name, ms in kernels.items() if name in needed and ms > 0}
+
+
+def measured_bandwidth(device: str) -> float:
+    """Bytes per second that a copy of a large array reads and writes."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    source = wp.zeros(COPY_BYTES, dtype=wp.uint8, device=device)
+    target = wp.empty_like(source)
+    best = float("inf")
+    for _ in range(6):
+        wp.synchronize_device(device)
+        start = time.perf_counter()
+        wp.copy(target, source)
+        wp.synchronize_device(device)
+        best = min(best, time.perf_counter() - start)
+    return 2 * COPY_BYTES / best
+
+
+def _peak_megabytes(device: str) -> float:
+    if not device.startswith("cuda"):
+        return float("nan")
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    return wp.get_mempool_used_mem_high(device) / 1e6
+
+
+def table(rows: list[DeviceRun]) -> str:
+    """Markdown: times and memory of each run, then the kernels of those on a GPU."""
+    stages = list(dict.fromkeys(stage for row in rows for stage in row.stages))
+    head = ["recording", "voxel, cm", "device", "frame", *stages, "mesh", "view", "map, MB", "device, MB"]
+    text = grid(head, [_line(row, stages) for row in rows])
+    reason = obstacle()
+    if not any(row.device.startswith("cuda") for row in rows):
+        text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not asked for'}.\n"
+    for row in rows:
+        if row.error:
+            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: {row.error}\n"
+        if row.kernels:
+            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: kernels per frame\n\n"
+            lines = [
+                [name, f"{ms:.3f}", f"{100 * row.shares[name]:.0f}" if name in row.shares else ""]
+                for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])
+            ]
+            text += grid(["kernel", "ms", "bandwidth, %"], lines)
+    return text
+
+
+def _line(row: DeviceRun, stages: list[str]) -> list[str]:
+    times = [row.frame_ms, *(row.stages.get(stage, float("nan")) for stage in stages), row.mesh_ms, row.view_ms]
+    figures = [*times, row.map_mb, row.device_mb]
+    return [row.what, f"{100 * row.voxel:g}", row.device, *("" if np.isnan(x) else f"{x:.1f}" for x in figures)]

@@ -1,0 +1,1 @@
+"""The operations of ``kernels/backend.py`` on NVIDIA GPUs, by Warp (extra ``gpu``)."""

@@ -1,0 +1,372 @@
+"""The back end for GPUs: Warp kernels behind the operations of ``kernels/backend.py``.
+
+The map stays on the device (``memory.py``); images that the device computed are not uploaded again. What is not ported
+is delegated to the CPU's back end by name: ``color_pixels`` and ``footprint_colors``, which are off by default, and the
+division of a mesh into chunks.
+"""
+
+from typing import Any
+
+import numpy as np
+import warp as wp  # pyright: ignore[reportMissingImports]
+from numpy.typing import NDArray
+
+from dudmap.gpu.kernels import fusion, images, surface
+from dudmap.gpu.kernels.formulas import Motion
+from dudmap.gpu.kernels.structs import Camera, Lattice, struct
+from dudmap.gpu.memory import Images, OnDevice, resident, wrote
+from dudmap.gpu.meshing import extract_surface
+from dudmap.kernels import meshing, raycasting, registration, visibility
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.parameters import (
+    BLOCK,
+    DepthTiles,
+    DepthView,
+    FilterParameters,
+    FusedBlocks,
+    FusionParameters,
+    MapSample,
+    MeshArrays,
+    MeshParameters,
+    NormalEquations,
+    RaycastParameters,
+    RaycastResult,
+    RegistrationParameters,
+    SensorNoise,
+    VoxelGrid,
+)
+
+GROUPS = 64
+"""Partial sums that are left after the first level of a sum."""
+PER_THREAD = 8
+"""Pixels that one thread adds up in a linearisation."""
+_IMAGES: dict[str, Images] = {}
+
+
+class WarpBackend:
+    """``Backend`` on a device of Warp.
+
+    Args:
+        device: Name of the device: "cuda:0", or "cpu" for tests, where the same kernels run one thread after another.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._images = _IMAGES.setdefault(device, Images(device))
+        self._host = CpuBackend()
+        self.color_pixels, self.footprint_colors = self._host.color_pixels, self._host.footprint_colors
+        self._marks = wp.zeros(0, dtype=wp.int32, device=device)
+
+    # -- filter ------------------------------------------------------------------------------------------------------
+
+    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
+        """See ``Backend.filter``."""
+        p, shape = parameters, depth.shape
+        image = self._run(images.limit_depth, shape, self._up(depth), p.depth_min, p.depth_max)
+        if p.drop_mixed:
+            image = self._run(images.drop_mixed, shape, image, p.alpha, p.hole_noise, p.steepest)
+        if p.fill_holes:
+            image = self._run(images.fill_holes, shape, image, p.alpha, p.hole_noise)
+        if p.smooth:
+            spatial = np.exp(-(np.arange(p.radius + 1) ** 2) / (2 * p.sigma_px**2)).astype(np.float32)
+            spatial.flags.writeable = False
+            weights = wp.array(spatial, device=self.device)
+            image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 1, 0)
+            image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 0, 1)
+        return self._images.down(image)
+
+    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See ``Backend.intensity``."""
+        shares = 0.299 / 255, 0.587 / 255, 0.114 / 255
+        return self._images.down(self._run(images.intensities, rgb.shape[:2], self._up(rgb), *shares))
+
+    def halve(
+        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See ``Backend.halve``."""
+        shape = depth.shape[0] // 2, depth.shape[1] // 2
+        out = self._empty(shape), self._empty(shape)
+        self._launch(images.halve, shape, self._up(depth), self._up(intensity), tolerance, *out)
+        return self._images.down(out[0]), self._images.down(out[1])
+
+    # -- integrate ---------------------------------------------------------------------------------------------------
+
+    def view(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        T_camera_world: NDArray[np.float32],
+    ) -> DepthView:
+        """See ``Backend.view``; the tiles stay on the device, and the depth can no longer be written to."""
+        shape = -(-depth.shape[0] // visibility.TILE), -(-depth.shape[1] // visibility.TILE)
+        tiles = DepthTiles(self._empty(shape), self._empty(shape), self._empty(shape))
+        depth = np.ascontiguousarray(depth)
+        depth.flags.writeable = False
+        self._launch(fusion.tile_ranges, shape, self._up(depth), *tiles)
+        return DepthView(depth, tiles, intrinsics, T_grid_camera, T_camera_world)
+
+    def reading_weights(
+        self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
+    ) -> NDArray[np.uint8]:
+        """See ``Backend.reading_weights``."""
+        out = self._empty(depth.shape, wp.uint8)
+        self._launch(
+            fusion.reading_weights, depth.shape, self._up(depth), _camera(intrinsics), struct(noise), best, out
+        )
+        return self._images.down(out)
+
+    def touched_cells(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        stamps: NDArray[np.int32],
+        stride: int,
+        free_after: int,
+        frame_number: int,
+        parameters: FusionParameters,
+    ) -> NDArray[np.int32]:
+        """See ``Backend.touched_cells``; marks on the device take the place of ``stamps``, which stay as they are."""
+        lattice, p = self._lattice(grid), parameters
+        marks = self._cleared_marks(lattice.cells.size)
+        shape = -(-view.depth.shape[0] // stride), -(-view.depth.shape[1] // stride)
+        self._launch(
+            fusion.mark_cells, shape, self._up(view.depth), _camera(view.intrinsics),
+            _motion(view.T_grid_camera / np.float32(BLOCK)), stride, lattice, self._bytes(grid.free_count), free_after,
+            struct(p.band), BLOCK * p.voxel_size, marks,
+        )  # fmt: skip
+        return self._marked(marks).numpy().copy()
+
+    def fuse(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        candidates: NDArray[np.int32],
+        fused: NDArray[np.uint8],
+        turn: int,
+        count: int,
+        parameters: FusionParameters,
+    ) -> FusedBlocks:
+        """See ``Backend.fuse``."""
+        p, (height, width) = struct(parameters), view.depth.shape
+        camera, t = _camera(view.intrinsics), _motion(view.T_camera_world)
+        coords, slots = wp.array(grid.slot_coords, device=self.device), wp.array(candidates, device=self.device)
+        marks, repeats = self._empty(len(candidates), wp.int32), self._empty(len(candidates))
+        self._launch(
+            fusion.visible_slots, len(candidates), slots, coords, self._bytes(fused), turn, t, camera, height, width,
+            BLOCK * parameters.voxel_size, view.tiles.farthest, p, marks, repeats,
+        )  # fmt: skip
+        visible = self._marked(marks)
+        pixels = self._empty((height * width, 2), wp.int32)
+        images_ = self._up(view.depth), self._up(color), self._up(weights)
+        self._launch(fusion.pack_pixels, (height, width), *images_, p, pixels)
+        occupied = wp.zeros(len(visible), dtype=wp.int32, device=self.device)
+        self._launch(
+            fusion.integrate, (len(visible), BLOCK**3), visible, slots, repeats, float(count), coords, t, camera,
+            height, width, pixels, resident(grid.geometry, self.device), resident(grid.colors, self.device), p,
+            occupied,
+        )  # fmt: skip
+        written = candidates[visible.numpy()]
+        wrote(grid.geometry, self.device, written)
+        wrote(grid.colors, self.device, written)
+        return FusedBlocks(written, occupied.numpy().copy())
+
+    def observe_free(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        parity: int,
+        count: int,
+        free_after: int,
+        parameters: FusionParameters,
+    ) -> NDArray[np.int32]:
+        """See ``Backend.observe_free``."""
+        lattice, p, (height, width) = self._lattice(grid), parameters, view.depth.shape
+        marks, counts = self._cleared_marks(lattice.cells.size), self._bytes(grid.free_count)
+        self._launch(
+            fusion.observe_free, (int(grid.shape[0]) // 2, int(grid.shape[1])), lattice,
+            wp.vec3i(*(int(n) for n in grid.origin)), parity, _motion(view.T_camera_world), _camera(view.intrinsics),
+            height, width, BLOCK * p.voxel_size, view.tiles.nearest, view.tiles.valid, struct(p.band), p.depth_max,
+            counts, count, free_after, marks,
+        )  # fmt: skip
+        found = self._marked(marks).numpy().copy()
+        grid.free_count[:] = counts.numpy()
+        return found
+
+    # -- read the map ------------------------------------------------------------------------------------------------
+
+    def linearize(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        parameters: RegistrationParameters,
+    ) -> NormalEquations:
+        """See ``Backend.linearize``; the residuals stay on the device until one of their images is asked for."""
+        threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
+        partial = self._empty((registration.NUM_SUMS, threads))
+        residuals = self._empty((2, *depth.shape))
+        self._launch(
+            surface.linearize, threads, self._up(depth), self._up(intensity), self._up(weights), _camera(intrinsics),
+            _motion(T_grid_camera), self._lattice(grid), float(grid.voxel_size), float(grid.sdf_unit),
+            struct(parameters), PER_THREAD, residuals, partial,
+        )  # fmt: skip
+        parts = self._empty((registration.NUM_SUMS, GROUPS), wp.float64)
+        self._launch(surface.add_up, parts.shape, partial, GROUPS, parts)
+        sums = self._empty(registration.NUM_SUMS, wp.float64)
+        self._launch(surface.finish, registration.NUM_SUMS, parts, sums)
+        total = sums.numpy().copy()
+        return NormalEquations(
+            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
+            float(total[30]), float(total[31]), OnDevice(residuals),
+        )  # fmt: skip
+
+    def sample(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        free_after: int,
+    ) -> MapSample:
+        """See ``Backend.sample``."""
+        out = self._empty(depth.shape), self._empty(depth.shape), self._empty(depth.shape, wp.uint8)
+        self._launch(
+            surface.sample, depth.shape, self._up(depth), self._up(intensity), _camera(intrinsics),
+            _motion(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count), free_after,
+            *out,
+        )  # fmt: skip
+        return MapSample(*(image.numpy().copy() for image in out))
+
+    def label(
+        self,
+        log_odds: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        coupling: float,
+        sweeps: int,
+    ) -> NDArray[np.float32]:
+        """See ``Backend.label``."""
+        shape, evidence, z, step = depth.shape, self._up(log_odds), self._up(depth), self._up(tolerance)
+        spin = self._run(images.first_spins, shape, evidence)
+        for _ in range(sweeps):
+            spin = self._run(images.mean_field_sweep, shape, evidence, z, step, coupling / 8, spin)
+        return self._run(images.probabilities, shape, spin).numpy().copy()
+
+    def raycast(
+        self,
+        grid: VoxelGrid,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: NDArray[np.float32],
+        size: tuple[int, int],
+        parameters: RaycastParameters,
+    ) -> RaycastResult:
+        """See ``Backend.raycast``."""
+        lattice, camera, (height, width) = self._lattice(grid), _camera(intrinsics), size
+        to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
+        tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
+        near = wp.full(tiles, float(raycasting.INFINITE), dtype=wp.float32, device=self.device)
+        far = wp.zeros(tiles, dtype=wp.float32, device=self.device)
+        limits = float(parameters.depth_min), float(parameters.depth_max)
+        self._launch(
+            surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, _motion(to_camera), camera, height, width,
+            radius, *limits, near, far,
+        )  # fmt: skip
+        depth, color = self._empty(size), self._empty((*size, 3), wp.uint8)
+        normals = self._empty(size, wp.vec3)
+        self._launch(
+            surface.trace, size, lattice, resident(grid.colors, self.device), camera, _motion(to_lattice), near, far,
+            *limits, grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1), depth, color, normals,
+        )  # fmt: skip
+        return RaycastResult(depth.numpy().copy(), color.numpy().copy(), normals.numpy().copy())
+
+    def extract_mesh(
+        self,
+        geometry: Mirror | NDArray[np.int32],
+        colors: Mirror | NDArray[np.int32],
+        slots: NDArray[np.int32],
+        coords: NDArray[np.integer],
+        neighbours: NDArray[np.int32],
+        parameters: MeshParameters,
+    ) -> MeshArrays:
+        """See ``Backend.extract_mesh``."""
+        return MeshArrays(*self._surface(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
+
+    def extract_chunks(
+        self,
+        geometry: Mirror | NDArray[np.int32],
+        colors: Mirror | NDArray[np.int32],
+        slots: NDArray[np.int32],
+        coords: NDArray[np.integer],
+        neighbours: NDArray[np.int32],
+        parameters: MeshParameters,
+        chunks: NDArray[np.integer],
+    ) -> list[MeshArrays]:
+        """See ``Backend.extract_chunks``."""
+        arguments = geometry, colors, slots, coords, neighbours, parameters, chunks
+        return meshing.extract_chunks(*arguments, surface=self._surface)
+
+    # -- helpers -----------------------------------------------------------------------------------------------------
+
+    def _surface(self, *arguments: Any) -> tuple[NDArray, ...]:  # noqa: ANN401
+        """Vertices, faces, colours, normals and first face of each block, as ``meshing.surface`` gives them."""
+        return extract_surface(self.device, *arguments)
+
+    def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
+        if np.prod(dim) > 0:
+            wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
+
+    def _run(self, kernel: Any, shape: tuple[int, ...], *arguments: Any) -> Any:  # noqa: ANN401
+        """A float32 image that a kernel, whose last argument it is, computes."""
+        out = self._empty(shape)
+        self._launch(kernel, shape, *arguments, out)
+        return out
+
+    def _empty(self, shape: Any, dtype: Any = wp.float32) -> Any:  # noqa: ANN401
+        return wp.empty(shape, dtype=dtype, device=self.device)
+
+    def _up(self, image: NDArray) -> Any:  # noqa: ANN401
+        return self._images.up(image)
+
+    def _bytes(self, array: NDArray[np.uint8]) -> Any:  # noqa: ANN401
+        """A copy on the device, also where host and device share their memory: kernels may write to it."""
+        return wp.array(array, dtype=wp.uint8, device=self.device)
+
+    def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
+        lattice = Lattice()
+        lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
+        lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
+        return lattice
+
+    def _cleared_marks(self, size: int) -> Any:  # noqa: ANN401
+        """A mark per cell of the window, all 0; ``_marked`` clears them again."""
+        if self._marks.size != size:
+            self._marks = wp.zeros(size, dtype=wp.int32, device=self.device)
+        return self._marks
+
+    def _marked(self, marks: Any) -> Any:  # noqa: ANN401
+        """Numbers (n,) int32 of the marked elements, ascending; clears the marks."""
+        if marks.size == 0:
+            return wp.empty(0, dtype=wp.int32, device=self.device)
+        ends = self._empty(marks.size, wp.int32)
+        wp.utils.array_scan(marks, ends, inclusive=True)
+        out = self._empty(int(ends[-1:].numpy()[0]), wp.int32)
+        self._launch(fusion.compact, marks.size, marks, ends, out)
+        return out
+
+
+def _motion(T: NDArray[np.float32]) -> Any:  # noqa: ANN401
+    return Motion(*(float(value) for value in T.reshape(-1)))
+
+
+def _camera(intrinsics: NDArray[np.float32]) -> Any:  # noqa: ANN401
+    camera = Camera()
+    camera.fx, camera.fy, camera.cx, camera.cy = (float(value) for value in intrinsics)
+    return camera

@@ -1,0 +1,161 @@
+"""Choice of the compute device: the CPU, or an NVIDIA GPU by Warp (extra ``gpu``).
+
+Warp is imported only where a GPU is asked for or may be there; the driver is asked first, by its own library.
+"""
+
+import ctypes
+import importlib.util
+import os
+import sys
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING
+
+from dudmap.errors import ConfigError
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+OLDEST_DRIVER = (13, 0)
+"""Version of CUDA that the driver must support for the wheels of Warp from 1.19 on."""
+OLDEST_RELEASE = 580
+"""First driver that supports it."""
+OLDEST_GPU = 75
+"""Oldest compute capability, times ten, that CUDA 13 compiles for."""
+
+
+def make_backend(device: str) -> Backend:
+    """A new back end on a device.
+
+    Args:
+        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
+            the CPU; "warp-cpu" for the kernels of the GPU on the CPU, for tests.
+
+    Raises:
+        ConfigError: There is no such device, or it does not work.
+    """
+    name = resolve(device)
+    if name == "cpu":
+        return CpuBackend()
+    _load_warp()
+    from dudmap.gpu.backend import WarpBackend
+
+    return WarpBackend("cpu" if name == "warp-cpu" else name)
+
+
+@cache
+def resolve(device: str) -> str:
+    """Name of the device that is meant: "cpu", "warp-cpu" or "cuda:N".
+
+    Raises:
+        ConfigError: There is no such device, or it does not work.
+    """
+    if device == "cpu":
+        return device
+    if device == "warp-cpu":
+        _need_warp(device)
+        return device
+    found = obstacle()
+    if device == "auto":
+        return "cpu" if found else "cuda:0"
+    if device.partition(":")[0] != "cuda":
+        raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
+    _need_warp(device)
+    if found:
+        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or mend this")
+    number = int(device.partition(":")[2] or 0)
+    if number >= num_gpus():
+        known = ", ".join(f"cuda:{n}" for n in range(num_gpus()))
+        raise ConfigError(f"there is no device {device}; this machine has {known}")
+    return f"cuda:{number}"
+
+
+def obstacle() -> str:
+    """Why no GPU can be used, as part of a sentence; empty where one can."""
+    version = driver_version()
+    if version is None:
+        return "no NVIDIA driver was found"
+    if version < OLDEST_DRIVER:
+        return (
+            f"the NVIDIA driver supports CUDA {version[0]}.{version[1]}, but Warp needs {OLDEST_DRIVER[0]}."
+            f"{OLDEST_DRIVER[1]}, that is driver {OLDEST_RELEASE} or later"
+        )
+    if num_gpus() == 0:
+        return "the NVIDIA driver finds no GPU"
+    if not _has_warp():
+        return "Warp is not installed (pip install 'dudmap[gpu]')"
+    if supported_gpus() == 0:
+        return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    return ""
+
+
+def _driver() -> ctypes.CDLL | None:
+    """Library of the NVIDIA driver; None where there is none."""
+    try:
+        return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return None
+
+
+@cache
+def driver_version() -> tuple[int, int] | None:
+    """Newest version of CUDA that the driver supports; None without a driver."""
+    library, version = _driver(), ctypes.c_int(0)
+    if library is None or library.cuDriverGetVersion(ctypes.byref(version)) != 0:
+        return None
+    return version.value // 1000, version.value % 1000 // 10
+
+
+@cache
+def num_gpus() -> int:
+    """GPUs that the driver finds."""
+    library, count = _driver(), ctypes.c_int(0)
+    if library is None or library.cuInit(0) != 0 or library.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return 0
+    return count.value
+
+
+def supported_gpus() -> int:
+    """GPUs that Warp finds and supports."""
+    _load_warp()
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    return sum(gpu.arch >= OLDEST_GPU for gpu in wp.get_cuda_devices())
+
+
+def _has_warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+def _need_warp(device: str) -> None:
+    if not _has_warp():
+        raise ConfigError(f"device {device} needs Warp, which is not installed: pip install 'dudmap[gpu]'")
+
+
+@cache
+def _load_warp() -> None:
+    """Start Warp without its greeting, and without its warning where there is no driver."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    wp.config.log_level = wp.LOG_WARNING
+    with _silent_stderr(driver_version() is None):
+        wp.init()
+
+
+@contextmanager
+def _silent_stderr(silent: bool) -> "Iterator[None]":
+    """Discard what a library writes to the standard error, if ``silent``."""
+    if not silent:
+        yield
+        return
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,28 @@
+"""Copies of single rows and elements between an array and a buffer."""
+
+import warp as wp
+
+wp.set_module_options({"enable_backward": False})
+
+Rows = wp.array2d(dtype=wp.int32)
+
+
+@wp.kernel
+def scatter(rows: wp.array(dtype=wp.int32), source: Rows, target: Rows):
+    """Row n of ``source`` to row ``rows[n]`` of ``target``."""
+    n, k = wp.tid()
+    target[rows[n], k] = source[n, k]
+
+
+@wp.kernel
+def gather(rows: wp.array(dtype=wp.int32), source: Rows, target: Rows):
+    """Row ``rows[n]`` of ``source`` to row n of ``target``."""
+    n, k = wp.tid()
+    target[n, k] = source[rows[n], k]
+
+
+@wp.kernel
+def take(places: Rows, source: Rows, out: wp.array(dtype=wp.int32)):
+    """Element n of ``out`` is that at the row and column ``places[n]`` of ``source``."""
+    n = wp.tid()
+    out[n] = source[places[n, 0], places[n, 1]]

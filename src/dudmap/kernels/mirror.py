@@ -1,0 +1,88 @@
+"""An array in the host's memory of which a compute device may keep a copy."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+class DeviceCopy(Protocol):
+    """Copy of an array on a device."""
+
+    def host_wrote(self, rows: NDArray[np.integer] | None) -> None:
+        """Rows (n,) of the host's array, None = all, have been written."""
+        ...
+
+    def pull(self, host: NDArray) -> None:
+        """Bring the host's array up to date with what the device wrote."""
+        ...
+
+    def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray:
+        """Elements (n,) in the host's memory."""
+        ...
+
+    def grow(self, host: NDArray, value: int) -> None:
+        """Follow the host's array to more rows, the new ones holding ``value``."""
+        ...
+
+
+class Mirror:
+    """An array, and the copy of it that a back end may attach; rows move when one side needs what the other wrote.
+
+    On the CPU there is no copy, and this is the array alone.
+
+    Args:
+        array: The array in the host's memory.
+
+    Attributes:
+        copy: Copy on a device; None = none.
+    """
+
+    def __init__(self, array: NDArray) -> None:
+        self._array = array
+        self.copy: DeviceCopy | None = None
+
+    @property
+    def host(self) -> NDArray:
+        """The array, up to date; whoever writes to it calls ``wrote``."""
+        if self.copy is not None:
+            self.copy.pull(self._array)
+        return self._array
+
+    @property
+    def stale(self) -> NDArray:
+        """The array without what only the device has written."""
+        return self._array
+
+    def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray:
+        """Elements (n,) at rows and columns (n,), without bringing whole rows over."""
+        return self._array[rows, columns] if self.copy is None else self.copy.take(rows, columns)
+
+    def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
+        """Rows (n,), or all of them, have been written in the host's memory."""
+        if self.copy is not None:
+            self.copy.host_wrote(rows)
+
+    def fill(self, rows: NDArray[np.integer], value: int) -> None:
+        """Overwrite rows (n,)."""
+        self._array[rows] = value
+        self.wrote(rows)
+
+    def grow(self, capacity: int, value: int) -> None:
+        """Make room for ``capacity`` rows, the new ones holding ``value``."""
+        self._array = grown(self._array, capacity, value)
+        if self.copy is not None:
+            self.copy.grow(self._array, value)
+
+
+def on_host(array: "Mirror | NDArray") -> NDArray:
+    """An array as it is, and a mirror's array up to date."""
+    return array.host if isinstance(array, Mirror) else array
+
+
+def grown(array: NDArray, capacity: int, value: int) -> NDArray:
+    """Copy of ``array`` with room for ``capacity`` rows, the new ones holding ``value``."""
+    shape = (capacity, *array.shape[1:])
+    out = np.zeros(shape, array.dtype) if value == 0 else np.full(shape, value, array.dtype)
+    out[: len(array)] = array
+    return out

@@ -1,0 +1,43 @@
+"""Every kernel compiles for GPUs, without a GPU or a driver."""
+
+import re
+from importlib import import_module
+
+import pytest
+
+from dudmap.gpu.device import make_backend
+
+wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+make_backend("warp-cpu")
+
+from dudmap.gpu import ahead
+
+DOUBLE = {"images", "surface", "cubes"}
+"""Modules with sums in float64, intensities, or positions of vertices."""
+
+
+@pytest.fixture(scope="module")
+def listings(tmp_path_factory):
+    files = ahead.compile_kernels(tmp_path_factory.mktemp("ptx"), (80, 90))
+    return {path.name: path.read_text() for path in files}
+
+
+@pytest.mark.parametrize("architecture", [80, 90])
+@pytest.mark.parametrize("module", ahead.MODULES)
+def test_every_kernel_is_in_the_ptx(listings, module, architecture):
+    kernels = [value for value in vars(import_module(module)).values() if isinstance(value, wp.Kernel)]
+    own = [kernel for kernel in kernels if kernel.module.name == module]
+    text = next(text for name, text in listings.items() if f"{module}_" in name and f"sm{architecture}." in name)
+    assert f".target sm_{architecture}" in text
+    assert own
+    entries = re.findall(r"\.entry (\w+)", text)
+    for kernel in own:
+        assert any(kernel.key in entry for entry in entries), kernel.key
+    if module.rpartition(".")[2] not in DOUBLE:  # a literal that is no float32 would make the arithmetic float64
+        assert ".f64" not in text[text.index(".entry") :]
+
+
+def test_one_module_becomes_machine_code(tmp_path, monkeypatch):
+    monkeypatch.setattr(ahead, "MODULES", ahead.MODULES[-1:])
+    (file,) = ahead.compile_kernels(tmp_path, (90,), ptx=False)
+    assert file.read_bytes()[:4] == b"\x7fELF"

@@ -1,0 +1,167 @@
+"""Operations on the map: the device against the CPU, and twice on the device."""
+
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from dudmap.errors import MapError
+from dudmap.kernels.parameters import RegistrationParameters
+from dudmap.mapping.volume import TsdfVolume
+from small_maps import CAMERA, CONFIG, integrated, voxels
+
+pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+
+
+def registration(volume, tukey):
+    return RegistrationParameters(volume.band, 0.02, tukey, 0.02, 0.1, 0.003, 1.0)
+
+
+def linearized(volume, recording, tukey=0.0, index=4):
+    """Normal equations of a frame at a pose a little beside its own."""
+    T = recording.ground_truth.Ts_world_camera[index].copy()
+    T[:3, 3] += [0.01, -0.005, 0.008]
+    frame = recording[index]
+    depth, shade = frame.depth.astype(np.float32), volume.backend.intensity(np.ascontiguousarray(frame.color))
+    weights = np.linspace(0, 1, depth.size, dtype=np.float32).reshape(depth.shape)
+    volume.look_at(T)
+    return volume.backend.linearize(
+        volume.grid, depth, shade, weights, CAMERA.intrinsics, volume.window.T_grid_camera(T),
+        registration(volume, tukey),
+    )  # fmt: skip
+
+
+def test_maps_have_the_same_blocks_and_voxels(maps):
+    """Blocks, weights and free space are equal but for pixels on whose border a voxel projects (one in a thousand);
+    distances differ by rounding, one step of ten micrometres, elsewhere."""
+    expected, found = voxels(maps[0]), voxels(maps[1])
+    assert expected.keys() == found.keys()
+    assert maps[0].num_free_blocks == maps[1].num_free_blocks > 10
+    a, b = (np.array([words for words, _ in each.values()]) for each in (expected, {k: found[k] for k in expected}))
+    assert ((a >> 8 & 0xFF) != (b >> 8 & 0xFF)).mean() < 1e-3
+    assert (np.abs((a >> 16) - (b >> 16)) > 1).mean() < 1e-3
+    assert (np.abs((a & 0xFF) - (b & 0xFF)) > 1).mean() < 1e-3
+    a, b = (np.array([paint for _, paint in each.values()]) for each in (expected, {k: found[k] for k in expected}))
+    assert (np.abs((a >> 20) - (b >> 20)) > 1).mean() < 1e-3
+
+
+@pytest.mark.parametrize("tukey", [0.0, 0.05])
+def test_normal_equations_are_those_of_the_cpu(maps, recording, tukey):
+    """The map is that of the CPU on both, so that only the arithmetic differs."""
+    other = on_device(maps[0], maps[1].backend)
+    expected, found = linearized(maps[0], recording, tukey), linearized(other, recording, tukey)
+    assert abs(found.num_inliers - expected.num_inliers) <= 2
+    assert expected.num_inliers > 5000
+    np.testing.assert_allclose(found.H, expected.H, atol=2e-5 * np.abs(expected.H).max())
+    np.testing.assert_allclose(found.b, expected.b, atol=2e-4 * np.abs(expected.b).max())
+    for name in ("cost", "readings", "weight", "chi_square"):
+        assert getattr(found, name) == pytest.approx(getattr(expected, name), rel=1e-4)
+    for k in range(2):
+        assert np.mean(np.isnan(found.residuals[k]) != np.isnan(expected.residuals[k])) < 1e-3
+        np.testing.assert_allclose(np.nan_to_num(found.residuals[k] - expected.residuals[k]), 0, atol=1e-4)
+
+
+def test_sums_are_the_same_in_every_run(maps, recording):
+    one, two = linearized(maps[1], recording), linearized(maps[1], recording)
+    assert np.array_equal(one.H, two.H)
+    assert np.array_equal(one.b, two.b)
+    assert one.cost == two.cost
+
+
+def test_samples_are_those_of_the_cpu(maps, recording):
+    other = on_device(maps[0], maps[1].backend)
+    T, depth = recording.ground_truth.Ts_world_camera[4], recording[4].depth.astype(np.float32)
+    shade = np.zeros(depth.shape, np.float32)
+    for volume in (maps[0], other):
+        volume.look_at(T)
+    expected, found = (volume.sample(depth, shade, CAMERA, T) for volume in (maps[0], other))
+    assert (expected.occupancy != found.occupancy).mean() < 1e-3
+    same = expected.occupancy == found.occupancy
+    for a, b in ((expected.distance, found.distance), (expected.difference, found.difference)):
+        np.testing.assert_allclose(b[same], a[same], atol=1e-4)
+
+
+def test_a_view_of_the_map_is_that_of_the_cpu(maps, recording):
+    """Depths agree to a tenth of a millimetre but for one pixel in two hundred, at silhouettes."""
+    other = on_device(maps[0], maps[1].backend)
+    T = recording.ground_truth.Ts_world_camera[2]
+    expected, found = maps[0].raycast(T), other.raycast(T)
+    assert (expected.depth > 0).mean() > 0.5
+    near = np.abs(expected.depth - found.depth) < 1e-4
+    assert near.mean() > 0.995
+    assert (np.abs(expected.color[near].astype(int) - found.color[near]) <= 1).mean() > 0.999
+    assert (np.abs(expected.normals[near] - found.normals[near]) < 1e-2).mean() > 0.999
+
+
+def test_meshes_are_equal(maps):
+    """Vertices, triangles and colours to the bit; normals to rounding."""
+    other = on_device(maps[0], maps[1].backend)
+    expected, found = maps[0].extract_mesh(1), other.extract_mesh(1)
+    assert len(expected.faces) > 5000
+    np.testing.assert_array_equal(found.faces, expected.faces)
+    np.testing.assert_array_equal(found.colors, expected.colors)
+    np.testing.assert_allclose(found.vertices, expected.vertices, atol=1e-6)
+    np.testing.assert_allclose(found.normals, expected.normals, atol=1e-5)
+
+
+def test_chunks_are_equal(maps):
+    other = on_device(maps[0], maps[1].backend)
+    count = maps[0].num_blocks
+    chunks = np.where(np.arange(count) % 5 == 4, -1, np.arange(count) % 3).astype(np.int64)
+    expected, found = (volume.extract_chunks(volume.active_slots, chunks) for volume in (maps[0], other))
+    for a, b in zip(expected, found, strict=True):
+        np.testing.assert_array_equal(b.faces, a.faces)
+        np.testing.assert_allclose(b.vertices, a.vertices, atol=1e-6)
+
+
+def test_the_mesh_of_a_map_made_on_the_device_is_within_a_quarter_voxel(maps):
+    a, b = (volume.extract_mesh(1).vertices for volume in maps)
+    distance = cKDTree(a).query(b)[0]
+    assert np.quantile(distance, 0.999) < CONFIG.voxel_size / 4
+
+
+def test_map_files_are_exchanged(maps, tmp_path):
+    """A map made on the device, saved, loaded on the CPU, and gone on in on the device."""
+    maps[1].save(tmp_path / "map.npz")
+    loaded = TsdfVolume.load(tmp_path / "map.npz")
+    assert [*voxels(loaded)] == [*voxels(maps[1])]
+    again = loaded.for_camera(CAMERA, maps[1].backend)
+    np.testing.assert_array_equal(again.extract_mesh(1).faces, maps[1].extract_mesh(1).faces)
+
+
+def test_what_the_host_changes_reaches_the_device(recording):
+    """Colours taken from another map, as when a calibration repaints it, and fusion after that."""
+    painted, plain = integrated(recording, "warp-cpu"), integrated(recording, "warp-cpu")
+    reference = integrated(recording, "cpu")
+    grey = integrated(recording, "cpu")
+    grey.blocks.write(grey.active_slots, *(0 * grey.blocks.geometry[grey.active_slots],) * 2)
+    for volume in (painted, reference):
+        volume.take_colors(grey)
+    T = recording.ground_truth.Ts_world_camera[0]
+    assert plain.raycast(T).color.max() > 0
+    assert painted.raycast(T).color.max() == 0
+    for volume in (painted, reference):
+        volume.integrate(recording[5], recording.ground_truth.Ts_world_camera[5])
+    a, b = voxels(reference), voxels(painted)
+    assert a.keys() == b.keys()
+    paints = np.array([[a[key][1], b[key][1]] for key in a])
+    assert (paints[:, 0] != paints[:, 1]).mean() < 1e-2
+    assert (paints != 0).any()
+
+
+def test_too_large_a_map_says_how_large_a_voxel_fits(monkeypatch, maps):
+    from dudmap.gpu import memory
+
+    monkeypatch.setattr(memory, "free_memory", lambda device: 1000)
+    with pytest.raises(MapError, match=r"voxel_size to at least \d"):
+        on_device(maps[0], maps[1].backend).raycast(np.eye(4))
+
+
+def on_device(volume, backend):
+    """The same blocks in a map on the device."""
+    blocks, slots = volume.blocks, volume.active_slots
+    other = TsdfVolume(CAMERA, CONFIG, depth_max=6.0, backend=backend)
+    other.blocks = type(blocks).restored(
+        blocks.coords[: blocks.num_entries], blocks.free_count[: blocks.num_entries], blocks.entry_of[slots],
+        blocks.geometry[slots], blocks.colors[slots],
+    )  # fmt: skip
+    return other
