@@ -5,6 +5,7 @@ import sys
 import types
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from fake_slam import FakeSlam
@@ -24,6 +25,16 @@ if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
     import cv2
 
     cv2.setUseOptimized(False)
+
+
+@pytest.fixture(autouse=True)
+def float_errors_are_errors():
+    """Division by zero, overflow and invalid operations raise. Underflow to zero is rounding and allowed.
+
+    Threads do not inherit this; there NumPy warns, and warnings are errors (pyproject.toml).
+    """
+    with np.errstate(divide="raise", over="raise", invalid="raise"):
+        yield
 
 
 @pytest.fixture

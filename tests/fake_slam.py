@@ -35,6 +35,8 @@ class FakeResult:
     uncertain: str = ""
     balance: None = None
     calibrated: bool = False
+    rejected: str = ""
+    unobservable: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0
     residuals: np.ndarray = field(default_factory=lambda: np.full((HEIGHT // 2, WIDTH // 2), 0.01, np.float32))

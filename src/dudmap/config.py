@@ -45,6 +45,11 @@ class SensorConfig(ConfigSection):
     """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
     before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
 
+    repeats: bool = False
+    """Accept images that repeat bit for bit, as a simulated camera at rest without noise gives them; otherwise a
+    repeated depth image is taken for a sensor that hangs and not used, and a repeated colour image for one without
+    information."""
+
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
         return self.sigma_base + self.sigma_scale * z**2
@@ -181,6 +186,11 @@ class TrackerConfig(ConfigSection):
     the reading, whether or not the registration weighs by them."""
     min_condition: float = Field(default=1e-4, ge=0, lt=1)
     """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
+    min_information: float = Field(default=3.0, ge=0)
+    """Smallest information on a direction of motion, in multiples of what the noise of the gradients alone gives, from
+    which on the registration moves along it; else it keeps the predicted motion and reports it. Between 2, which an
+    endless tunnel gives where only noise shows the way along it, and 4.6, the least of corridors with texture; 0 moves
+    along all directions."""
     max_speed: float = Field(default=5.0, gt=0)
     """Largest plausible speed of the camera, m/s."""
     max_turn_deg: float = Field(default=360.0, gt=0)

@@ -33,7 +33,16 @@ class DatasetError(DudmapError):
 
 
 class FrameError(DatasetError):
-    """One frame of a recording cannot be read; the other frames may be valid."""
+    """One frame of a recording cannot be read or used; the other frames may be valid.
+
+    Args:
+        message: The sentence.
+        kind: Key under which such frames are counted.
+    """
+
+    def __init__(self, message: str, kind: str = "unreadable") -> None:
+        super().__init__(message)
+        self.kind = kind
 
 
 class MissingExtraError(ConfigError):

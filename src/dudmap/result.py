@@ -17,9 +17,11 @@ class FrameResult:
     """Result of processing one frame.
 
     Attributes:
-        timestamp: Time of the depth image, seconds.
+        timestamp: Time of the depth image, seconds; on the clock of the first frames, if it was set back since.
         state: "tracked" or "lost".
         lost_reason: Sentence on the check that failed; empty for a tracked frame.
+        rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
+            else empty.
         T_world_camera: Camera pose (4, 4); None if lost.
         fused: Whether the frame changed the map.
         skipped_similar: Whether the frame was not fused because it is a redundant view.
@@ -37,6 +39,8 @@ class FrameResult:
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
         calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
         uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
+        unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
+            predicted one; see ``tracking/observability.py``. The frame is ``uncertain`` then.
         balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
             frame, else None.
     """
@@ -61,3 +65,5 @@ class FrameResult:
     uncertain: str = ""
     balance: TermBalance | None = None
     calibrated: bool = False
+    rejected: str = ""
+    unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))

@@ -19,6 +19,7 @@ from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.frame import Frame, FrameArrays
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
+from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
@@ -45,6 +46,7 @@ from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.front_end import FrontEnd
 from dudmap.tracking.motion_model import MotionModel
+from dudmap.tracking.observability import sentence as unobserved
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
@@ -94,6 +96,7 @@ class Slam:
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
+        self.stream = StreamCheck(config.tracker.max_speed, repeats_are_valid=config.sensor.repeats)
         self.tracker = Tracker(config.tracker, config.sensor)
         self.motion = MotionModel(config.tracker)
         self.color_motion = ColorMotion(self.motion, given)
@@ -241,7 +244,8 @@ class Slam:
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
 
         Args:
-            frame: Depth and colour with a timestamp later than all before; prepared or not, the result is the same.
+            frame: Depth and colour, in the order of arrival; prepared or not, the result is the same. A frame whose
+                stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
             dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
                 from the first registration on.
             arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
@@ -249,13 +253,16 @@ class Slam:
 
         Raises:
             ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
-            DatasetError: The images have another shape or type, or do not fit the camera or each other.
+            DatasetError: The arrays have another shape or type.
+            FrameError: The images do not fit the camera or each other; the frame changed nothing.
         """
-        frame = self._given(frame, arrays)
-        view = self.color_motion.predicted(self.prepare(frame, dynamic_mask))
+        view = self.prepare(self._given(frame, arrays), dynamic_mask)
+        if rejection := self.stream.rejection(view.observation):
+            return self._reject(view, rejection)
+        view = self.color_motion.predicted(self._resumed(view))
         if self.reference.is_empty:
             return self._start_map(view)
-        view = replace(view, blind=view.textureless and not self.bootstrap.textureless)
+        view = replace(view, blind=self._is_blind(view))
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
@@ -267,7 +274,7 @@ class Slam:
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self._recolor_first_frame(view, estimate)
         self._accept(view, estimate)
-        uncertain = self.predictor.doubt(view, prediction, estimate)
+        uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
             fuse = not (view.blind or uncertain or self.localize)
             fuse = fuse and not self.redundancy.is_redundant(self.volume, view, estimate)
@@ -289,6 +296,23 @@ class Slam:
         if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
             raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
         return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
+
+    def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
+        """Report a frame that the stream has spoilt."""
+        mask = np.zeros(view.observation.depth.shape, dtype=bool)
+        return replace(self._result(view, None, mask, reason=rejection.reason), rejected=rejection.kind)
+
+    def _resumed(self, view: FrameView) -> FrameView:
+        """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
+        may be elsewhere."""
+        view = replace(view, observation=self.stream.restamped(view.observation))
+        if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
+            self.front_end.lose(view.timestamp)
+        return view
+
+    def _is_blind(self, view: FrameView) -> bool:
+        """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
+        return (view.textureless or self.stream.color_is_frozen) and not self.bootstrap.textureless
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -453,6 +477,7 @@ class Slam:
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
+            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable,
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:

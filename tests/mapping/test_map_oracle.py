@@ -413,10 +413,10 @@ def test_an_occupied_block_costs_little_more_than_its_voxels():
 def test_the_map_has_an_end_and_says_so():
     volume = TsdfVolume(CAMERA, CONSTANT, depth_max=3.0)
     edge = np.eye(4)
-    edge[0, 3] = 0.4 * (1 << 15) - 4.0
+    edge[0, 3] = 0.4 * (1 << 17) - 4.0
     for _ in range(3):
         volume.integrate(wall(1.5), edge)
-    assert volume.extract_mesh().vertices[:, 0].min() > 13_000
+    assert volume.extract_mesh().vertices[:, 0].min() > 52_000
     edge[0, 3] += 4.0
-    with pytest.raises(MapError, match="13107 m from where the map began"):
+    with pytest.raises(MapError, match="52429 m from where the map began"):
         volume.integrate(wall(1.5), edge)

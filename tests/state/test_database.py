@@ -10,7 +10,8 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.mapping import morton
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.state.block_keys import BITS, MAP_SHIFT, block_coords, block_keys
+from dudmap.mapping.voxel_blocks import COORDINATE_BITS, MAX_COORDINATE
+from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_coords, block_keys
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.system import differences, restore, take_snapshot
 
@@ -63,14 +64,20 @@ def assert_same(tmp_path, a, b):
 
 
 def test_morton_codes_interleave_the_bits_of_the_coordinates():
-    coords = np.random.default_rng(0).integers(-(1 << 15), 1 << 15, (500, 3)).astype(np.int16)
-    for code, block in zip(morton.encode(coords, BITS).tolist(), coords.tolist(), strict=True):
-        bits = [f"{value + (1 << 15):016b}" for value in block]
+    coords = np.random.default_rng(0).integers(-MAX_COORDINATE, MAX_COORDINATE, (500, 3)).astype(np.int32)
+    for code, block in zip(morton.encode(coords, COORDINATE_BITS).tolist(), coords.tolist(), strict=True):
+        bits = [f"{value + MAX_COORDINATE:018b}" for value in block]
         assert code == int("".join(x + y + z for x, y, z in zip(*bits, strict=True)), 2)
-    for number in (0, 1, (1 << 15) - 1):
+    for number in (0, 1, MAX_MAPS - 1):
         keys = block_keys(number, coords)
         np.testing.assert_array_equal(block_coords(keys), coords)
         np.testing.assert_array_equal(keys >> MAP_SHIFT, number)
+
+
+def test_blocks_beyond_the_keys_are_refused():
+    for far in (MAX_COORDINATE, -MAX_COORDINATE - 1):
+        with pytest.raises(StateError, match="from where the map began"):
+            block_keys(0, np.array([[0, far, 0]], np.int32))
 
 
 def test_only_changed_blocks_and_parts_of_arrays_are_written(tmp_path):

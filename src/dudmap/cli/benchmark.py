@@ -210,6 +210,41 @@ def first_second(
 
 
 @app.command()
+def faults(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room with people.")
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=20, help="Number of frames of the recording.")] = 120,
+    width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
+    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the synthetic room.")] = 0,
+    only: Annotated[str, typer.Option("--only", help="Comma-separated faults; default: all.")] = "",
+    out: Annotated[Path | None, typer.Option("--out", help="Also write the table to this file (Markdown).")] = None,
+    assignments: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
+    ] = None,
+) -> None:
+    """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
+    from dudmap.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
+    from dudmap.config import Config
+    from dudmap.sequences import open_sequence
+
+    config = Config().override(assignments or [])
+    source = default_room(frames, width, seed) if recording is None else open_sequence(recording)
+    lines, failed = [table_head(source.name, frames)], 0
+    typer.echo(lines[0])
+    for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], frames):
+        lines.append(fault_row(run, clean))
+        failed += run.outcome(clean).startswith("FAILED")
+        typer.echo(lines[-1])
+    if out is not None:
+        out.parent.mkdir(parents=True, exist_ok=True)
+        out.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    if failed:
+        typer.echo(f"dudmap: {failed} of {len(lines) - 1} streams failed; see the column outcome", err=True)
+        raise typer.Exit(1)
+
+
+@app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
         "tests/gate.toml"

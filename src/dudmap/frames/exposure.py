@@ -6,6 +6,9 @@ from numpy.typing import NDArray
 from dudmap.frames.observation import Level
 from dudmap.kernels.median import median
 
+LARGE_GAIN, MORE_ROUNDS, MAX_GAIN = 1.25, 3, 4.0
+"""A gain above this is fitted again, at most so often, and grows no further beyond the last."""
+
 
 def exposed_color(rgb: NDArray[np.uint8], exposure: tuple[float, float]) -> NDArray[np.uint8]:
     """Colours (H, W, 3) with gain and offset applied, comparable to those of the map."""
@@ -37,7 +40,9 @@ def fit_exposure(
 ) -> tuple[float, float]:
     """Gain and offset with ``gain * intensity + offset`` closest to the map's intensities, by a robust fit.
 
-    Auto-exposure changes all intensities at once; without this model such a change would look like motion.
+    Auto-exposure changes all intensities at once; without this model such a change would look like motion. The prior of
+    the gain outweighs the low contrast of an image that is suddenly dark, so a large gain is applied and fitted again.
+    A small one is not: it is also what an image gives that shows something else.
 
     Args:
         intensity: (h, w) float32 of the image.
@@ -50,6 +55,17 @@ def fit_exposure(
     used = used[:: max(1, len(used) // 1000)]  # a thousand pixels determine two numbers well
     x = intensity.reshape(-1)[used].astype(np.float64)
     y = x + difference.reshape(-1)[used]
+    change = exposure = _fit(x, y)
+    for _ in range(MORE_ROUNDS):
+        if change[0] < LARGE_GAIN or exposure[0] > MAX_GAIN / change[0]:
+            break
+        change = _fit(exposure[0] * x + exposure[1], y)
+        exposure = chained(exposure, change)
+    return exposure
+
+
+def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
+    """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
     gain, offset = 1.0, float(median(y - x))
     for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
         error = y - gain * x - offset

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig
-from dudmap.errors import DatasetError
+from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.color_registration import color_projection, register_color
 from dudmap.frames.frame import Frame
 from dudmap.frames.observation import Observation
@@ -75,7 +75,7 @@ class Preprocessor:
         """The preprocessed frame.
 
         Raises:
-            DatasetError: Depth or colour do not have the camera's size, or the wrong type.
+            FrameError: Depth or colour do not have the camera's size, or the wrong type.
         """
         self._check(frame)
         depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
@@ -142,19 +142,22 @@ class Preprocessor:
         h, w = self.camera.shape
         if self.calibration is not None and frame.color.shape != (*self.calibration.camera.shape, 3):
             color_h, color_w = self.calibration.camera.shape
-            raise DatasetError(
-                f"the colour camera is {color_w}x{color_h}, but the colour image has the shape {frame.color.shape}"
+            raise FrameError(
+                f"the colour camera is {color_w}x{color_h}, but the colour image has the shape {frame.color.shape}",
+                "resolution",
             )
         unregistered = self.calibration is not None
         if frame.depth.shape != (h, w) or not (unregistered or frame.color.shape == (h, w, 3)):
-            raise DatasetError(
+            raise FrameError(
                 f"the camera is {w}x{h}, but the depth image has the shape {frame.depth.shape} and the colour image "
-                f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand"
+                f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand",
+                "resolution",
             )
         if frame.depth.dtype.kind != "f" or frame.color.dtype != np.uint8:
-            raise DatasetError(
+            raise FrameError(
                 f"depth is {frame.depth.dtype} and colour {frame.color.dtype}; expected depth in metres as float32 "
-                "and colour as uint8"
+                "and colour as uint8",
+                "type",
             )
 
     def _undistorted(

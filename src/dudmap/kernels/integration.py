@@ -53,7 +53,7 @@ def integrate_blocks(
         start, stop: Range of blocks.
         slots: (n,) int32.
         repeats: (n,) float32, number of frames that this one stands for.
-        coords: (num_slots, 3) int16.
+        coords: (num_slots, 3) int32 from the origin of T.
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.

@@ -184,7 +184,7 @@ class VoxelGrid(NamedTuple):
         origin: (3,) int64 coordinates of the first block.
         geometry: (slots, 512) int32 packed voxels.
         colors: (slots, 512) int32 packed colours.
-        slot_coords: (slots, 3) int16 block coordinates by slot.
+        slot_coords: (slots, 3) int32 block coordinates by slot.
         free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
         voxel_size: Edge of a voxel, metres.
         sdf_unit: Metres per step of the stored distance.
@@ -195,7 +195,7 @@ class VoxelGrid(NamedTuple):
     origin: NDArray[np.int64]
     geometry: Mirror | NDArray[np.int32]
     colors: Mirror | NDArray[np.int32]
-    slot_coords: NDArray[np.int16]
+    slot_coords: NDArray[np.int32]
     free_count: NDArray[np.uint8]
     voxel_size: float
     sdf_unit: float

@@ -108,7 +108,7 @@ def visible_slots(
     Args:
         start, stop: Range of candidates.
         slots: (n,) int32 candidates.
-        coords: (num_slots, 3) int16 block coordinates by slot.
+        coords: (num_slots, 3) int32 from the origin of T block coordinates by slot.
         fused: (num_slots,) uint8 frames that were fused into a slot.
         turn: Number of this frame; negative = all blocks are updated in every frame.
         T: (3, 4) float32, world to camera.

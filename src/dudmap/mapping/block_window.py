@@ -6,10 +6,14 @@ from numpy.typing import NDArray
 from dudmap.errors import MapError
 from dudmap.kernels import hashing
 from dudmap.kernels.mirror import Mirror
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.mapping.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
 
 MARGIN = 3
 """Blocks that the view may move before the window follows; the window is larger by as many on each side."""
+
+LOCAL_GRID = 4096
+"""Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
+where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
 
 
 class BlockWindow:
@@ -55,6 +59,12 @@ class BlockWindow:
         self.mirror.wrote()
         self.near = np.sort(self.cells[self.cells >= 0])
 
+    @property
+    def local_origin(self) -> NDArray[np.int64]:
+        """Blocks (3,) from the origin of the map to the local origin that is nearest to the window."""
+        assert self.origin is not None
+        return LOCAL_GRID * np.rint((self.origin + self.shape // 2) / LOCAL_GRID).astype(np.int64)
+
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
         assert self.origin is not None
@@ -99,11 +109,11 @@ class BlockWindow:
         """
         assert self.origin is not None
         coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
-        if np.abs(coords).max(initial=0) >= 1 << 15:
-            farthest = (1 << 15) * self.block_size
+        if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
+            farthest = MAX_COORDINATE * self.block_size
             raise MapError(
                 f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
                 f"{self.block_size / BLOCK} m it cannot be larger: set volume.voxel_size to a larger value"
             )
         unknown = int(np.count_nonzero(self.cells[cells] == -1))
-        return blocks.entries_at(coords.astype(np.int16), unknown)
+        return blocks.entries_at(coords.astype(np.int32), unknown)

@@ -99,8 +99,10 @@ class Integrator:
             frame_number: Number of the frame among those of the map, from 1.
             count: Number of equal frames that it stands for.
         """
-        T_camera_world = se3.inverse(T_world_camera)[:3].astype(np.float32)
-        view = self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_world)
+        T_camera_local = se3.inverse(T_world_camera)
+        T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (window.local_origin * window.block_size)
+        T_camera_local = T_camera_local[:3].astype(np.float32)
+        view = self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_local)
         self._allocate(blocks, window, view, frame_number)
         weights = self.reading_weights(depth, camera) if weights is None else weights
         self._average(blocks, window, view, color, weights, frame_number, count)
@@ -114,6 +116,14 @@ class Integrator:
             window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
             blocks.slot_coords, blocks.free_count, self.scale.voxel_size, self.scale.sdf_unit,
         )  # fmt: skip
+
+    def _local_grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
+        """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
+        grid, origin = self.grid(blocks, window), window.local_origin
+        if not origin.any():
+            return grid
+        coords = (grid.slot_coords - origin).astype(grid.slot_coords.dtype)
+        return grid._replace(origin=grid.origin - origin, slot_coords=coords)
 
     def _allocate(self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int) -> None:
         """Allocate voxels for the blocks that the truncation band of the image touches."""
@@ -149,8 +159,9 @@ class Integrator:
         turn = frame_number if self.config.take_turns else -1
         if self.config.antialias:
             color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
+        grid = self._local_grid(blocks, window)
         slots, occupied = self.backend.fuse(
-            self.grid(blocks, window), view, color, weights, window.near, blocks.fused, turn, count, self.parameters
+            grid, view, color, weights, window.near, blocks.fused, turn, count, self.parameters
         )
         blocks.written[slots] = frame_number
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
@@ -165,6 +176,6 @@ class Integrator:
         Each call visits every second plane of the window, so that the cost is spread over two frames.
         """
         cells = self.backend.observe_free(
-            self.grid(blocks, window), view, frame_number % 2, count, self.config.free_after, self.parameters
+            self._local_grid(blocks, window), view, frame_number % 2, count, self.config.free_after, self.parameters
         )
         window.set_free(cells, blocks, count)

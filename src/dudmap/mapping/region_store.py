@@ -15,7 +15,7 @@ from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords
 
 COLUMNS = tuple(field.name for field in fields(BlockRecords))
 _TYPES = {
-    "coords": (np.int16, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
+    "coords": (np.int32, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
     "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),
 }  # fmt: skip
 

@@ -11,6 +11,10 @@ from dudmap.kernels.parameters import BLOCK
 
 __all__ = ["BLOCK", "VoxelBlocks", "grown"]
 
+COORDINATE_BITS = 18
+"""Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
+MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
+"""Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
@@ -20,14 +24,14 @@ class BlockRecords:
     """Blocks taken out of a map.
 
     Attributes:
-        coords: (n, 3) int16 block coordinates.
+        coords: (n, 3) int32 block coordinates.
         free_count: (n,) uint8 observations of emptiness.
         owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
         geometry, colors: (m, 512) int32 packed voxels.
         fused: (m,) uint8 frames that were fused into a block, 255 or more.
     """
 
-    coords: NDArray[np.int16]
+    coords: NDArray[np.int32]
     free_count: NDArray[np.uint8]
     owners: NDArray[np.int32]
     geometry: NDArray[np.int32]
@@ -46,14 +50,14 @@ class VoxelBlocks:
 
     Attributes:
         table: Hash table of entry numbers (``kernels/hashing.py``).
-        coords: (entries, 3) int16 block coordinates.
+        coords: (entries, 3) int32 block coordinates.
         slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
         free_count: (entries,) uint8 observations of emptiness.
         num_entries: Number of entries.
         geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
         geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
         entry_of: (slots,) int32 entry of each slot, -1 = unused.
-        slot_coords: (slots, 3) int16 block coordinates by slot.
+        slot_coords: (slots, 3) int32 block coordinates by slot.
         written: (slots,) int32 number of the frame that last wrote to a slot.
         fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
         num_slots: Number of slots in use or released.
@@ -61,14 +65,14 @@ class VoxelBlocks:
 
     def __init__(self, slots: int = 1 << 10) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
-        self.coords = np.empty((1 << 12, 3), dtype=np.int16)
+        self.coords = np.empty((1 << 12, 3), dtype=np.int32)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
         self.geometry_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
         self.colors_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
         self.entry_of = np.full(slots, -1, dtype=np.int32)
-        self.slot_coords = np.zeros((slots, 3), dtype=np.int16)
+        self.slot_coords = np.zeros((slots, 3), dtype=np.int32)
         self.written = np.zeros(slots, dtype=np.int32)
         self.fused = np.zeros(slots, dtype=np.uint8)
         self.num_slots = 0
@@ -137,7 +141,7 @@ class VoxelBlocks:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
         return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
 
-    def entries_at(self, coords: NDArray[np.int16], unknown: int) -> NDArray[np.int32]:
+    def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
         """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
         needed = self.num_entries + unknown
         if needed > len(self.coords):
@@ -261,7 +265,7 @@ class VoxelBlocks:
         _check_restored(coords, free_count, entries, geometry, colors)
         blocks, n, m = cls(), len(coords), len(entries)
         blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
-        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n
+        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int32), free_count.copy(), n
         hashing.rebuild(blocks.table, blocks.coords, n)
         blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
         blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
@@ -289,7 +293,7 @@ def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geom
             raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {np.dtype(kind)} {shape}")
     if m and not (0 <= entries.min() and entries.max() < n and len(np.unique(entries)) == m):
         raise ValueError("the voxels of a block belong to no block, or two to one")
-    if n and np.abs(coords.astype(np.int64)).max() > np.iinfo(np.int16).max:
+    if n and np.abs(coords.astype(np.int64)).max() > MAX_COORDINATE - 1:
         raise ValueError("a block lies farther away than block coordinates reach")
     if len(np.unique(coords, axis=0)) != n:
         raise ValueError("a block is there twice")

@@ -18,6 +18,9 @@ VOXELS = BLOCK**3
 MAX_COUNT = 255
 """Largest weight of a voxel and number of observations of emptiness of a block."""
 
+MAX_STEPS = 32767
+"""Largest distance of a voxel, steps: maps of a wider truncation band, in larger steps, may hold more."""
+
 
 @dataclass(frozen=True, eq=False)
 class BlockSums:
@@ -25,34 +28,27 @@ class BlockSums:
 
     Attributes:
         coords: (n, 3) int32 coordinates of the blocks.
-        weight, distance: (n, 512) int32 and int64, sum of the weights, and of weight times distance in steps.
-        shade_weight, shade: (n, 512) int32, the same of the intensities 1..255.
-        color_weight, color: (n, 512) and (n, 512, 3) int32, the same of the colours in quarters of a grey level. The
-            32 bits hold the sums of 8000 maps.
+        weight, distance: (n, 512) int64, sum of the weights, and of weight times distance in steps.
+        shade_weight, shade: (n, 512) int64, the same of the intensities 1..255.
+        color_weight, color: (n, 512) and (n, 512, 3) int64, the same of the colours in quarters of a grey level.
         free: (n,) int64, observations of emptiness of maps in which the block has no voxels.
     """
 
     coords: NDArray[np.int32]
-    weight: NDArray[np.int32]
+    weight: NDArray[np.int64]
     distance: NDArray[np.int64]
-    shade_weight: NDArray[np.int32]
-    shade: NDArray[np.int32]
-    color_weight: NDArray[np.int32]
-    color: NDArray[np.int32]
+    shade_weight: NDArray[np.int64]
+    shade: NDArray[np.int64]
+    color_weight: NDArray[np.int64]
+    color: NDArray[np.int64]
     free: NDArray[np.int64]
 
     @classmethod
     def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
         """Sums over no map."""
-        shape = len(coords), VOXELS
-
-        def zeros(*shape: int, kind: type = np.int32) -> NDArray:
-            return np.zeros(shape, kind)
-
-        return cls(
-            coords, zeros(*shape), zeros(*shape, kind=np.int64), zeros(*shape), zeros(*shape), zeros(*shape),
-            zeros(*shape, 3), zeros(len(coords), kind=np.int64),
-        )  # fmt: skip
+        n = len(coords)
+        shapes = *[(n, VOXELS)] * 5, (n, VOXELS, 3), (n,)
+        return cls(coords, *(np.zeros(shape, np.int64) for shape in shapes))
 
     def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
         """Sums over some of the blocks."""
@@ -149,10 +145,11 @@ def _sums(
     free: NDArray[np.int64],
 ) -> BlockSums:
     """Sums of a single map from its values; an intensity or colour of 0 is unknown."""
-    shade_weight = weight * (shade > 0)
-    color_weight = weight * np.any(color > 0, axis=-1)
+    wide = weight.astype(np.int64)
+    shade_weight = wide * (shade > 0)
+    color_weight = wide * np.any(color > 0, axis=-1)
     return BlockSums(
-        coords, weight, weight.astype(np.int64) * distance, shade_weight, shade_weight * shade, color_weight,
+        coords, wide, wide * distance, shade_weight, shade_weight * shade, color_weight,
         color_weight[..., None] * color, free,
     )  # fmt: skip
 
@@ -192,6 +189,7 @@ def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) ->
     distance = _rounded(sums.distance + free_steps * emptiness, weight)
     shade = _rounded(sums.shade, sums.shade_weight)
     channels = _rounded(sums.color, sums.color_weight[..., None])
+    distance = np.clip(distance, -MAX_STEPS, MAX_STEPS)
     packed = (distance << 16) | (np.minimum(weight, MAX_COUNT) << 8) | shade
     colors = (channels[..., 0] << 20) | (channels[..., 1] << 10) | channels[..., 2]
     least = weight.min(axis=1) // carve_rate

@@ -59,6 +59,7 @@ class ObjectFusion:
                 "exposure": False,
                 "min_inliers": 0.1,
                 "min_condition": 1e-6,
+                "min_information": 0.0,
                 "color_weight": COLOR_SHARE * config.tracker.color_weight,
             }
         )

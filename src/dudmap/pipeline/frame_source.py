@@ -113,7 +113,10 @@ def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, s
     except FrameError as error:
         return FrameRead(error, None, 1000 * (time.perf_counter() - start))
     ms = 1000 * (time.perf_counter() - start)
-    prepared = None if slam is None else slam.prepare(frame)
+    try:
+        prepared = None if slam is None else slam.prepare(frame)
+    except FrameError as error:
+        return FrameRead(error, None, ms)
     return FrameRead(
         frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared
     )

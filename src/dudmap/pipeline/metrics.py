@@ -16,6 +16,7 @@ from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
+    from dudmap.errors import FrameError
     from dudmap.objects.object_tracker import Mover
     from dudmap.result import FrameResult
     from dudmap.tracking.term_balance import TermBalance
@@ -28,12 +29,15 @@ class RunRecord:
     Attributes:
         rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
         lost: Timestamp and reason of every lost frame.
-        unreadable: One sentence per frame that could not be read.
+        unreadable: One sentence per frame that could not be read or had another size.
+        rejected: Number of frames that were not used for a fault of the stream, by kind; those with a readable image
+            of the right size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the JSON object of movers.jsonl.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
         balances: Uncertainties of poses, of every tenth tracked frame.
         fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
+        degenerate: Number of tracked frames with unobservable directions of motion.
         masked: Number of frames with an external mask, None without external masks.
         dropped: Number of frames dropped by a live run, None otherwise.
     """
@@ -41,6 +45,7 @@ class RunRecord:
     rows: list[dict[str, Any]] = field(default_factory=list)
     lost: list[dict[str, Any]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    rejected: dict[str, int] = field(default_factory=dict)
     mask_ious: list[float] = field(default_factory=list)
     movers: list[dict[str, Any]] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
@@ -51,6 +56,7 @@ class RunRecord:
     corrected: int = 0
     blind: int = 0
     uncertain: int = 0
+    degenerate: int = 0
     masked: int | None = None
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -100,6 +106,9 @@ class RunRecord:
         self.corrected += result.corrected
         self.blind += result.blind
         self.uncertain += bool(result.uncertain)
+        self.degenerate += len(result.unobservable) > 0
+        if result.rejected:
+            self._reject(result.rejected)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -110,6 +119,14 @@ class RunRecord:
             self.balances.append(result.balance)
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
+
+    def skip(self, error: "FrameError") -> None:
+        """Count a frame that cannot be read or used."""
+        self.unreadable.append(str(error))
+        self._reject(error.kind)
+
+    def _reject(self, kind: str) -> None:
+        self.rejected[kind] = self.rejected.get(kind, 0) + 1
 
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
@@ -153,7 +170,9 @@ class RunRecord:
             "corrected": self.corrected,
             "blind": self.blind,
             "uncertain": self.uncertain,
+            "degenerate": self.degenerate,
             "unreadable": len(self.unreadable),
+            "frames_rejected": dict(sorted(self.rejected.items())),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),
             "ms_reading_median": _number(np.median(readings)),

@@ -306,7 +306,7 @@ def process_source(
     if record.dropped is not None:
         record.dropped += source.dropped
     if isinstance(read.frame, FrameError):
-        record.unreadable.append(str(read.frame))
+        record.skip(read.frame)
         display.note(f"skipped: {read.frame}")
         for observer in observers:
             observer.event("unreadable", frame=index, reason=str(read.frame))
@@ -319,15 +319,20 @@ def process_source(
     if isinstance(given_mask, FrameError):
         display.note(f"frame {index}: the given mask is ignored, {given_mask}")
         given_mask = None
-    if record.masked is not None:
-        record.masked += given_mask is not None
     start = time.perf_counter()
     frame = read.prepared or read.frame
-    result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
+    try:
+        result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
+    except FrameError as error:
+        record.skip(error)
+        display.note(f"skipped: {error}")
+        return
     end = time.perf_counter()
+    if record.masked is not None:
+        record.masked += given_mask is not None
     delays = {} if source.arrival is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
-    if mask_folder is not None:
+    if mask_folder is not None and not result.rejected:
         try:
             save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
         except OSError as error:

@@ -89,6 +89,7 @@ class LoopVerifier:
         found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
         if (
             found.converged
+            and len(found.unobservable) == 0
             and not monitor.deviation(found, recognized=True)
             and found.inlier_share >= limits.min_on_map
             and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)

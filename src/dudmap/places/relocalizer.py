@@ -122,6 +122,7 @@ class Relocalizer:
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
             if (
                 tracking.converged
+                and len(tracking.unobservable) == 0
                 and accept(tracking)
                 and static_share * tracking.inlier_share >= limits.min_on_map
                 and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)

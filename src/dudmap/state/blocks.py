@@ -13,7 +13,7 @@ from dudmap.mapping.block_pager import Region
 from dudmap.mapping.block_window import BlockWindow
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
-from dudmap.state.block_keys import MAX_MAPS, block_keys
+from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
 
 VOXELS = 2 * BLOCK**3
 """Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""
@@ -178,7 +178,7 @@ def restore_map(
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
     owned = np.flatnonzero(index["entry_of"] >= 0)
     order = np.argsort(slots)
-    number = int(keys[0] >> 48) if len(keys) else 0
+    number = int(keys[0] >> MAP_SHIFT) if len(keys) else 0
     if (
         any(a != b for a, b in (*sizes, (len(index["written"]), m), (len(index["fused"]), m)))
         or not np.array_equal(slots[order], owned)

@@ -288,7 +288,7 @@ class StateReader:
     def _rows(self, statement: str, *values: object) -> Iterable[Sequence[Any]]:
         try:
             yield from self._connection.execute(statement, values)
-        except sqlite3.Error as error:
+        except (sqlite3.Error, UnicodeDecodeError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
 
 

@@ -119,7 +119,8 @@ class FrontEnd:
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""
         tracking, labels = estimate.tracking, estimate.labels
-        self.motion.update(view.timestamp, tracking.T_world_camera)
+        observed = len(tracking.unobservable) == 0
+        self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
         self.monitor.images.update(view, estimate)

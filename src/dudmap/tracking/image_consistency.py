@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import Config
 from dudmap.dynamics.detector import depth_tolerance, distance_sigma
-from dudmap.frames.exposure import fit_exposure
+from dudmap.frames.exposure import LARGE_GAIN, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import reduced
 from dudmap.geometry import se3
@@ -48,17 +48,20 @@ class ImageConsistency:
         self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
         self.motion = motion
         self._last: tuple[Level, NDArray[np.uint8]] | None = None  # coarsest level and its dynamic pixels
+        self._gain = 1.0  # of the exposure of the last frame
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Compare the next frame with this one, whose pose is accepted."""
         level = view.pyramid.coarse
         self._last = None if view.blind or not self._enabled else (level, _dynamic(estimate, level).astype(np.uint8))
+        self._gain = estimate.exposure[0]
 
     def contradicts(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> str:
         """Sentence if the last image contradicts the pose of a frame, empty if not.
 
         It does if it is more than MAX_MISREGISTRATION beside this one, and the corners of the two images follow no
-        common motion, or one that explains the images clearly better. Blur alone moves corners and images alike.
+        common motion, or one that explains the images clearly better. Blur alone moves corners and images alike. That
+        corners are not found again where the exposure has changed suddenly says nothing.
 
         Args:
             view: The frame.
@@ -72,7 +75,8 @@ class ImageConsistency:
             return ""
         T_image = image_pose()
         if T_image is None:
-            if len(view.pyramid.corners) < MIN_CORNERS:
+            change = estimate.exposure[0] / self._gain
+            if len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN:
                 return ""
             return f"the last image lies {distance:.1f} coarse pixels beside this one, and no motion joins them"
         other = self.misregistration(view, estimate, T_image)

@@ -10,6 +10,15 @@ VELOCITY_LIFETIME = 0.15
 """Time after the last accepted pose during which the velocity is still used, seconds."""
 
 
+PAUSE = 1.0
+"""Time without a pose after which the last velocity says nothing, seconds: a hand accelerates by about 1 m/s^2."""
+
+ACCELERATION = 1.0
+"""Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
+MAX_DRIFT = 0.03
+"""Largest standard deviation of a pose that follows the prediction where the view shows no motion, metres."""
+
+
 class MotionModel:
     """Predicts the next pose from the last two.
 
@@ -23,6 +32,7 @@ class MotionModel:
         self._timestamp = 0.0
         self._velocity = np.zeros(6)  # twist per second, camera axes
         self._initialized = False
+        self._observed = 0.0  # time of the last pose whose motion was seen in all directions
 
     @property
     def velocity(self) -> NDArray[np.float64]:
@@ -35,8 +45,10 @@ class MotionModel:
             return self.T_world_camera
         return self.T_world_camera @ se3.exp(self._velocity * self.elapsed(timestamp))
 
-    def update(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Accept the pose of a tracked frame."""
+    def update(self, timestamp: float, T_world_camera: NDArray[np.float64], *, observed: bool = True) -> None:
+        """Accept the pose of a tracked frame, whose motion was ``observed`` in all directions or partly predicted."""
+        if observed:
+            self._observed = timestamp
         if self._initialized:
             self._velocity = self.velocity_to(timestamp, T_world_camera)
         self._timestamp, self.T_world_camera, self._initialized = timestamp, T_world_camera, True
@@ -57,6 +69,21 @@ class MotionModel:
             return False
         self._velocity = np.zeros(6)
         return True
+
+    def has_paused(self, timestamp: float) -> bool:
+        """Whether no pose has been accepted for longer than PAUSE."""
+        return self._initialized and timestamp - self._timestamp > PAUSE
+
+    def drift_reason(self, timestamp: float) -> str:
+        """Sentence if a pose that is partly predicted would be too uncertain, empty if not.
+
+        An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
+        """
+        elapsed = timestamp - self._observed
+        drift = ACCELERATION * elapsed**2 / 2
+        if drift <= MAX_DRIFT:
+            return ""
+        return f"the view has not shown all directions of motion for {elapsed:.2f} s, in which the pose may drift"
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Continue from the pose of a relocalised frame with unknown velocity."""

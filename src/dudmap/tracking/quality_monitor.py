@@ -91,6 +91,7 @@ class QualityMonitor:
         return (
             tracking.reason
             or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
+            or (self.motion.drift_reason(view.timestamp) if len(tracking.unobservable) else "")
             or self.deviation(tracking, crowded=crowded)
             or self._undetermined(view, estimate)
             or self.images.contradicts(view, estimate, image_pose)

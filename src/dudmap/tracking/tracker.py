@@ -1,6 +1,6 @@
 """Direct registration of a frame to the distances and intensities of the map (thesis section 4.4, algorithm 2)."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from dudmap.geometry import se3
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import ImageStack, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
 SHORT_STEP = 4
 """A step shorter than this multiple of the stop tolerance also ends a level if the cost hardly changes."""
@@ -65,6 +66,8 @@ class TrackingResult:
         color_residual: Median absolute intensity difference (0..1) to the map at the static readings, after the best
             gain and offset; NaN for a textureless image.
         settled: Whether the last level ended by a stop criterion and not at the iteration limit.
+        unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the initial pose was
+            kept (``tracking/observability.py``).
     """
 
     T_world_camera: NDArray[np.float64]
@@ -77,6 +80,7 @@ class TrackingResult:
     iterations: int
     color_residual: float = 0.0
     settled: bool = True
+    unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
 
 
 class Tracker:
@@ -113,7 +117,7 @@ class Tracker:
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
         volume.look_at(T_init)
-        T, iterations, system, settled = T_init, 0, None, True
+        T, iterations, system, settled, seen = T_init, 0, None, True, COMPLETE
         lit, weights = levels[-1], np.ones_like(levels[-1].depth)
         for index, level in enumerate(levels):
             limit = self.config.iterations[first_level + index]
@@ -132,13 +136,44 @@ class Tracker:
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
             stop = self.config.stop if finest else self.config.stop_coarse
-            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight)
+            seen = self._observability(volume, lit, T, weights, system, color_weight)
+            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight, seen)
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return replace(self._judge(T, exposure, system, lit, weights, iterations), settled=settled)
+        return replace(self._judge(T, exposure, system, lit, weights, iterations, seen), settled=settled)
+
+    def _observability(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: LinearSystem,
+        color_weight: float | None,
+    ) -> Observability:
+        """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
+        config, R = self.config, T_world_camera[:3, :3]
+        color_weight = config.color_weight if color_weight is None else color_weight
+        if config.min_information == 0:
+            return COMPLETE
+        noise = gradient_noise(
+            level,
+            system.residuals,
+            weights,
+            R,
+            volume.voxel_size,
+            volume.camera.width,
+            color_weight,
+            config,
+            self.sensor,
+        )
+        if noise is None or noise.is_exceeded(system.H, config.min_information):
+            return COMPLETE
+        distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
+        return noise.observability(distances.H, system.H, R, config.min_information)
 
     def _optimize(
         self,
@@ -150,9 +185,10 @@ class Tracker:
         limit: int,
         stop: float,
         color_weight: float | None,
+        seen: Observability,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
-        accepted if it decreases the cost.
+        accepted if it decreases the cost. It moves only along the directions that are ``seen``.
 
         Returns:
             Pose, its normal equations, number of linearisations, whether a stop criterion was met.
@@ -163,7 +199,7 @@ class Tracker:
             if not diagonal.max() > 0:
                 break
             damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
-            step = np.asarray(-np.linalg.solve(damped, system.b), dtype=np.float64)
+            step = seen.step(damped, system.b)
             T_trial, length = se3.retract(T, step), np.linalg.norm(step)
             if length < stop:  # too short to need another linearisation
                 return T_trial, system, used, True
@@ -221,8 +257,11 @@ class Tracker:
         level: Level,
         weights: NDArray[np.float32],
         iterations: int,
+        seen: Observability,
     ) -> TrackingResult:
         """Result of a registration with the first check it fails: overlap, residual, conditioning of H.
+
+        Directions that are known not to be determined do not count as badly conditioned, as long as others remain.
 
         The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
         the registration does not weigh by it, and intensities after the best gain and offset even if the registration
@@ -241,7 +280,7 @@ class Tracker:
             reason = f"only {share:.0%} of the static readings fall on the map"
         elif residual > config.max_residual * self.sensor.sigma(1.0):
             reason = f"readings lie {1000 * residual:.1f} mm off the map"
-        elif condition < config.min_condition:
+        elif seen.observable.shape[1] == 0 or (seen.is_complete and condition < config.min_condition):
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
@@ -252,7 +291,10 @@ class Tracker:
         difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
-        return TrackingResult(T, exposure, not reason, reason, share, residual, condition, iterations, color_residual)
+        return TrackingResult(
+            T, exposure, not reason, reason, share, residual, condition, iterations, color_residual,
+            unobservable=seen.unobservable,
+        )  # fmt: skip
 
     def _chi_square(self, system: LinearSystem, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation

@@ -144,7 +144,7 @@ def pack_pixels(
 
 @wp.kernel
 def visible_slots(
-    slots: Indices, coords: wp.array2d(dtype=wp.int16), fused: wp.array(dtype=wp.uint8), turn: int, t: Motion,
+    slots: Indices, coords: wp.array2d(dtype=wp.int32), fused: wp.array(dtype=wp.uint8), turn: int, t: Motion,
     camera: Camera, height: int, width: int, block_size: wp.float32, farthest: Image, p: FusionParameters,
     marks: Indices, repeats: wp.array(dtype=wp.float32),
 ):  # fmt: skip
@@ -191,7 +191,7 @@ def visible_slots(
 @wp.kernel
 def integrate(
     slots: Indices, candidates: Indices, repeats: wp.array(dtype=wp.float32), count: wp.float32,
-    coords: wp.array2d(dtype=wp.int16), t: Motion, camera: Camera, height: int, width: int,
+    coords: wp.array2d(dtype=wp.int32), t: Motion, camera: Camera, height: int, width: int,
     pixels: wp.array2d(dtype=wp.int32), geometry: wp.array2d(dtype=wp.int32), colors: wp.array2d(dtype=wp.int32),
     p: FusionParameters, occupied: Indices,
 ):  # fmt: skip

@@ -1,0 +1,213 @@
+"""Directions of motion that a view does not determine, found from H (Zhang, Kaess and Singh 2016, On degeneracy of
+optimization-based state estimation problems)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.frames.observation import Level
+
+FILTER_PX = 4.0
+"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
+gradient noise of the distances is computed."""
+INTENSITY_SIGMA = 1 / 255
+"""Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
+SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
+"""Readings across the image from which the noise of H is computed, and how many of all must lie on the map."""
+INTERPOLATED = 2 * (2 / 3) ** 2
+"""Variance of a component of the gradient of the trilinear interpolation of independent values of variance 1, per cell:
+a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
+STEEPEST = 9.5
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+REGULAR = 1e-6
+"""Share by which the diagonal of the noise is raised."""
+AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
+"""Motion along and about the camera's x, y and z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """Which directions of a twist (v, omega) about the camera's centre a registration determines.
+
+    Attributes:
+        observable: (6, m) basis of the determined directions, world axes.
+        unobservable: (6 - m, 6) the others, camera axes; each of unit length if one radian counts as the mean depth.
+    """
+
+    observable: NDArray[np.float64]
+    unobservable: NDArray[np.float64]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every direction is determined."""
+        return len(self.unobservable) == 0
+
+    def step(self, H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Solution (6,) of ``H step = -b`` that does not move along directions that are not determined (the solution
+        remapping of Zhang et al., with the directions orthogonal under the noise of H)."""
+        if self.is_complete:
+            return np.asarray(-np.linalg.solve(H, b), dtype=np.float64)
+        basis = self.observable
+        return basis @ np.linalg.solve(basis.T @ H @ basis, -basis.T @ b)
+
+
+COMPLETE = Observability(np.eye(6), np.empty((0, 6)))
+"""Every direction is determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientNoise:
+    """Information that noise of the gradients alone contributes to H.
+
+    Attributes:
+        distances, intensities: (6, 6) of the two terms, world axes.
+        variances: Mean variances of the gradients of the two terms.
+        depth: Mean depth, metres.
+    """
+
+    distances: NDArray[np.float64]
+    intensities: NDArray[np.float64]
+    variances: tuple[float, float]
+    depth: float
+
+    def is_exceeded(self, H: NDArray[np.float64], least: float) -> bool:
+        """Whether H has at least ``least`` times the information of the noise on every direction. Then one of its two
+        terms has."""
+        return bool(_eigenvalues(H, self.distances + self.intensities)[0][0] >= least)
+
+    def observability(
+        self,
+        H_distances: NDArray[np.float64],
+        H: NDArray[np.float64],
+        R_world_camera: NDArray[np.float64],
+        least: float,
+    ) -> Observability:
+        """Directions on which the information of both terms, each in units of its own noise, exceeds it.
+
+        Gradients e + n of a term with noise n give E[H] = H_true + N: where a view says nothing, H is not zero but N,
+        and the registration settles wherever the noise fits best. A term of precise gradients and one of poor ones
+        count by their variances s^2: the generalised eigenvalues of
+
+            (H_d / s_d^2 + H_c / s_c^2) v = mu (N_d / s_d^2 + N_c / s_c^2) v
+
+        are 1 where there is only noise, whatever the units of translation and rotation.
+
+        Args:
+            H_distances: (6, 6) normal equations of the distances alone, world axes.
+            H: (6, 6) of both terms.
+            R_world_camera: (3, 3).
+            least: Smallest eigenvalue of a direction that is determined.
+        """
+        s_d, s_c = self.variances
+        information, noise = H_distances / s_d, self.distances / s_d
+        if s_c > 0:
+            information, noise = information + (H - H_distances) / s_c, noise + self.intensities / s_c
+        ratios, directions = _eigenvalues(information, noise)
+        if ratios[0] >= least:
+            return COMPLETE
+        free = np.kron(np.eye(2), R_world_camera.T) @ directions[:, ratios < least]
+        lengths = np.sqrt(np.sum(free[:3] ** 2, axis=0) + self.depth**2 * np.sum(free[3:] ** 2, axis=0))
+        return Observability(directions[:, ratios >= least], (free / lengths).T)
+
+
+def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Generalised eigenvalues (6,) of ``H v = mu noise v``, ascending, and eigenvectors in the columns of (6, 6)."""
+    factor = np.linalg.inv(np.linalg.cholesky(noise))
+    ratios, vectors = np.linalg.eigh(factor @ H @ factor.T)
+    return ratios, np.asarray(factor.T @ vectors, dtype=np.float64)
+
+
+def gradient_noise(
+    level: Level,
+    residuals: NDArray[np.float32],
+    weights: NDArray[np.float32],
+    R_world_camera: NDArray[np.float64],
+    voxel_size: float,
+    map_width: int,
+    color_weight: float,
+    config: TrackerConfig,
+    sensor: SensorConfig,
+) -> GradientNoise | None:
+    """What noise of the gradients contributes to H in a view.
+
+    Noise of standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient variance
+    sigma^2 a^2 / (8 pi s^4) (variance sigma^2 a^2 / (4 pi s^2) over 2 s^2); s is that of the filter and of half a voxel
+    together. A voxel takes the reading of the nearest pixel, which on a slanted surface is wrong by a uniform share of
+    the step g between two pixels, in each voxel by another: the trilinear interpolation of distances of variance
+    g^2 / 12 has the gradient variance 2 (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent:
+    2 (2/3)^2 sigma_I^2 / voxel^2. The noise is isotropic, so that a reading at p from the camera's centre contributes
+    its variance times J' J with J = [I, -hat(p)].
+
+    Args:
+        level: The image.
+        residuals: (2, h, w) of the linearisation, NaN off the map.
+        weights: (h, w) static weights.
+        R_world_camera: (3, 3).
+        voxel_size: Metres.
+        map_width: Width of the images that the map was made of, pixels.
+        color_weight: Weight of the intensities.
+        config, sensor: The weights of the residuals.
+
+    Returns:
+        None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
+        neighbouring voxels take the same reading, and the noise is another one.
+    """
+    stride = max(1, level.camera.width // SAMPLES_ACROSS)
+    part = np.s_[stride // 2 :: stride, stride // 2 :: stride]
+    on_map = np.isfinite(residuals[1][part]) & (weights[part] > 0)
+    if np.count_nonzero(on_map) < MIN_SAMPLES:
+        return None
+    v, u = (stride * index + stride // 2 for index in np.nonzero(on_map))
+    z, camera = level.depth[v, u].astype(np.float64), level.camera
+    p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
+    distance, difference = np.abs(residuals[:, v, u]).astype(np.float64)
+    sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
+    if float(pixel.mean()) * camera.width / map_width > voxel_size:
+        return None
+    scale = np.minimum(sensor.sigma(1.0) / sigma, 1) if config.noise_weighting else np.ones_like(z)
+    if config.robust == "tukey":
+        robust = (1 - np.minimum(distance * scale / config.tukey, 1) ** 2) ** 2
+    else:
+        robust = config.huber / np.maximum(distance * scale, config.huber)
+    width = np.hypot(FILTER_PX * camera.width / 640 * pixel, voxel_size / 2)
+    static = stride**2 * weights[v, u].astype(np.float64)
+    w = static * robust * scale**2
+    steps = _depth_steps(level.depth, v, u, pixel) * camera.width / map_width
+    w_noise = w * (sigma**2 * pixel**2 / (8 * np.pi * width**4) + INTERPOLATED * steps**2 / 12 / voxel_size**2)
+    w_color = color_weight * static * config.color_huber / np.maximum(difference, config.color_huber)
+    color_variance = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if color_weight > 0 else 0.0
+    distances, intensities = _isotropic(w_noise, p), _isotropic(w_color * color_variance, p)
+    variance = float(w_noise.sum() / max(w.sum(), 1e-12))
+    return GradientNoise(distances, intensities, (max(variance, 1e-12), color_variance), float(z.mean()))
+
+
+def _depth_steps(
+    depth: NDArray[np.float32], v: NDArray[np.intp], u: NDArray[np.intp], pixel: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Change (n,) of the depth from a pixel to the next, metres, at most that of the steepest surface."""
+    h, w = depth.shape
+    across = depth[v, np.minimum(u + 1, w - 1)] - depth[v, np.maximum(u - 1, 0)]
+    down = depth[np.minimum(v + 1, h - 1), u] - depth[np.maximum(v - 1, 0), u]
+    return np.minimum(np.hypot(across, down) / 2, STEEPEST * pixel)
+
+
+def _isotropic(w: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum (6, 6) of w J' J with J = [I, -hat(p)] over points (n, 3), of weights (n,)."""
+    N = np.zeros((6, 6))
+    first, second = w @ p, (w[:, None] * p).T @ p
+    N[:3, :3] = np.eye(3) * w.sum()
+    N[3:, :3] = [[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]]
+    N[:3, 3:] = N[3:, :3].T
+    N[3:, 3:] = np.eye(3) * np.trace(second) - second
+    return N + REGULAR * np.diag(np.diag(N))  # readings in one line leave a rotation without any
+
+
+def sentence(unobservable: NDArray[np.float64]) -> str:
+    """Sentence on the directions (k, 6) that a view does not determine, empty if there are none."""
+    if len(unobservable) == 0:
+        return ""
+    strongest = np.abs(unobservable).max(axis=0)
+    named = [name for name, share in zip(AXES, strongest, strict=True) if share > 0.5 * strongest.max()]
+    return f"the view does not show how the camera moves in {len(unobservable)} direction(s): {', '.join(named)}"
