@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.observation import Level
+from dudmap.kernels.parameters import ImageStack
 
 FILTER_PX = 4.0
 """Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
@@ -121,7 +122,7 @@ def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[ND
 
 def gradient_noise(
     level: Level,
-    residuals: NDArray[np.float32],
+    residuals: ImageStack,
     weights: NDArray[np.float32],
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
@@ -162,7 +163,7 @@ def gradient_noise(
     v, u = (stride * index + stride // 2 for index in np.nonzero(on_map))
     z, camera = level.depth[v, u].astype(np.float64), level.camera
     p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
-    distance, difference = np.abs(residuals[:, v, u]).astype(np.float64)
+    distance, difference = (np.abs(residuals[number][v, u]).astype(np.float64) for number in range(2))
     sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
     if float(pixel.mean()) * camera.width / map_width > voxel_size:
         return None
