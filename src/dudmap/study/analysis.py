@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.errors import ConfigError
-from dudmap.study import figures, indices, judgement, response_surface
+from dudmap.study import figures, indices, judgement, response_surface, screening
 from dudmap.study.designs import DesignOptions, Point
 from dudmap.study.effects import anova, interactions, main_effects
 from dudmap.study.factors import Factor, coded_points
@@ -103,6 +103,9 @@ def describe_response(
     """Add everything that is known about one response but the confirmation of its optimum."""
     data, heading = usable(table, name, log), heading_of(name, log)
     report.heading(heading)
+    if options.kind == "plackett-burman":
+        screening.describe_screening(report, screening.screen(data, factors, name), heading)
+        return
     effects = main_effects(data, factors, name)
     report.figure(figures.main_effects_figure(effects, heading), "Main effects, with 95 % intervals of the means.")
     if 2 <= len(factors) <= MOST_INTERACTION_FACTORS:
@@ -120,6 +123,30 @@ def describe_response(
         report.text(predicted)
     else:
         describe_surface(report, predicted, heading)
+
+
+def describe_keys(
+    report: Report, table: Table, factors: Sequence[Factor], names: Sequence[str], log: Sequence[str]
+) -> Table:
+    """Add the keys that matter for any response and the keys that do not; return all effects of all responses."""
+    import pandas as pd
+
+    effects = {}
+    for name in names:
+        try:
+            effects[name] = screening.screen(usable(table, name, name in log), factors, name)
+        except ConfigError:  # said under the heading of the response
+            continue
+    if not effects:
+        return pd.DataFrame()
+    found = screening.which_matter(effects).set_index("key")
+    matter, rest = found.dropna(how="all"), found.index[found.isna().all(axis=1)]
+    report.heading("Which keys matter")
+    if len(matter):
+        report.text("Largest significant effect in standard deviations of the residual:")
+        report.table(matter.loc[matter.abs().max(axis=1).sort_values(ascending=False).index].reset_index())
+    report.text(f"Without a significant effect on any response ({len(rest)}): {', '.join(rest)}.")
+    return pd.concat(effects, names=["response"]).reset_index("response")
 
 
 def describe_indices(

@@ -134,3 +134,20 @@ def indices_figure(indices: Table) -> bytes:
     axes[0][0].set_ylabel("Sobol index")
     axes[0][0].legend()
     return png(figure)
+
+
+def screening_figure(effects: Table, keys: Sequence[str], heading: str) -> bytes:
+    """Effects of the keys on every recording with their intervals; the first key is on top."""
+    recordings = list(dict.fromkeys(effects["recording"]))
+    figure, axes = _axes(1, len(recordings), 3.2, 0.24 * len(keys) + 1.0)
+    y = np.arange(len(keys))[::-1]
+    for ax, recording in zip(axes[0], recordings, strict=True):
+        part = effects[effects["recording"] == recording].set_index("key").loc[list(keys)]
+        bars = np.array([part["effect"] - part["low"], part["high"] - part["effect"]])
+        ax.errorbar(part["effect"], y, xerr=bars, fmt="o", ms=3, capsize=2, lw=1)
+        ax.axvline(0, color="0.7", lw=0.8, zorder=0)
+        ax.set_yticks(y, keys if ax is axes[0][0] else [""] * len(keys), fontsize=7)
+        ax.tick_params(axis="x", labelsize=7)
+        ax.set_title(recording, fontsize=8)
+    figure.supxlabel(f"effect on {heading}", fontsize=8)
+    return png(figure)

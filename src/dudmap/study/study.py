@@ -145,6 +145,8 @@ def write_report(
             report.text(f"{error}.")
         if name == plan.responses[0]:
             analysis.describe_confirmation(report, confirmation)
+    if plan.options.kind == "plackett-burman":
+        analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log).to_csv(out / "effects.csv", index=False)
     analysis.describe_pareto(report, table, plan.factors, plan.responses)
     analysis.describe_points(report, table, plan.factors, plan.responses)
     analysis.describe_failures(report, table)
