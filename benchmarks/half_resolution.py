@@ -51,7 +51,8 @@ def excerpt(recording: Path, out: Path, start: int, frames: int, step: int, full
     for row in rows:
         color = cv2.imread(str(recording / row[1]), cv2.IMREAD_COLOR)
         depth = cv2.imread(str(recording / row[3]), cv2.IMREAD_UNCHANGED)
-        assert color is not None and depth is not None, row
+        if color is None or depth is None:
+            raise SystemExit(f"cannot read {row[1]} or {row[3]} of {recording}")
         color_file = f"{Path(row[1]).with_suffix('.png')}"
         size = (color.shape[1] // 2, color.shape[0] // 2)
         cv2.imwrite(str(out / color_file), color if full else cv2.resize(color, size, interpolation=cv2.INTER_AREA))

@@ -47,7 +47,7 @@ def test_the_ends_differ_from_the_value_by_the_ratio_unless_a_bound_or_a_whole_n
 def test_a_key_can_be_left_out_or_have_levels_of_its_own():
     table = {"tracker.huber": [0.005, 0.03], "all_numeric": {"without": ["tracker.damping", "dynamics.width"]}}
     factors = {factor.key: factor for factor in make_factors(table, Config())}
-    assert "tracker.damping" not in factors and "dynamics.width" not in factors
+    assert not {"tracker.damping", "dynamics.width"} & set(factors)
     assert factors["tracker.huber"].levels == (0.005, 0.03)
 
 
@@ -109,7 +109,8 @@ def test_the_report_names_keys_that_matter_and_a_response_that_never_varies_has_
         describe_screening(report, found, name)
     report.save(tmp_path)
     text = (tmp_path / "report.md").read_text()
-    assert f"2 of {len(plan.factors)} keys have an effect on ate" in text and "volume.voxel_size" in text
+    assert f"2 of {len(plan.factors)} keys have an effect on ate" in text
+    assert "volume.voxel_size" in text
     assert f"0 of {len(plan.factors)} keys have an effect on ms" in text
     found = which_matter(effects).set_index("key")
     assert set(found.dropna(how="all").index) == {"volume.voxel_size", "dynamics.margin_px"}

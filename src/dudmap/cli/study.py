@@ -7,6 +7,8 @@ import typer
 from typer.core import TyperGroup
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from dudmap.study.conduct import Progress
     from dudmap.study.executor import Executor
 
@@ -37,6 +39,11 @@ ClusterOption = Annotated[
     typer.Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine."),
 ]
 
+PriceOption = Annotated[
+    float,
+    typer.Option("--cost-per-core-hour", min=0, help="Price of a core for one hour; the progress shows the cost."),
+]
+
 
 @app.command()
 def run(
@@ -46,6 +53,7 @@ def run(
     max_runs: MaxRunsOption = 1000,
     keep: KeepOption = False,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
     from dudmap.study.plan import load_plan
@@ -54,7 +62,8 @@ def run(
     need_libraries()
     plan = load_plan(design)
     out = out or Path("runs/study") / design.stem
-    typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+    report = _shown_with(cost_per_core_hour)
+    typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report))
     typer.echo(f"written to {out}")
 
 
@@ -73,6 +82,7 @@ def thesis(
     max_runs: MaxRunsOption = 1000,
     keep: KeepOption = False,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
     from dudmap.study.study import need_libraries, run_study
@@ -85,7 +95,8 @@ def thesis(
     else:
         plan = thesis_plan(table, recordings or (), frames)
         out = out or Path("runs/study") / f"thesis-{table}"
-        typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show))
+        report = _shown_with(cost_per_core_hour)
+        typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report))
     typer.echo(f"written to {out}")
 
 
@@ -96,6 +107,7 @@ def tune(
     jobs: JobsOption = 0,
     max_runs: MaxRunsOption = 1000,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
     from dudmap.study.plan import load_plan
@@ -105,7 +117,8 @@ def tune(
     need_libraries()
     plan = load_plan(design)
     out = out or Path("runs/study") / f"{design.stem}-tune"
-    typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=_show))
+    report = _shown_with(cost_per_core_hour)
+    typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=report))
     typer.echo(f"written to {out}")
 
 
@@ -119,5 +132,6 @@ def _executor(jobs: int, cluster: str) -> "Executor":
     return LocalExecutor(jobs or usable_cores())
 
 
-def _show(progress: "Progress") -> None:
-    typer.echo(str(progress), err=True)
+def _shown_with(price: float) -> "Callable[[Progress], None]":
+    """Function that shows the progress with its cost at a price per core-hour."""
+    return lambda progress: typer.echo(progress.describe(price), err=True)

@@ -14,7 +14,7 @@ CPUS_PER_RUN = 1
 
 
 class RayExecutor:
-    """Tasks of a Ray cluster. All nodes must see the study folder and the recordings under the same paths.
+    """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
 
     Args:
         address: ``auto``, or ``ray://HOST:PORT``.
@@ -36,18 +36,19 @@ class RayExecutor:
         self._ray = ray
         self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(_perform)  # retries: dudmap.study.conduct
         self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
-        self._running: list[Any] = []
+        self.cores = CPUS_PER_RUN
+        self._running: set[Any] = set()
 
     def submit(self, job: Job) -> "Future[Outcome]":
         """See ``Executor``."""
         reference = self._perform.remote(job)
-        self._running.append(reference)
+        self._running.add(reference)
         out: Future[Outcome] = Future()
         reference.future().add_done_callback(lambda future: self._pass_on(reference, future, out))
         return out
 
     def _pass_on(self, reference: Any, future: "Future[Outcome]", out: "Future[Outcome]") -> None:  # noqa: ANN401
-        self._running.remove(reference)
+        self._running.discard(reference)
         errors = self._ray.exceptions
         lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
         error = future.exception()

@@ -1,8 +1,8 @@
 """Experimental designs: which combinations of levels are run.
 
 Every design comes from a library: factorial, Plackett-Burman (1946), central composite (Box and Wilson 1951) and
-Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs of Saltelli (2010) and
-Morris (1991), from which their indices are computed without a model, from SALib.
+Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs
+of Saltelli (2010) and Morris (1991), from which their indices are computed without a model, from SALib.
 """
 
 from collections.abc import Callable, Sequence

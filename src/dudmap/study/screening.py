@@ -49,10 +49,10 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
         value = value_of(base, key)
         if key in without or key in chosen:
             continue
-        if isinstance(value, tuple) and all(is_number(element) for element in value):
+        if isinstance(value, tuple):
             ends = [[_scaled(element, factor) for element in value] for factor in (1 / ratio, ratio)]
             out.append(Factor(key, tuple(ends)))
-        elif is_number(value) and value != 0:
+        elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0:
             low, high = _ends(key, value, ratio)
             whole = isinstance(value, int)
             out.append(Factor(key, (), low, high, "linear" if whole or low <= 0 else "log", whole))
@@ -147,7 +147,9 @@ def describe_screening(report: "Report", effects: Table, heading: str) -> None:
     report.table(cells.reset_index())
     report.text("A star marks the effects that are significant.")
     shown = effects[effects["key"].isin(order.index[:MOST_SHOWN])]
-    report.figure(figures.screening_figure(shown, list(order.index[:MOST_SHOWN]), heading), "Effects with 95 % intervals.")
+    report.figure(
+        figures.screening_figure(shown, list(order.index[:MOST_SHOWN]), heading), "Effects with 95 % intervals."
+    )
 
 
 def which_matter(effects: Mapping[str, Table]) -> Table:

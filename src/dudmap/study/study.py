@@ -1,6 +1,7 @@
 """A whole study: its runs, its confirmation, its tables and its report."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -74,9 +75,50 @@ def run_study(
         confirmation: Confirmation | str = "There is nothing to confirm."
         if not isinstance(predicted, str) and plan.confirm:
             confirmation = _confirm(plan, predicted, out, executor, keep=keep, report=report)
+        each = confirm_each(plan, table, out, executor, keep=keep, report=report) if plan.each else None
     finally:
         executor.close()
-    return write_report(plan, table, predicted, confirmation, out, executor.workers, state)
+    return write_report(plan, table, predicted, confirmation, out, executor.workers, state, each)
+
+
+def confirm_each(
+    plan: Plan, table: Table, out: Path, executor: Executor, *, keep: bool, report: Callable[[Progress], None]
+) -> Table:
+    """Model, optimum and confirmation of every recording on its own; also written to each.csv.
+
+    One row per recording: values of the factors at the optimum, R2 of the model, R2 when each run is left out in turn,
+    prediction, mean of the confirmation runs, best point of the design on the same recordings, whether the model held,
+    and whether anything spoke against it before.
+    """
+    import numpy as np
+    import pandas as pd
+
+    from dudmap.study.analysis import predict_optimum
+
+    name, rows = plan.responses[0], []
+    plain = np.exp if name in plan.log else np.asarray
+    for recording in sequence_names(plan):
+        alone = replace(plan, entries=tuple(entry for entry in plan.entries if entry[0] == recording))
+        predicted = predict_optimum(table[table["sequence"] == recording], plan.factors, name, name in plan.log)
+        if isinstance(predicted, str):
+            rows.append({"recording": recording, "held": predicted})
+            continue
+        point = {key.rpartition(".")[2]: value for key, value in predicted.point.items()}
+        surface = predicted.surface
+        row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
+        row |= {"best run": float(plain(surface.best_seen)), "predicted": float(plain(predicted.best.predicted))}
+        found = _confirm(
+            alone, predicted, out, executor, keep=keep, report=report, file=f"confirmation-{recording}.csv"
+        )
+        if isinstance(found, str):
+            rows.append(row | {"held": found})
+            continue
+        row |= {"measured": float(plain(found.measured)), "best point": float(plain(found.best_point))}
+        warned = "no" if predicted.judgement.credible else "yes"
+        rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
+    each = pd.DataFrame(rows)
+    each.to_csv(out / "each.csv", index=False)
+    return each
 
 
 def _confirm(
@@ -87,6 +129,7 @@ def _confirm(
     *,
     keep: bool,
     report: Callable[[Progress], None],
+    file: str = "confirmation.csv",
 ) -> "Confirmation | str":
     """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
@@ -99,7 +142,7 @@ def _confirm(
     conduct([*at_optimum, *at_best], out, executor, keep=keep, report=report)
     tables = [table_of(at_optimum, out), table_of(at_best, out)]
     pd.concat(tables, keys=["optimum", "best point of the design"], names=["at"]).reset_index("at").to_csv(
-        out / "confirmation.csv", index=False
+        out / file, index=False
     )
     try:
         measured, best = (usable(table, name, name in plan.log) for table in tables)
@@ -120,6 +163,7 @@ def write_report(
     out: Path,
     workers: int,
     state: Progress | None = None,
+    each: Table | None = None,
 ) -> str:
     """Write report.md and report.html; return the outcome in words."""
     from dudmap.pipeline.environment import machine, versions
@@ -145,8 +189,13 @@ def write_report(
             report.text(f"{error}.")
         if name == plan.responses[0]:
             analysis.describe_confirmation(report, confirmation)
+            if each is not None:
+                report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
+                report.table(each)
     if plan.options.kind == "plackett-burman":
-        analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log).to_csv(out / "effects.csv", index=False)
+        analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log).to_csv(
+            out / "effects.csv", index=False
+        )
     analysis.describe_pareto(report, table, plan.factors, plan.responses)
     analysis.describe_points(report, table, plan.factors, plan.responses)
     analysis.describe_failures(report, table)
