@@ -121,6 +121,11 @@ def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
 def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded:
     from pyDOE3 import pbdesign
 
+    for factor in factors:
+        if len(factor.levels) > 2:
+            raise ConfigError(
+                f"a plackett-burman design has two levels, but {factor.key} has {len(factor.levels)}; give it a range"
+            )
     runs = 4 * (len(factors) // 4 + 1)
     while True:  # pyDOE3 knows the sizes 2^n, 12 2^n and 20 2^n
         try:
