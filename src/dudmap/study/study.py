@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 from dudmap.errors import ConfigError
 from dudmap.study.conduct import Progress, conduct, table_of
+from dudmap.study.effects import effects_by_recording
 from dudmap.study.executor import Executor
 from dudmap.study.plan import MAX_RUNS, Plan, sequence_names
 from dudmap.study.tables import Table
@@ -192,6 +193,10 @@ def write_report(
             if each is not None:
                 report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
                 report.table(each)
+                levels = effects_by_recording(analysis.usable(table, name, name in plan.log), plan.factors, name)
+                levels.to_csv(out / "levels.csv", index=False)
+                report.text(f"Mean {analysis.heading_of(name, name in plan.log)} at every level:")
+                report.table(levels)
     if plan.options.kind == "plackett-burman":
         analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log).to_csv(
             out / "effects.csv", index=False
