@@ -124,8 +124,8 @@ def of_driver(count: int, address: str) -> None:
         cpu, wall = time.process_time() - begin, time.monotonic() - wall
         executor.close()
     where = f"Ray, {executor.workers} at a time" if address else "in this process, the run folders included"
-    print(f"{count} runs that do nothing ({where}): {1000 * cpu / count:.2f} ms of the driver's processor time per run; "
-          f"making the list of runs {1000 * made / count:.2f} ms per run; {wall:.0f} s in all")  # fmt: skip
+    print(f"{count} empty runs ({where}): {1000 * cpu / count:.2f} ms of the driver's processor time per run, "
+          f"{1000 * made / count:.2f} ms to make the list of runs; {wall:.0f} s in all")  # fmt: skip
 
 
 if __name__ == "__main__":

@@ -25,7 +25,7 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
 
     tree = {
         "factors": {"tracker.huber": LEVELS},
-        "sequences": [{**ROOM, "name": name} for name in ("near", "far", "trap")],
+        "sequences": [{**ROOM, "name": name, "seed": 10 * n} for n, name in enumerate(("near", "far", "trap"))],
         "responses": ["ate"],
         "each": True,
         "confirm": 1,

@@ -33,6 +33,8 @@ class RayExecutor:
             ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="error")
         except (ConnectionError, ValueError) as error:
             raise ConfigError(f"there is no Ray cluster at {address}: {error}") from None
+        except ImportError as error:  # ray:// needs the client of Ray
+            raise ConfigError(f"ray lacks its client ({error}); pip install 'dudmap[cluster]'") from None
         self._ray = ray
         self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(_perform)  # retries: dudmap.study.conduct
         self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
