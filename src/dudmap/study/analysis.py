@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MOST_FAILURES = 10
 """Failed runs that a report lists one by one."""
+ENOUGH_TRACKED = 0.9
+"""Share of the frames below which a run is named among those that lost frames."""
 MOST_POINTS = 100
 """Points of a design whose means a report lists; runs.csv holds those of larger ones."""
 MOST_INTERACTION_FACTORS = 6
@@ -265,6 +267,21 @@ def describe_points(report: Report, table: Table, factors: Sequence[Factor], nam
     if 0 < len(points) <= MOST_POINTS:
         report.heading("Means of all points over the recordings")
         report.table(points)
+
+
+def describe_losses(report: Report, table: Table) -> None:
+    """Add the runs that lost many frames: errors are those of the tracked frames only, and may be small for that."""
+    if "tracked_share" not in table:
+        return
+    partial = table[table["tracked_share"] < ENOUGH_TRACKED]
+    if partial.empty:
+        return
+    report.heading("Runs that lost frames")
+    report.text(f"{len(partial)} of {len(table)} runs tracked less than {ENOUGH_TRACKED:.0%} of the frames. Trajectory "
+                "errors are those of the tracked frames, so that such a run may look better than one that tracks all: "
+                "read them together with the response lost.")  # fmt: skip
+    counts = partial.groupby("sequence", sort=False).size()
+    report.items(f"{name}: {count} of {(table['sequence'] == name).sum()}" for name, count in counts.items())
 
 
 def describe_failures(report: Report, table: Table) -> None:

@@ -14,12 +14,18 @@ if TYPE_CHECKING:
 
     from dudmap.study.response_surface import Optimum, Surface
 
+COLORS = 64
+"""Colours of the palette of a figure."""
+
 
 def png(figure: "Figure") -> bytes:
-    """PNG file of a figure."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    """PNG file of a figure, with a palette: lines and text on white need no more, and it is a quarter of the size."""
+    from PIL import Image
+
+    drawn, out = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=110)
+    Image.open(drawn).convert("RGB").quantize(COLORS).save(out, format="PNG", optimize=True)
+    return out.getvalue()
 
 
 def _axes(rows: int, columns: int, width: float = 3.0, height: float = 2.6) -> "tuple[Figure, Any]":

@@ -88,8 +88,8 @@ def confirm_each(
     """Model, optimum and confirmation of every recording on its own; also written to each.csv.
 
     One row per recording: values of the factors at the optimum, R2 of the model, R2 when each run is left out in turn,
-    prediction, mean of the confirmation runs, best point of the design on the same recordings, whether the model held,
-    and whether anything spoke against it before.
+    prediction, mean of the confirmation runs, best point of the design on the same recordings, frames lost in the
+    confirmation runs, whether the model held, and whether anything spoke against it before.
     """
     import numpy as np
     import pandas as pd
@@ -108,13 +108,14 @@ def confirm_each(
         surface = predicted.surface
         row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
         row |= {"best run": float(plain(surface.best_seen)), "predicted": float(plain(predicted.best.predicted))}
-        found = _confirm(
-            alone, predicted, out, executor, keep=keep, report=report, file=f"confirmation-{recording}.csv"
-        )
+        file = f"confirmation-{recording}.csv"
+        found = _confirm(alone, predicted, out, executor, keep=keep, report=report, file=file)
         if isinstance(found, str):
             rows.append(row | {"held": found})
             continue
         row |= {"measured": float(plain(found.measured)), "best point": float(plain(found.best_point))}
+        runs = pd.read_csv(out / file)
+        row["lost at the optimum"] = float(runs.loc[runs["at"] == "optimum", "lost"].mean())
         warned = "no" if predicted.judgement.credible else "yes"
         rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
     each = pd.DataFrame(rows)
@@ -203,6 +204,7 @@ def write_report(
         )
     analysis.describe_pareto(report, table, plan.factors, plan.responses)
     analysis.describe_points(report, table, plan.factors, plan.responses)
+    analysis.describe_losses(report, table)
     analysis.describe_failures(report, table)
     report.save(out)
     return outcome(predicted, confirmation)
