@@ -69,7 +69,7 @@ def of_folder(count: int) -> None:
     sys.addaudithook(lambda event, _: events.update([event]) if event in IMPORTANT else None)
     runs = empty_plan(count).runs()
     with tempfile.TemporaryDirectory(prefix="study-overhead-") as root:
-        store, times = StudyFolder(root), []
+        store, times, found = StudyFolder(root), [], ""
         store.create()
         perform(Job(runs[0], Path(root), do=nothing))  # imports
         for n, run in enumerate(runs[1:]):

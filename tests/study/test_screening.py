@@ -10,7 +10,7 @@ from dudmap.study.designs import DesignOptions, points_of
 from dudmap.study.factors import configured, make_factors, value_of
 from dudmap.study.plan import make_plan
 from dudmap.study.report import Report
-from dudmap.study.screening import bounds_of, describe_screening, screen, which_matter
+from dudmap.study.screening import bounds_of, describe_screening, screen, summary, which_matter
 
 
 def factors_of(**changed):
@@ -112,6 +112,8 @@ def test_the_report_names_keys_that_matter_and_a_response_that_never_varies_has_
     assert f"2 of {len(plan.factors)} keys have an effect on ate" in text
     assert "volume.voxel_size" in text
     assert f"0 of {len(plan.factors)} keys have an effect on ms" in text
+    words = summary(pd.concat(effects, names=["response"]).reset_index("response"))
+    assert words.startswith(f"2 of {len(plan.factors)} keys have a significant effect:\nate: volume.voxel_size")
     found = which_matter(effects).set_index("key")
     assert set(found.dropna(how="all").index) == {"volume.voxel_size", "dynamics.margin_px"}
 

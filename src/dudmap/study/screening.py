@@ -152,6 +152,18 @@ def describe_screening(report: "Report", effects: Table, heading: str) -> None:
     )
 
 
+def summary(effects: Table) -> str:
+    """Which keys matter for which response, in words; the table has the columns of ``screen`` and ``response``."""
+    if effects.empty:
+        return "No response could be screened."
+    sure = effects[effects["p"] < FALSE_SHARE]
+    lines = [f"{sure['key'].nunique()} of {effects['key'].nunique()} keys have a significant effect:"]
+    for name, part in sure.groupby("response", sort=False):
+        order = part.groupby("key")["relative"].agg(lambda column: column.abs().max()).sort_values(ascending=False)
+        lines.append(f"{name}: {', '.join(order.index)}")
+    return "\n".join(lines)
+
+
 def which_matter(effects: Mapping[str, Table]) -> Table:
     """For every key, the largest effect on each response in standard deviations of the residual; NaN if none is sure.
 

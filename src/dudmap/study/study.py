@@ -169,7 +169,7 @@ def write_report(
 ) -> str:
     """Write report.md and report.html; return the outcome in words."""
     from dudmap.pipeline.environment import machine, versions
-    from dudmap.study import analysis
+    from dudmap.study import analysis, screening
     from dudmap.study.report import Report
 
     report = Report(f"Study {plan.name}")
@@ -198,16 +198,17 @@ def write_report(
                 levels.to_csv(out / "levels.csv", index=False)
                 report.text(f"Mean {analysis.heading_of(name, name in plan.log)} at every level:")
                 report.table(levels)
+    effects = None
     if plan.options.kind == "plackett-burman":
-        analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log).to_csv(
-            out / "effects.csv", index=False
-        )
-    analysis.describe_pareto(report, table, plan.factors, plan.responses)
-    analysis.describe_points(report, table, plan.factors, plan.responses)
+        effects = analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log)
+        effects.to_csv(out / "effects.csv", index=False)
+    else:
+        analysis.describe_pareto(report, table, plan.factors, plan.responses)
+        analysis.describe_points(report, table, plan.factors, plan.responses)
     analysis.describe_losses(report, table)
     analysis.describe_failures(report, table)
     report.save(out)
-    return outcome(predicted, confirmation)
+    return outcome(predicted, confirmation) if effects is None else screening.summary(effects)
 
 
 def outcome(predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:
