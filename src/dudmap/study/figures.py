@@ -28,11 +28,13 @@ def png(figure: "Figure") -> bytes:
     return out.getvalue()
 
 
-def _axes(rows: int, columns: int, width: float = 3.0, height: float = 2.6) -> "tuple[Figure, Any]":
+def _axes(
+    rows: int, columns: int, width: float = 3.0, height: float = 2.6, same_y: bool = False
+) -> "tuple[Figure, Any]":
     from matplotlib.figure import Figure
 
     figure = Figure((max(width * columns, 4.0), max(height * rows, 3.0)), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    return figure, figure.subplots(rows, columns, squeeze=False, sharey=same_y)
 
 
 def _label(level: object) -> str:
@@ -42,7 +44,7 @@ def _label(level: object) -> str:
 def main_effects_figure(effects: Table, heading: str) -> bytes:
     """Mean response at every level of every factor with its confidence interval."""
     keys = list(dict.fromkeys(effects["factor"]))
-    figure, axes = _axes(1, len(keys))
+    figure, axes = _axes(1, len(keys), same_y=True)
     for ax, key in zip(axes[0], keys, strict=True):
         part = effects[effects["factor"] == key]
         x = np.arange(len(part))
@@ -51,7 +53,6 @@ def main_effects_figure(effects: Table, heading: str) -> bytes:
         ax.set_xticks(x, [_label(level) for level in part["level"]])
         ax.axhline(np.average(part["mean"], weights=part["runs"]), color="0.7", lw=0.8, zorder=0)
         ax.set_xlabel(key.rpartition(".")[2])
-        ax.sharey(axes[0][0])
     axes[0][0].set_ylabel(heading)
     return png(figure)
 
@@ -101,7 +102,7 @@ def residuals_figure(surface: "Surface") -> bytes:
 def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
     """Prediction along every factor through the optimum, with the interval of the mean."""
     count = len(surface.factors)
-    figure, axes = _axes(1, count)
+    figure, axes = _axes(1, count, same_y=True)
     for n, (ax, factor) in enumerate(zip(axes[0], surface.factors, strict=True)):
         coded = np.tile(best.coded, (41, 1))
         coded[:, n] = np.linspace(-1, 1, 41)
@@ -112,7 +113,6 @@ def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
         ax.axvline(best.values[factor.key], color="0.6", lw=0.8, ls="--")
         ax.set_xscale(factor.scale)
         ax.set_xlabel(factor.name)
-        ax.sharey(axes[0][0])
     axes[0][0].set_ylabel(f"predicted {heading}")
     return png(figure)
 
