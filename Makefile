@@ -7,6 +7,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 PIP := $(PYTHON) -m pip --python $(BIN)/python --disable-pip-version-check
 # uses only what the lock file has installed, and fails where pyproject.toml asks for more
+CLEAN := $(PYTHON) -m pip --python build/clean/bin/python --disable-pip-version-check install --quiet
 SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
 	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
@@ -15,7 +16,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --for
 # than a few processes gain nothing
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all check processors lock clean
+.PHONY: demo test test-all check docs package processors fuzz fuzz-guided audit licences lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -31,8 +32,42 @@ check: .venv/developed
 	$(BIN)/ruff format --check
 	$(BIN)/pyright --pythonpath $(BIN)/python
 
+docs: .venv/developed
+	$(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs docs/_build/html
+
+# wheel (from the sdist) and sdist, and the wheel in an environment that has nothing but what it requires
+package: .venv/developed
+	rm -rf dist build/clean
+	$(BIN)/python -m build --no-isolation --outdir dist
+	$(BIN)/twine check --strict dist/*
+	$(PYTHON) -m venv --without-pip build/clean
+	$(CLEAN) --requirement requirements/run.txt
+	$(CLEAN) --no-index --no-deps dist/*.whl
+	cd build/clean && bin/dudmap --version && bin/dudmap demo --help >/dev/null && bin/dudmap config >/dev/null && \
+		bin/python -c 'import dudmap; [getattr(dudmap, name) for name in dudmap.__all__]'
+
 processors: .venv/developed
 	$(BIN)/python benchmarks/processors.py
+
+# hostile files for all loaders: make fuzz SECONDS=60 LOADERS="bag,map", see docs/reliability.md
+SECONDS ?= 60
+LOADERS ?=
+fuzz: .venv/developed
+	$(BIN)/python tests/fuzz/campaign.py --seconds $(SECONDS) --loaders "$(LOADERS)"
+
+# the same for one loader, guided by coverage: make fuzz-guided LOADER=sens
+LOADER ?= sens
+fuzz-guided: .venv/developed
+	$(PIP) install --quiet atheris
+	$(BIN)/python tests/fuzz/guided.py "$(LOADER)" -max_total_time=$(SECONDS)
+
+# known weaknesses of the packages in the lock file; asks the service of PyPI or OSV, so it needs the network
+audit: $(BIN)/python
+	$(PIP) install --quiet pip-audit
+	$(BIN)/pip-audit --requirement requirements/run.txt --require-hashes --disable-pip
+
+licences: .venv/installed
+	$(BIN)/dudmap doctor --licences
 
 lock: $(BIN)/python
 	$(PIP) install --quiet --upgrade uv
@@ -40,7 +75,7 @@ lock: $(BIN)/python
 	$(COMPILE) --constraint requirements/dev.txt --output-file requirements/run.txt
 
 clean:
-	rm -rf .venv .numba_cache
+	rm -rf .venv .numba_cache build dist docs/_build
 
 $(BIN)/python:
 	@$(PYTHON) -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))' || \

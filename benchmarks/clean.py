@@ -1,9 +1,11 @@
 """Recordings without their people against their true static twins.
 
-python benchmarks/clean.py [--data FOLDER] [--work FOLDER] [--passes N] [--pictures FOLDER] [--out FILE.json]
+python benchmarks/clean.py [--data FOLDER] [--with-person RECORDING] [--work FOLDER] [--passes N] [--only TEXT]
+    [--pictures FOLDER] [--out FILE.json]
 
 Synthetic worlds are rendered with and without movers; of the recordings under --data those count that have a static
-twin (NAME_confusao and NAME_static). Each is run with its own labels, then cleaned as `dudmap clean` does. Scored are
+twin (NAME_confusao and NAME_static); into a recording --with-person, of a place where nothing moves, a rendered person
+is put who walks before the camera. Each is run with its own labels, then cleaned as `dudmap clean` does. Scored are
 the pixels that show something that moves (true mask) and whose background another frame of the recording shows, judged
 by true poses and the depth of the twin: the share that was filled, PSNR of the colour (dB), and RMSE and median of the
 depth error (mm). For comparison the same of the recording as it is.
@@ -41,8 +43,62 @@ TOLERANCE = 0.03
 """A surface is the same if its depths agree within this share."""
 
 
-def pairs(data: Path | None):
+class WithPerson:
+    """A recording of a place where nothing moves, with a rendered person who walks before its camera.
+
+    Args:
+        sequence: The recording.
+        frames: Number of frames, taken evenly.
+    """
+
+    calibration = None
+
+    def __init__(self, sequence, frames=120):
+        self._sequence = sequence
+        self._chosen = np.linspace(0, len(sequence) - 1, min(frames, len(sequence))).astype(int)
+        self.name, self.camera, self.format = f"{sequence.name} with a person", sequence.camera, sequence.format
+        self.timestamps, self.ground_truth = sequence.timestamps[self._chosen], sequence.ground_truth
+        straight = replace(sequence.camera, distortion=())
+        self._person = synthetic.sequence(
+            "room", movers=["person"], camera_path="still", frames=len(self._chosen), camera=straight, seed=1
+        )
+
+    def __len__(self):
+        return len(self._chosen)
+
+    def twin_frame(self, index):
+        """The frame as it was recorded."""
+        return self._sequence[int(self._chosen[index])]
+
+    def mask(self, index):
+        """Pixels that show the person."""
+        depth, behind = self._person[index].depth, self.twin_frame(index).depth
+        return self._person.mask(index) & (depth > 0) & ((behind == 0) | (depth < behind))
+
+    def __getitem__(self, index):
+        frame, person, mask = self.twin_frame(index), self._person[index], self.mask(index)
+        return replace(
+            frame,
+            depth=np.where(mask, person.depth, frame.depth).astype(np.float32),
+            color=np.where(mask[..., None], person.color, frame.color),
+        )
+
+
+class Chosen:
+    """The frames of a recording that ``WithPerson`` takes."""
+
+    def __init__(self, sequence):
+        self._sequence = sequence
+
+    def __getitem__(self, index):
+        return self._sequence.twin_frame(index)
+
+
+def pairs(data: Path | None, with_person: list[Path], frames: int):
     """Name, recording and static twin."""
+    for folder in with_person:
+        sequence = WithPerson(open_sequence(folder), frames)
+        yield sequence.name, sequence, Chosen(sequence)
     for name, arguments in WORLDS.items():
         sequence = synthetic.sequence(camera=CAMERA, **arguments)
         yield name, sequence, sequence.static_twin()
@@ -126,7 +182,7 @@ def score(name, sequence, twin, work: Path, passes: int, pictures: Path | None):
         if index not in poses:
             continue
         used = seen_elsewhere(index, sequence, twin, poses, views)
-        frame, moving, background = cleaner.clean(index)
+        frame, moving, _, background = cleaner.clean(index)
         truth = twin[index]
         missed = used & ~moving
         color = np.where(missed[..., None], frame.color, background.color)
@@ -160,6 +216,8 @@ def main():
     """Print one line for each recording."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--data", type=Path, help="folder with recordings NAME_confusao and NAME_static")
+    parser.add_argument("--with-person", type=Path, action="append", default=[], help="static recording; repeatable")
+    parser.add_argument("--frames", type=int, default=120, help="of the recordings --with-person, taken evenly")
     parser.add_argument("--work", type=Path, help="keeps the run folders here, and uses those that are here already")
     parser.add_argument("--only", help="only the recordings whose name holds this")
     parser.add_argument("--passes", type=int, default=2)
@@ -169,7 +227,7 @@ def main():
     rows = []
     with tempfile.TemporaryDirectory() as temporary:
         work = arguments.work or Path(temporary)
-        for name, sequence, twin in pairs(arguments.data):
+        for name, sequence, twin in pairs(arguments.data, arguments.with_person, arguments.frames):
             if arguments.only is None or arguments.only in name:
                 rows.append(score(name, sequence, twin, work, arguments.passes, arguments.pictures))
                 print(json.dumps(rows[-1]), flush=True)

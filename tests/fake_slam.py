@@ -31,6 +31,7 @@ class FakeResult:
     relocalized: bool = False
     corrected: bool = False
     blind: bool = False
+    submap: int = 0
     uncertain: str = ""
     balance: None = None
     calibrated: bool = False

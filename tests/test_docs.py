@@ -18,7 +18,7 @@ from dudmap.config import Config, keys
 from dudmap.sequences import readers
 
 ROOT = Path(__file__).parent.parent
-PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 EXCERPT = ROOT / "tests" / "fixtures" / "freiburg1_xyz"
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 
@@ -34,6 +34,8 @@ def shown_commands():
             for line in block.splitlines():
                 if line.startswith("dudmap "):
                     yield pytest.param(line.partition("#")[0].strip(), id=f"{page.name}: {line[:60]}")
+    for line in re.findall(r"`(dudmap [^`]+)`", (ROOT / "docs" / "how-to.md").read_text(encoding="utf-8")):
+        yield pytest.param(line, id=f"how-to.md: {line[:60]}")
 
 
 def program(*arguments, cwd):
@@ -64,7 +66,7 @@ def test_links_lead_somewhere(page):
 
 def test_every_page_is_in_the_index():
     index = (ROOT / "docs" / "README.md").read_text(encoding="utf-8")
-    for page in PAGES[2:]:
+    for page in PAGES[3:]:
         assert page.name == "README.md" or f"({page.name})" in index
 
 

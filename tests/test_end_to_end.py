@@ -78,4 +78,4 @@ def test_warmup_goes_through_every_part():
     result = CliRunner().invoke(app, ["warmup"])
     assert result.exit_code == 0, result.output
     for part in ("synthetic frames", "tracking, labels and map", "mesh", "view", "map file", "ready after"):
-        assert part in result.stderr
+        assert part in result.output

@@ -14,7 +14,9 @@ from typing import Any, Literal
 import tomli_w
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
+from dudmap.atomic_file import write_text
 from dudmap.errors import ConfigError
+from dudmap.input_files import parse_toml, read_toml
 from dudmap.presets import PRESETS
 
 
@@ -337,7 +339,7 @@ class Config(ConfigSection):
             ConfigError: The file is missing, not TOML, or holds an unknown key or an invalid value.
         """
         try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
             raise ConfigError(f"cannot read the configuration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
@@ -392,7 +394,7 @@ class Config(ConfigSection):
 
     def save(self, path: str | Path) -> None:
         """Write all values as TOML."""
-        Path(path).write_text(self.to_toml(), encoding="utf-8")
+        write_text(path, self.to_toml())
 
 
 def keys() -> list[str]:
@@ -424,6 +426,6 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 def _value(text: str) -> Any:  # noqa: ANN401 - TOML values have many types
     try:
-        return tomllib.loads(f"value = {text}")["value"]
+        return parse_toml(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:
         return text

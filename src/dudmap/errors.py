@@ -3,9 +3,25 @@
 A message is one sentence that states what was found, what was expected and how to correct it.
 """
 
+import re
+
+LARGEST_MESSAGE = 2000
+"""Characters of a message; a damaged file may hold one line of a hundred megabytes, which messages quote."""
+_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
+
 
 class DudmapError(Exception):
-    """Base class of all errors of dudmap; the command line prints them without a traceback."""
+    """Base class of all errors of dudmap; the command line prints them without a traceback.
+
+    Control characters in a message, such as a line break or a terminal's escape sequence in the name of a file, are
+    written as escapes, so that it stays one line that shows what it says.
+    """
+
+    def __init__(self, message: object = "") -> None:
+        text = str(message)
+        if len(text) > LARGEST_MESSAGE:
+            text = f"{text[: LARGEST_MESSAGE // 2]} ... {text[-LARGEST_MESSAGE // 2 :]}"
+        super().__init__(_UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text))
 
 
 class ConfigError(DudmapError):
@@ -20,9 +36,21 @@ class FrameError(DatasetError):
     """One frame of a recording cannot be read; the other frames may be valid."""
 
 
+class MissingExtraError(ConfigError):
+    """A library of an extra is not installed; the sentence names the extra."""
+
+
 class CameraError(DudmapError):
     """A camera or its driver is missing, or the camera stopped to deliver frames."""
 
 
+class InternalError(DudmapError):
+    """A defect of dudmap itself: something happened that it does not foresee, and a report of it was written."""
+
+
 class MapError(DudmapError):
     """A map or mesh is invalid, or cannot be loaded or saved."""
+
+
+class StateError(DudmapError):
+    """The stored state of a run is missing, damaged or of another version, or the run cannot be continued."""

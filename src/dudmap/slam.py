@@ -2,6 +2,8 @@
 
 import time
 from dataclasses import replace
+from pathlib import Path
+from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +16,13 @@ from dudmap.dynamics.detector import DynamicDetector
 from dudmap.dynamics.masks import full_mask, grown_mask
 from dudmap.errors import ConfigError
 from dudmap.frames.depth_correction import DepthCorrection
-from dudmap.frames.frame import Frame
+from dudmap.frames.frame import Frame, FrameArrays
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
 from dudmap.objects.object_map import RigidObject
@@ -64,6 +67,8 @@ class Slam:
         saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
             are lost until one is recognised in it, or a submap is started that is joined with it later.
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
+        max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
+            disk. It changes no result. None keeps all in memory.
     """
 
     def __init__(
@@ -76,13 +81,16 @@ class Slam:
         live: bool = False,
         saved_map: SavedMap | None = None,
         localize: bool = False,
+        max_blocks: int | MemoryLimit | None = None,
     ) -> None:
+        self.max_blocks = max_blocks
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
         self.preprocess = Preprocessor(camera, config.preprocess, calibration=given, voxel_size=voxel_size)
         self.camera = self.preprocess.camera
+        self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.tracker = Tracker(config.tracker, config.sensor)
         self.motion = MotionModel(config.tracker)
@@ -111,7 +119,7 @@ class Slam:
         self.objects = MovingObjects(config)
         self.localize = localize
         if saved_map is not None:
-            self.atlas.go_on_in(saved_map, self.camera)
+            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.restore(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
@@ -174,6 +182,29 @@ class Slam:
         poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
         return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)
 
+    def save(self, path: str | Path) -> None:
+        """Write the whole state, from which ``resume`` goes on, replacing an older file at the end.
+
+        Raises:
+            StateError: The file cannot be written.
+        """
+        from dudmap.state.system import save_system
+
+        save_system(self, Path(path))
+
+    @classmethod
+    def resume(cls, path: str | Path) -> "Slam":
+        """A system in the state that ``save`` wrote: the frames that follow give the same results, bit for bit.
+
+        The file stays open and must stay as it is while the system lives: stored frames are read from it.
+
+        Raises:
+            StateError: The file is missing, damaged, or was written by another version.
+        """
+        from dudmap.state.system import resume_system
+
+        return resume_system(Path(path))
+
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
 
@@ -199,17 +230,26 @@ class Slam:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
         return frame
 
-    def process(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameResult:
+    def process(
+        self,
+        frame: Frame | FrameView | None = None,
+        dynamic_mask: NDArray[np.bool_] | None = None,
+        **arrays: Unpack[FrameArrays],
+    ) -> FrameResult:
         """Register a frame to the map, label its dynamic pixels, fuse the static ones.
 
         Args:
             frame: Depth and colour with a timestamp later than all before; prepared or not, the result is the same.
             dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
                 from the first registration on.
+            arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
+                per metre (1000 unless set: millimetres), 0 = no reading; ``rgb`` (H, W, 3) uint8; ``timestamp`` in s.
 
         Raises:
-            DatasetError: The images do not fit the camera or each other.
+            ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
+            DatasetError: The images have another shape or type, or do not fit the camera or each other.
         """
+        frame = self._given(frame, arrays)
         view = self.color_motion.predicted(self.prepare(frame, dynamic_mask))
         if self.reference.is_empty:
             return self._start_map(view)
@@ -241,6 +281,12 @@ class Slam:
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _given(self, frame: Frame | FrameView | None, arrays: FrameArrays) -> Frame | FrameView:
+        """The frame as it was given, or made of arrays."""
+        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -408,4 +454,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        return TsdfVolume(self.camera, self.config.volume, self.config.sensor, self.config.preprocess.depth_max)
+        config = self.config
+        return TsdfVolume(
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, max_blocks=self.max_blocks
+        )

@@ -7,17 +7,10 @@ from dudmap.geometry import se3
 from dudmap.mapping.incremental_mesh import EDGE, IncrementalMesh
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.volume_mirror import VolumeMirror
+from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1})
-
-
-def triangles(mesh):
-    """Positions, colours and normals (n, 27) of all triangles in a fixed order, corners rotated to begin alike."""
-    rows = np.concatenate([mesh.vertices, mesh.colors, mesh.normals], axis=1)[mesh.faces]
-    first = np.lexsort((rows[:, :, 2].T, rows[:, :, 1].T, rows[:, :, 0].T), axis=0)[0]
-    rows = np.take_along_axis(rows, ((first[:, None] + np.arange(3)) % 3)[..., None], axis=1).reshape(-1, 27)
-    return rows[np.lexsort(rows.T[::-1])]
 
 
 def assert_equal(live, volume):

@@ -4,6 +4,8 @@ import json
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from dudmap.config import Config, VolumeConfig
 from dudmap.errors import ConfigError, DudmapError, MapError
@@ -12,7 +14,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.block_sums import block_sums, fused
+from dudmap.merging.block_sums import BlockSums, block_sums, fused
 from dudmap.merging.map_fusion import fuse_maps
 from dudmap.merging.map_merging import compare_maps
 from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
@@ -64,21 +66,31 @@ def words(volume):
     return blocks.coords[: blocks.num_entries][order], blocks.free_count[: blocks.num_entries][order], geometry, colors
 
 
-def test_any_order_and_grouping_of_the_sums_gives_the_same_voxels():
+@pytest.fixture(scope="module")
+def sums_of_walls():
     rng = np.random.default_rng(0)
     volumes = [wall(1.5 + 0.004 * k, grey=60 + 20 * k, poses=[shifted(*rng.uniform(-0.4, 0.4, 2))]) for k in range(5)]
     coords = np.unique(np.concatenate([v.blocks.coords[: v.blocks.num_entries] for v in volumes]), axis=0)
     Ts = [None, se3.exp(np.array([0.01, 0, 0, 0, 0.02, 0])), None, None, se3.exp(np.array([0, 0.02, 0, 0.01, 0, 0]))]
     unit = volumes[0].sdf_unit
-    sums = [block_sums(v, coords.astype(np.int32), T, unit) for v, T in zip(volumes, Ts, strict=True)]
-    expected = fused(((sums[0] + sums[1]) + (sums[2] + sums[3])) + sums[4], 1000, 4, 4)
-    for order in ([4, 3, 2, 1, 0], [2, 0, 4, 1, 3]):
-        total = sums[order[0]]
-        for number in order[1:]:
-            total = sums[number] + total
-        found = fused(total, 1000, 4, 4)
-        for name in ("geometry", "colors", "has_voxels", "free_count"):
-            np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
+    return [block_sums(v, coords.astype(np.int32), T, unit) for v, T in zip(volumes, Ts, strict=True)]
+
+
+def total_of(parts):
+    total = BlockSums.zeros(parts[0].coords)
+    for part in parts:
+        total.add(np.arange(len(part.coords)), part)
+    return total
+
+
+@given(order=st.permutations(range(5)), cut=st.integers(1, 4))
+@settings(max_examples=10, deadline=None)
+def test_any_order_and_grouping_of_the_sums_gives_the_same_voxels(sums_of_walls, order, cut):
+    expected = fused(total_of(sums_of_walls), 1000, 4, 4)
+    groups = [total_of([sums_of_walls[number] for number in part]) for part in (order[:cut], order[cut:])]
+    found = fused(total_of(groups), 1000, 4, 4)
+    for name in ("geometry", "colors", "has_voxels", "free_count"):
+        np.testing.assert_array_equal(getattr(found, name), getattr(expected, name))
 
 
 def test_a_map_fused_alone_stays_as_it_is_and_orders_do_not_matter():

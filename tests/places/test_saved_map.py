@@ -82,12 +82,14 @@ def test_bad_folders_are_refused_with_a_reason(tmp_path):
     with pytest.raises(ConfigError, match=r"has voxels of 0\.01 m, the run is to have 0\.02 m; set"):
         SavedMap.load(tmp_path, 0.02)
     path = tmp_path / KEYFRAME_FILE
+    nothing = {"counts": np.zeros(0, int), "timestamps": np.zeros(0), "Ts_world_camera": np.zeros((0, 4, 4))}
+    nothing |= {"points": np.zeros((0, 3)), "descriptors": np.zeros((0, 128))}
     for changes, reason in (
         ({"format": "dudmap keyframes 2"}, "has version 2 and this program reads up to 1; update dudmap"),
         ({"format": "something else"}, "is no keyframe file of dudmap"),
         ({"counts": np.array([3, 0, 4])}, "differ in number"),
         ({"voxel_size": 0.03}, "is mixed up"),
-        ({"counts": np.zeros(0, int), "points": np.zeros((0, 3)), "timestamps": np.zeros(0)}, "holds no keyframe, so"),
+        (nothing, "holds no keyframe, so"),
     ):
         saved(tmp_path)
         rewritten(path, **changes)

@@ -10,7 +10,7 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from bags import START, BagWriter, millimetres, write_bag
-from dudmap.errors import DatasetError, FrameError
+from dudmap.errors import DatasetError, FrameError, MissingExtraError
 from dudmap.geometry import se3
 from dudmap.sequences import open_sequence
 from dudmap.sequences.bag import RosBag
@@ -260,7 +260,7 @@ def test_a_damaged_bag_is_one_sentence(tmp_path, kind):
 def test_rosbags_missing_is_one_sentence(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "a.bag", "ros1")
     monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
-    with pytest.raises(DatasetError, match=r"the package rosbags is needed; .*'dudmap\[ros-bags\]'"):
+    with pytest.raises(MissingExtraError, match=r'the ROS bag .* needs the extra ros-bags .*"dudmap\[ros-bags\]"'):
         open_sequence(path)
 
 

@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.errors import DatasetError, FrameError
+from dudmap.errors import DatasetError, FrameError, MissingExtraError
 from dudmap.sequences import open_sequence
 
 COLOR_SIZE, DEPTH_SIZE = (96, 128), (24, 32)
@@ -79,5 +79,5 @@ def test_defects_are_one_sentence(tmp_path):
 def test_lzfse_missing_is_one_sentence(tmp_path, monkeypatch):
     path = write_r3d(tmp_path / "a.r3d", pack=bytes)
     monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
-    with pytest.raises(DatasetError, match=r"needs the package lzfse .*'dudmap\[record3d\]'"):
+    with pytest.raises(MissingExtraError, match=r'needs the extra record3d .*"dudmap\[record3d\]"'):
         open_sequence(path)

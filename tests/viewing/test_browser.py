@@ -1,9 +1,8 @@
 """Both pages in a real browser: they load without errors, draw something, and react.
 
-Needs the program of a Chromium in DUDMAP_CHROMIUM, and the package playwright.
+Needs the package playwright and a Chromium, on the PATH (on Debian: apt install chromium) or named by DUDMAP_CHROMIUM.
 """
 
-import os
 import socket
 import time
 
@@ -11,17 +10,17 @@ import cv2
 import numpy as np
 import pytest
 
+from browsers import SOFTWARE, find_chromium
 from dudmap.viewing.report import write_report
 from dudmap.viewing.run_files import RunFiles
 from run_folders import write_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
-CHROMIUM = os.environ.get("DUDMAP_CHROMIUM")
+CHROMIUM = find_chromium()
 pytestmark = [
     pytest.mark.browser,
-    pytest.mark.skipif(not CHROMIUM, reason="DUDMAP_CHROMIUM does not name the program of a Chromium"),
+    pytest.mark.skipif(not CHROMIUM, reason="no Chromium on the PATH, and DUDMAP_CHROMIUM names none"),
 ]
-SOFTWARE = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
 
 
 class Tab:
@@ -205,3 +204,11 @@ def test_a_live_window_grows(browser, window):
     assert window._shown == 12
     assert window._slider.max == 12
     assert window._state.content.endswith("50% moves")
+
+
+def test_the_window_tells_a_browser_without_webgl(driver, window):
+    browser = driver.chromium.launch(executable_path=CHROMIUM, args=["--no-sandbox", "--disable-3d-apis"])
+    page = browser.new_page()
+    page.goto(window.url)
+    page.wait_for_selector("text=WebGL is unavailable", timeout=30000)
+    browser.close()

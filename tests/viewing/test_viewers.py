@@ -177,7 +177,7 @@ def test_a_missing_extra_is_named(slam, tmp_path, monkeypatch, package, argument
     monkeypatch.setitem(sys.modules, package, None)
     done = CliRunner().invoke(app, ["run", str(write_recording(tmp_path / "desk", 3)), *arguments])
     assert done.exit_code == 1
-    assert f"pip install '{extra}'" in done.stderr
+    assert f'pip install "{extra}"' in done.stderr
     assert not (tmp_path / "runs").exists()
 
 

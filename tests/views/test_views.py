@@ -12,12 +12,12 @@ from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting.run_content import RunContent
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
+from dudmap.geometry.lens import Lens
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import open_sequence
 from dudmap.sequences.images import read_mask
 from dudmap.views.background import BackgroundRenderer, continued, exposure_gain
-from dudmap.views.cleaning import clean_recording
-from dudmap.views.lens import Lens
+from dudmap.views.cleaning import clean_recording, unlike, with_shadow
 from dudmap.views.rendering import looking_at, orbit, render_run
 from dudmap.views.video import VideoWriter
 from exported_runs import CAMERA, make_run
@@ -93,12 +93,12 @@ def test_exposure_of_the_frame_is_kept(made, run):
     renderer = BackgroundRenderer(run.volume, CAMERA, CAMERA)
     Ts = run.trajectory.Ts_world_camera
     for index in range(0, 20, 2):
-        renderer.add(sequence[index], sequence.mask(index), Ts[index])
+        renderer.add(sequence[index], sequence.mask(index), Ts[index], Ts[index])
     frame, moving = sequence[9], np.zeros(CAMERA.shape, bool)
     moving[40:80, 60:100] = True
     dark = Frame(frame.timestamp, frame.depth, (frame.color // 2).astype(np.uint8))
-    as_it_is = renderer.render(frame, moving, Ts[9], Ts[9])
-    half = renderer.render(dark, moving, Ts[9], Ts[9])
+    as_it_is = renderer.render(frame, moving, moving, Ts[9], renderer.colors(frame, moving, Ts[9]))
+    half = renderer.render(dark, moving, moving, Ts[9], renderer.colors(dark, moving, Ts[9]))
     known = moving & as_it_is.known & half.known
     ratio = as_it_is.color[known].mean() / half.color[known].mean()
     assert ratio == pytest.approx(2, rel=0.05)
@@ -160,6 +160,36 @@ def test_unknown_colours_continue_what_is_around():
     np.testing.assert_array_equal(out[known], color[known])
     assert np.abs(out[10:30, 5:20].astype(int) - (200, 100, 0)).max() < 40
     assert (continued(color, np.zeros_like(known)) == color).all()
+
+
+def test_shadows_of_the_projector_and_feet_belong_to_what_moves():
+    moving, depth = np.zeros((60, 160), bool), np.full((60, 160), 2.0, np.float32)
+    moving[10:50, 60:80] = True
+    depth[10:50, 50:60] = 0  # the shadow
+    depth[5:8, 120:130] = 0  # a hole elsewhere
+    depth[20:24, 80:84] = 0  # a hole beside it whose background nobody knows
+    behind = np.where(np.arange(160) < 80, 3.0, 0).astype(np.float32) * np.ones((60, 1), np.float32)
+    found = with_shadow(moving, depth, behind)
+    expected = moving.copy()
+    expected[10:50, 50:60] = True
+    np.testing.assert_array_equal(found, expected)
+
+    rng = np.random.default_rng(0)
+    expected = rng.integers(80, 160, (60, 160, 3)).astype(np.uint8)
+    image = np.clip(expected + rng.normal(0, 6, expected.shape), 0, 255).astype(np.uint8)
+    image[40:50, 82:90] = 20  # a shoe
+    image[30, 100:130] = 20  # an edge that is a pixel off
+    where = np.zeros((60, 160), bool)
+    where[5:55, 80:140] = True
+    left = unlike(image, expected, where)
+    assert left[40:50, 82:90].all()
+    assert not left[30, 100:130].any()
+    assert left.sum() < 150
+    image[5:55, 80:130] = 20  # most of what is asked: usual is what the depth confirms
+    surely = np.zeros_like(where)
+    surely[5:55, 132:140] = True
+    assert unlike(image, expected, where, surely)[5:55, 80:130].mean() > 0.98
+    assert not unlike(image, expected, np.zeros_like(where)).any()
 
 
 def test_gain_needs_enough_pixels():

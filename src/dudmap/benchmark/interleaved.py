@@ -117,9 +117,9 @@ def _run_ours(folder: Path) -> Row:
     from dudmap.slam import Slam
 
     camera = Camera(**json.loads((folder / "camera.json").read_text(encoding="utf-8")))
-    depths, colors = np.load(folder / "depth.npy", mmap_mode="r"), np.load(folder / "color.npy", mmap_mode="r")
+    depths, colors = (np.load(folder / f"{kind}.npy", mmap_mode="r", allow_pickle=False) for kind in ("depth", "color"))
     slam, ms, poses = Slam(camera, Config()), [], []
-    for stamp, depth, color in zip(np.load(folder / "timestamps.npy"), depths, colors, strict=True):
+    for stamp, depth, color in zip(np.load(folder / "timestamps.npy", allow_pickle=False), depths, colors, strict=True):
         frame = Frame(float(stamp), depth.astype(np.float32) / np.float32(camera.depth_scale), np.array(color))
         start = time.perf_counter()
         result = slam.process(frame)

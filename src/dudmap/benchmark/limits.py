@@ -122,7 +122,7 @@ def measure_cells(
         list(pool.map(measure, [wanted[start : start + CHUNK] for start in range(0, len(wanted), CHUNK)]))
     return [
         {"sweep": cell.sweep, "x": cell.x, "coverage": cell.condition.coverage, "system": name}
-        | (json.loads(file.read_text()) if file.is_file() else {"error": errors.get(cell.condition)})
+        | (json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {"error": errors.get(cell.condition)})
         for cell in cells
         for name in systems
         for file in [files[cell.condition, name]]

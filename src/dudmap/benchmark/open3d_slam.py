@@ -20,8 +20,8 @@ def main() -> None:
     import open3d as o3d  # type: ignore[import-not-found]
 
     folder, voxel_size, depth_max = Path(sys.argv[1]), float(sys.argv[2]), float(sys.argv[3])
-    depths, colors = np.load(folder / "depth.npy", mmap_mode="r"), np.load(folder / "color.npy", mmap_mode="r")
-    camera = json.loads((folder / "camera.json").read_text())
+    depths, colors = (np.load(folder / f"{kind}.npy", mmap_mode="r", allow_pickle=False) for kind in ("depth", "color"))
+    camera = json.loads((folder / "camera.json").read_text(encoding="utf-8"))
     scale, band, nearest, distance = camera["depth_scale"], 8.0, 0.1, 0.07
     device = o3d.core.Device("CPU:0")
     intrinsic = o3d.core.Tensor([[camera["fx"], 0, camera["cx"]], [0, camera["fy"], camera["cy"]], [0, 0, 1]])

@@ -7,9 +7,11 @@ import numpy as np
 from numpy.polynomial.legendre import leg2poly, legvander
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file
 from dudmap.errors import DatasetError
 from dudmap.frames.depth_correction import FARTHEST, MIDDLE, NEAREST, ORDER, DepthCorrection
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, open_arrays
 
 PLACES = [(i, order - i) for order in range(2, ORDER + 1) for i in range(order + 1)]
 """Orders (i, j) of the products of Legendre polynomials P_i(x / X) P_j(y / Y), X and Y the edges of the image. They are
@@ -66,7 +68,9 @@ class DepthModel:
         Raises:
             OSError: The file cannot be written.
         """
-        np.savez(path, terms=TERMS, state=self.state, covariance=self.covariance, extent=self.extent, views=self.views)
+        values = {"state": self.state, "covariance": self.covariance, "extent": self.extent, "views": self.views}
+        with atomic_file(path) as file:
+            np.savez(file, terms=TERMS, **values)
 
     @classmethod
     def load(cls, path: Path) -> "DepthModel":
@@ -76,13 +80,13 @@ class DepthModel:
             DatasetError: The file is missing or not such a file.
         """
         try:
-            with np.load(path, allow_pickle=False) as data:
+            with open_arrays(path) as data:
                 if not np.array_equal(data["terms"], TERMS):
                     raise DatasetError(f"{path} holds a depth model of other terms than this version")
                 state, covariance = (np.asarray(data[key], np.float64) for key in ("state", "covariance"))
                 extent = np.asarray(data["extent"], np.float64)
                 views = int(data["views"])
-        except (OSError, ValueError, KeyError, EOFError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"{path} is not a readable depth model: {error}") from error
         if state.shape != (len(TERMS),) or covariance.shape != (len(TERMS),) * 2 or extent.shape != (2,):
             raise DatasetError(f"{path} is not a readable depth model: its arrays have other shapes than its terms")

@@ -4,7 +4,8 @@ from abc import ABC, abstractmethod
 from importlib import import_module
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from dudmap.errors import CameraError, FrameError
+from dudmap.errors import CameraError, FrameError, MissingExtraError
+from dudmap.extras import extra
 
 if TYPE_CHECKING:
     from dudmap.frames.frame import Frame
@@ -100,25 +101,16 @@ def _first_connected() -> LiveCamera:
         if name != "replay":
             try:
                 return open_camera(name)
-            except CameraError as error:
+            except (CameraError, MissingExtraError) as error:
                 reasons.append(f"{name}: {error}")
     raise CameraError("no camera was found; " + "; ".join(reasons))
 
 
-def driver(package: str, module: str, extra: str) -> Any:  # noqa: ANN401 - an optional package
+def driver(module: str, extra_name: str) -> Any:  # noqa: ANN401 - an optional package
     """The module of a driver.
 
     Raises:
-        CameraError: The package is not installed, or a system library that it needs is missing.
+        MissingExtraError: It is not installed, or a system library that it needs is missing.
     """
-    try:
+    with extra(extra_name, f"a camera of the kind {extra_name}"):
         return import_module(module)
-    except ModuleNotFoundError:
-        raise CameraError(
-            f"the driver {package} is not installed; install it with pip install 'dudmap[{extra}]'"
-        ) from None
-    except ImportError as error:
-        raise CameraError(
-            f"the driver {package} cannot be loaded, {error}; install the system library that it names (on Debian: apt "
-            "install libusb-1.0-0)"
-        ) from error

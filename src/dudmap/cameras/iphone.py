@@ -28,7 +28,7 @@ class IPhoneCamera(LiveCamera):
     """
 
     def __init__(self) -> None:
-        record3d = driver("record3d", "record3d", "iphone")
+        record3d = driver("record3d", "iphone")
         self.name = "iphone"
         self._arrived, self._stopped = Event(), Event()
         self._numbers = 0

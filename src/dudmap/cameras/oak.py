@@ -25,7 +25,7 @@ class OakCamera(LiveCamera):
     """
 
     def __init__(self) -> None:
-        dai = driver("depthai", "depthai", "oak")
+        dai = driver("depthai", "oak")
         self.name = "oak"
         if not dai.Device.getAllAvailableDevices():
             raise CameraError("no OAK camera is connected; plug it in, and on Linux set the udev rule of its manual")

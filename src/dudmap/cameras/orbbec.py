@@ -28,7 +28,7 @@ class OrbbecCamera(LiveCamera):
     """
 
     def __init__(self) -> None:
-        ob = driver("pyorbbecsdk2", "pyorbbecsdk", "orbbec")
+        ob = driver("pyorbbecsdk", "orbbec")
         self.name = "orbbec"
         self._closed, self._reading = Event(), Lock()
         self._numbers = 0

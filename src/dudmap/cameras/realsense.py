@@ -35,7 +35,7 @@ class RealSenseCamera(LiveCamera):
     """
 
     def __init__(self, file: str | None = None) -> None:
-        rs = self._rs = driver("pyrealsense2", "pyrealsense2", "realsense")
+        rs = self._rs = driver("pyrealsense2", "realsense")
         self.name, self._file = "realsense", file
         self._closed, self._reading, self._paused = Event(), Lock(), False
         self._last = -1

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import CameraError
+from dudmap.extras import extra
 from dudmap.geometry import se3
 
 if TYPE_CHECKING:
@@ -41,7 +42,7 @@ class Recorder:
         dropped: Number of frames for which there was no time.
 
     Raises:
-        CameraError: The file exists, has another suffix or cannot be created, or the package rosbags is missing.
+        CameraError: The file exists, has another suffix or cannot be created.
     """
 
     def __init__(self, path: Path, camera: "Camera", calibration: "Calibration | None") -> None:
@@ -183,12 +184,8 @@ class _Messages:
 
 
 def _open_writer(folder: Path) -> Any:  # noqa: ANN401 - a type of an optional package
-    try:
+    with extra("ros-bags", "recording"):
         from rosbags.rosbag2 import StoragePlugin, Writer
-    except ImportError:
-        raise CameraError(
-            "recording needs the package rosbags; install it with pip install 'dudmap[ros-bags]'"
-        ) from None
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         if folder.exists():

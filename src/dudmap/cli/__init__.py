@@ -5,7 +5,10 @@ called, so that ``dudmap --help`` is fast. Errors are printed as one sentence. E
 usage, 130 for Ctrl-C.
 """
 
+import io
+import sys
 from importlib import import_module
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -18,7 +21,7 @@ COMMANDS = {
     "run": "Turn a recording into a trajectory and a clean mesh.",
     "view": "Show a run folder in the browser.",
     "report": "Write one page on a run that opens offline.",
-    "merge": "Join the maps of two runs of one place.",
+    "merge": "Join the maps of two or more runs of one place.",
     "export": "Write the results of a run for another program.",
     "render": "Render the map along a camera path, as a video or a recording.",
     "clean": "Write a recording as it would have been without what moves.",
@@ -32,8 +35,12 @@ COMMANDS = {
     "study": "Run a designed experiment over configurations and analyse it.",
     "config": "Print all parameters with their meanings as TOML.",
     "warmup": "Compile all kernels in advance.",
+    "doctor": "Check the installation and say what to do.",
 }
 """Name and one-line help of every command, in the order of the help page."""
+
+_USAGE: type[Exception] = typer.BadParameter.__mro__[2]
+"""Base of the errors of wrong usage: ClickException, of click or of Typer itself."""
 
 
 class CommandGroup(TyperGroup):
@@ -56,6 +63,12 @@ class CommandGroup(TyperGroup):
             raise
         except OSError as error:
             fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        except (typer.Exit, typer.Abort, _USAGE):
+            raise
+        except Exception as error:  # a defect of ours, whatever it is
+            from dudmap.pipeline.crash_report import report_crash
+
+            fail(str(report_crash(error, Path.cwd())))
         except KeyboardInterrupt as interrupt:
             fail(str(interrupt) or "interrupted", code=130)
 
@@ -78,7 +91,6 @@ app = typer.Typer(
     name="dudmap",
     cls=CommandGroup,
     no_args_is_help=True,
-    add_completion=False,
     pretty_exceptions_enable=False,
     help="Dense RGB-D SLAM in dynamic scenes: estimates the camera trajectory and a mesh of the static scene.",
 )
@@ -103,4 +115,7 @@ def _dudmap(
 
 def main() -> None:
     """Entry point of the program ``dudmap``."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a character, as on Windows
     app()

@@ -1,11 +1,16 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, and speed."""
 
+import json
+from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
 from dudmap.benchmark.suites import SUITES
+from dudmap.cli.output import JsonOption, answer
+from dudmap.cli.progress import counted
 
 app = typer.Typer(
     add_completion=False,
@@ -42,6 +47,7 @@ def suite_command(
             help="Score results of another system, FOLDER/<sequence>/trajectory.txt and mesh.ply; repeatable.",
         ),
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.benchmark.report import named_folders, run_suite
@@ -52,12 +58,17 @@ def suite_command(
     wanted, others = find_systems(systems), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or Path("runs/benchmark") / name
-    typer.echo(run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome))
-    typer.echo(f"written to {out}")
+    text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
+    tree = json.loads((out / f"{suite.name}.json").read_text(encoding="utf-8"))
+    _answer(tree, text, out, as_json=as_json)
 
 
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
+
+
+def _answer(tree: dict[str, Any], text: str, out: Path, *, as_json: bool) -> None:
+    answer(tree | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
 
 
 def _print_outcome(row: dict[str, Any]) -> None:
@@ -76,6 +87,7 @@ def sensors(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure the same synthetic room with faulty sensors and named cameras, with colour, without it, and by default.
 
@@ -91,8 +103,7 @@ def sensors(
     rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
     text = color_table(rows)
     save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
-    typer.echo(text)
-    typer.echo(f"written to {out}")
+    _answer({"rows": rows}, text, out, as_json=as_json)
 
 
 @app.command()
@@ -107,6 +118,7 @@ def random(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure random worlds with random sensors: distribution of the ATE, silent failures, and the worst worlds.
 
@@ -123,8 +135,7 @@ def random(
     rows = measure_worlds(seed, numbers, Config().override(assignments or []), out, jobs, _print_world)
     text = report(rows, seed)
     (out / f"seed-{seed}.md").write_text(text, encoding="utf-8")
-    typer.echo(text)
-    typer.echo(f"written to {out}")
+    _answer({"rows": rows}, text, out, as_json=as_json)
 
 
 def _print_world(row: dict[str, Any]) -> None:
@@ -143,6 +154,7 @@ def bias(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure how far each term of the registration pulls a frame from its true pose."""
     from dudmap import synthetic
@@ -152,13 +164,23 @@ def bias(
 
     config = Config().override(assignments or [])
     if recording is not None:
-        typer.echo(bias_table(measure_pulls(open_sequence(recording), config, stride)))
-        return
-    for scene in ("room", "corridor"):
-        for seed in range(seeds):
-            world = synthetic.sequence(scene, movers=(), frames=120, noise="none", seed=seed)
-            typer.echo(f"{scene}, seed {seed}, exact:\n")
-            typer.echo(bias_table(measure_pulls(world, config, stride)))
+        worlds = {recording.name: lambda: open_sequence(recording)}
+    else:
+        worlds = {
+            f"{scene}, seed {seed}, exact": partial(
+                synthetic.sequence, scene, movers=(), frames=120, noise="none", seed=seed
+            )
+            for scene in ("room", "corridor")
+            for seed in range(seeds)
+        }
+    found = {}
+    for name, opened in worlds.items():
+        pulls = measure_pulls(opened(), config, stride)
+        found[name] = [{"term": pull.term, "mean": pull.mean, "spread": pull.spread} for pull in pulls]
+        if not as_json:
+            typer.echo(f"{name}:\n\n{bias_table(pulls)}")
+    if as_json:
+        answer({"corrections_mm_deg": found}, "", as_json=True)
 
 
 @app.command("first-second")
@@ -167,6 +189,7 @@ def first_second(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
     from dudmap import synthetic
@@ -179,7 +202,11 @@ def first_second(
         measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES, noise="none", seed=seed), config)
         for scene, seed in worlds
     ]
-    typer.echo(first_second_table(runs))
+    tree = {
+        name: [run._asdict() for run in found]
+        for name, found in zip((f"{scene}, seed {seed}" for scene, seed in worlds), runs, strict=True)
+    }
+    answer(tree, first_second_table(runs), as_json=as_json)
 
 
 @app.command()
@@ -194,6 +221,7 @@ def gate(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
     from dudmap.benchmark import gate as gates
@@ -203,12 +231,14 @@ def gate(
     rows = gates.measure_gate(gates.gate_entries(fixtures), Config().override(assignments or []))
     if record:
         gates.save_figures(figures, rows, old["margins"] if old else None)
-        typer.echo(f"recorded in {figures}; review the difference before committing it")
+        text = f"recorded in {figures}; review the difference before committing it"
+        answer({"recorded": figures, "rows": rows}, text, as_json=as_json)
         return
     assert old is not None
     checks = gates.compare(rows, old)
-    typer.echo(gates.verdict(checks))
     failed = sum(not check.passed for check in checks)
+    tree = {"failed": failed, "checks": [asdict(check) | {"passed": check.passed} for check in checks]}
+    answer(tree, gates.verdict(checks), as_json=as_json)
     if failed:
         typer.echo(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
         raise typer.Exit(1)
@@ -222,6 +252,7 @@ def limits(
     ),
     jobs: JobsOption = 1,
     quick: QuickOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
@@ -238,8 +269,15 @@ def limits(
     wanted = find_systems(systems)
     sweeps = QUICK_SWEEPS if quick else SWEEPS
     cells = grid_cells(sweeps, QUICK_FRAMES if quick else FRAMES)
-    with typer.progressbar(length=len({cell.condition for cell in cells}), label="conditions") as bar:
-        rows = measure_cells(cells, wanted, out / "measured", jobs, bar.update)
+    total, finished = len({cell.condition for cell in cells}), 0
+    with counted("conditions", quiet=as_json) as progress:
+
+        def done(count: int) -> None:
+            nonlocal finished
+            finished += count
+            progress(finished, total)
+
+        rows = measure_cells(cells, wanted, out / "measured", jobs, done)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest dynamic share of the image with an ATE RMSE of at most 2 cm and no frame lost:\n"
@@ -247,8 +285,7 @@ def limits(
     text += "\nATE RMSE in cm and share of lost frames; bold where the system copes:\n"
     text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
-    typer.echo(text)
-    typer.echo(f"written to {out}")
+    _answer({"rows": rows}, text, out, as_json=as_json)
 
 
 @app.command()
@@ -269,10 +306,9 @@ def speed(
         Path | None, typer.Option("--recording", help="Recording of that comparison; default: a synthetic room.")
     ] = None,
     quick: QuickOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
-    import json
-
     from dudmap.benchmark.interleaved import find_open3d
     from dudmap.benchmark.speed import markdown, speed_figures
     from dudmap.pipeline.environment import machine, versions
@@ -290,5 +326,4 @@ def speed(
     (out / "speed.md").write_text(text, encoding="utf-8")
     content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
     (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    typer.echo(text)
-    typer.echo(f"written to {out}")
+    _answer(content, text, out, as_json=as_json)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, TopicsOption, read_config
 
 if TYPE_CHECKING:
@@ -29,15 +30,13 @@ def calibrate(
         Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
     ] = None,
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Estimate geometry, lens and timing of the colour camera relative to the depth camera.
 
     Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
     the images do not prove stays as the files give it.
     """
-    import json
-
     from rich.console import Console
 
     from dudmap.geometry.calibration import Calibration
@@ -52,7 +51,7 @@ def calibrate(
         estimate.calibration.save(out)
     if as_json:
         evidence = {name: value for name, value in estimate.evidence.items() if value == value}
-        typer.echo(json.dumps(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}))
+        answer(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}, "", as_json=True)
         return
     console = Console()
     console.print(table(given, estimate))

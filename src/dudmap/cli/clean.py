@@ -1,11 +1,11 @@
 """``dudmap clean``: a recording as it would have been without what moves."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, QuietOption, SetOption, read_config
 from dudmap.errors import DatasetError
 
@@ -14,7 +14,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def clean(
-    sequence: Annotated[Path, typer.Argument(help="Recording, with colour registered to depth.")],
+    sequence: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")],
     out: Annotated[Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.")],
     run: Annotated[
         Path | None,
@@ -28,19 +28,19 @@ def clean(
         int, typer.Option("--passes", min=1, max=2, help="Passes of the run that is made; 2 finds more.")
     ] = 2,
     quiet: QuietOption = False,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Replace what moves in every frame of a recording by the map and by what other frames show there."""
     from dataclasses import asdict
 
     from dudmap.cli.progress import counted
     from dudmap.exporting.run_content import RunContent
-    from dudmap.exporting.view_synthesis import open_recording
     from dudmap.pipeline.calibration import calibrate_start
     from dudmap.pipeline.run import run as run_sequence
+    from dudmap.sequences import open_sequence
     from dudmap.views.cleaning import clean_recording
 
-    recording = open_recording(sequence, camera)
+    recording = open_sequence(sequence, camera)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
@@ -48,15 +48,13 @@ def clean(
         given = calibrate_start(recording, parameters)
         run_sequence(
             recording, parameters, out / "run",
-            save_masks=True, passes=passes, progress=not quiet, calibration=given,
+            save_masks=True, passes=passes, progress=not (quiet or as_json), calibration=given,
         )  # fmt: skip
-    with counted("cleaning", quiet=quiet) as progress:
+    with counted("cleaning", quiet=quiet or as_json) as progress:
         report = clean_recording(RunContent.load(run or out / "run"), recording, out, progress)
-    if as_json:
-        typer.echo(json.dumps(asdict(report)))
-    elif not quiet:
-        typer.echo(
-            f"{report.frames} frames written to {out}: {report.replaced:.1%} of the pixels replaced, of which "
-            f"{report.unknown / max(report.replaced, 1e-9):.1%} were never seen; {len(report.left_out)} frames without "
-            "a pose left out"
-        )
+    text = (
+        f"{report.frames} frames written to {out}: {report.replaced:.1%} of the pixels replaced, of which "
+        f"{report.unknown / max(report.replaced, 1e-9):.1%} were never seen; {len(report.left_out)} frames without "
+        "a pose left out"
+    )
+    answer(asdict(report), text, as_json=as_json, quiet=quiet)

@@ -5,6 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer, preset_names
+
 if TYPE_CHECKING:
     from dudmap.config import Config
 
@@ -13,12 +15,16 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def config(
-    preset: Annotated[str, typer.Option("--preset", help="default or thesis.")] = "default",
+    preset: Annotated[
+        str, typer.Option("--preset", help="default or thesis.", autocompletion=preset_names)
+    ] = "default",
+    as_json: JsonOption = False,
 ) -> None:
     """Print all parameters with their meanings as TOML, the format of --config."""
     from dudmap.config import Config
 
-    typer.echo(commented(Config.from_tree({"preset": preset})), nl=False)
+    found = Config.from_tree({"preset": preset})
+    answer(found.model_dump(mode="json"), commented(found).rstrip("\n"), as_json=as_json)
 
 
 def commented(config: "Config") -> str:

@@ -5,9 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption
 from dudmap.cli.run import (
     HostOption,
-    JsonOption,
     PortOption,
     QuietOption,
     ReportOption,
@@ -18,7 +18,7 @@ from dudmap.cli.run import (
     print_report,
     read_config,
 )
-from dudmap.cli.view import observers
+from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
@@ -42,6 +42,7 @@ def demo(
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
@@ -58,7 +59,7 @@ def demo(
     recording = sequence(scene="room", movers=("person",), frames=frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun) as watching:
         done = run(
             recording, config, out, save_masks=True, progress=not quiet, ahead=0, observe=keeper.observe,
             observers=watching,

@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
+from dudmap.atomic_file import write_text
+from dudmap.cli.output import JsonOption
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 
 if TYPE_CHECKING:
@@ -36,7 +38,6 @@ app = typer.Typer(
     "`dudmap evaluate RUN` is short for `dudmap evaluate trajectory RUN`.",
 )
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a table.")]
 PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
 OutOption = Annotated[
     Path | None,
@@ -262,7 +263,7 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
     """Write the figures as JSON and print them."""
     text = json.dumps(figures, allow_nan=False)
     try:
-        file.write_text(text + "\n", encoding="utf-8")
+        write_text(file, text + "\n")
     except OSError as error:
         raise DudmapError(f"cannot write {file}: {error.strerror or error}; name a folder with --out") from error
     if as_json:

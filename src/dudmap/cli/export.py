@@ -5,6 +5,7 @@ from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, QuietOption
 from dudmap.errors import ConfigError
 from dudmap.exporting.exporters import EXPORTERS
@@ -49,6 +50,7 @@ def export(
     camera: CameraOption = None,
     every: Annotated[int, typer.Option("--every", min=1, help="Every so many frames of the recording.")] = 1,
     quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write trajectory, surface, space or images of a run for another program."""
     from dudmap.exporting.exporters import export_run
@@ -68,8 +70,7 @@ def export(
         every=every,
     )
     path = export_run(run, to, options)
-    if not quiet:
-        typer.echo(f"written to {path}")
+    answer({"export": path, "bytes": path.stat().st_size}, f"written to {path}", as_json=as_json, quiet=quiet)
 
 
 def direction(text: str | None) -> tuple[float, float, float] | None:

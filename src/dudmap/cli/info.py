@@ -1,11 +1,11 @@
 """``dudmap info``: say what a recording holds, and what looks wrong in it."""
 
-import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, TopicsOption
 
 if TYPE_CHECKING:
@@ -23,7 +23,7 @@ def info(
     camera: CameraOption = None,
     topics: TopicsOption = None,
     sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a list.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
 
@@ -43,7 +43,7 @@ def info(
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:
-        typer.echo(json.dumps(found.tree()))
+        answer(found.tree(), "", as_json=True)
         return
     console = Console()
     table = Table.grid(padding=(0, 2))

@@ -5,10 +5,11 @@ from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, camera_names
 from dudmap.cli.run import (
     ConfigOption,
     HostOption,
-    JsonOption,
+    LogOption,
     PortOption,
     PresetOption,
     QuietOption,
@@ -20,7 +21,7 @@ from dudmap.cli.run import (
     print_report,
     read_config,
 )
-from dudmap.cli.view import observers
+from dudmap.cli.view import TokenOption, observers
 
 app = typer.Typer(add_completion=False)
 
@@ -34,6 +35,7 @@ def live(
             help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="NAME",
+            autocompletion=camera_names,
         ),
     ] = None,
     record: Annotated[
@@ -53,7 +55,9 @@ def live(
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
+    log: LogOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -68,7 +72,7 @@ def live(
     parameters = read_config(config, preset, assignments or [])
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_live(
             source, parameters, out or free_folder(Path("runs") / source.name),
             max_frames=max_frames, save_masks=save_masks, record=record, calibration=given, progress=not quiet,

@@ -1,39 +1,62 @@
-"""``dudmap merge``: join the maps of two runs of one place."""
+"""``dudmap merge``: join the maps of two or more runs of one place."""
 
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dudmap.cli.run import JsonOption, QuietOption, free_folder
+from dudmap.cli.output import JsonOption, answer
+from dudmap.cli.run import QuietOption, free_folder
 
 app = typer.Typer(add_completion=False)
 
 
 @app.command()
 def merge(
-    first: Annotated[Path, typer.Argument(help="Run folder; its world frame is kept.", metavar="A")],
-    second: Annotated[Path, typer.Argument(help="Run folder of the same place.", metavar="B")],
-    out: Annotated[Path | None, typer.Option("--out", help="New run folder; default: runs/<A>-<B>.")] = None,
+    runs: Annotated[
+        list[Path], typer.Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", help="New folder; default: runs/<A>-<B>, or runs/world with more runs.")
+    ] = None,
+    world: Annotated[
+        bool, typer.Option("--world", help="Write map parts and tiles also for two runs, as for more.")
+    ] = False,
+    workers: Annotated[
+        int, typer.Option("--workers", help="Processes, with more than two runs or --world.", min=1)
+    ] = 1,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Join two maps whose views overlap, and refuse where geometry or colour disagree.
+    """Join maps whose views overlap, and refuse where geometry or colour disagree.
 
-    Writes map.npz, keyframes.npz, mesh.ply, config.toml, merge.json and the trajectories of both runs in the world
-    frame of the first.
+    Two runs become a run folder: map.npz, keyframes.npz, mesh.ply, config.toml, merge.json and the trajectories of both
+    in the world frame of the first. More runs become a world: map/ (parts of the map), tileset.json and tiles/ (3D
+    Tiles), world.json and the trajectories; it needs dudmap[fleet].
     """
-    import json
+    if len(runs) == 2 and not world:
+        from dudmap.pipeline.merge import merge_runs
 
-    from dudmap.pipeline.merge import merge_runs
-
-    report = merge_runs(first, second, out or free_folder(Path("runs") / f"{first.name}-{second.name}"))
-    if as_json:
-        typer.echo(json.dumps(report.tree))
-    elif not quiet:
+        report = merge_runs(runs[0], runs[1], out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}"))
         found = report.tree
-        typer.echo(
+        text = (
             f"merged by {found['features']} features of {found['keyframes']} keyframes: {found['area']:.1f} m2 of "
             f"common surface, {found['denied']:.1%} denied by free space, colour correlation "
             f"{found['color_correlation']:.2f}\nwritten to {report.out}"
         )
+    else:
+        from dudmap.fleet.merge import merge_fleet
+
+        def note(sentence: str) -> None:
+            if not (quiet or as_json):
+                typer.echo(sentence, err=True)
+
+        fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=workers, note=note)
+        found = fleet.tree
+        for sentence in fleet.sentences:
+            typer.echo(f"dudmap: {sentence}", err=True)
+        text = (
+            f"{len(found['runs'])} of {len(runs)} runs joined: {found['map_blocks']} blocks in {len(found['ranges'])} "
+            f"parts, {found['tiles']} tiles\nwritten to {fleet.out}"
+        )
+    answer(found, text, as_json=as_json, quiet=quiet)

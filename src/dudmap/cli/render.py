@@ -7,6 +7,7 @@ from typing import Annotated
 import typer
 
 from dudmap.cli.export import UpOption, direction
+from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import QuietOption
 from dudmap.errors import ConfigError
 
@@ -29,6 +30,7 @@ def render(
     size: Annotated[str | None, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = None,
     up: UpOption = None,
     quiet: QuietOption = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Render the map as a camera would see it: a video, or a recording without anything that moves."""
     from dudmap.cli.progress import counted
@@ -43,10 +45,9 @@ def render(
         path = Trajectory.load(trajectory)
     else:
         path = rendering.orbit(content, rendering.up_for_orbit(content, direction(up)), sweep, frames, fps)
-    with counted("rendering", quiet=quiet) as progress:
+    with counted("rendering", quiet=quiet or as_json) as progress:
         count = rendering.render_run(content, path, out, size=_size(size), fps=fps, progress=progress)
-    if not quiet:
-        typer.echo(f"{count} frames written to {out}")
+    answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)
 
 
 def _size(text: str | None) -> tuple[int, int] | None:

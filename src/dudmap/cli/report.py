@@ -1,10 +1,11 @@
 """``dudmap report``: one page on a run that needs nothing but a browser."""
 
-import json
 from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from dudmap.cli.output import JsonOption, answer
 
 app = typer.Typer(add_completion=False)
 
@@ -15,7 +16,7 @@ def report(
     out: Annotated[
         Path | None, typer.Option("--out", help="HTML file; default: report.html in the run folder.")
     ] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the path and the size as one JSON object.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.
 
@@ -24,7 +25,5 @@ def report(
     from dudmap.viewing.report import write_report
 
     path = write_report(run, out)
-    if as_json:
-        typer.echo(json.dumps({"report": str(path), "bytes": path.stat().st_size}))
-    else:
-        typer.echo(f"written: {path} ({1e-6 * path.stat().st_size:.1f} MB)")
+    size = path.stat().st_size
+    answer({"report": path, "bytes": size}, f"written: {path} ({1e-6 * size:.1f} MB)", as_json=as_json)

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.view import observers
+from dudmap.cli.output import JsonOption, answer, parameter_names, preset_names
+from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
 
 if TYPE_CHECKING:
@@ -24,7 +25,10 @@ TopicsOption = Annotated[
     ),
 ]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
-PresetOption = Annotated[str | None, typer.Option("--preset", help="Preset of the parameters: default or thesis.")]
+PresetOption = Annotated[
+    str | None,
+    typer.Option("--preset", help="Preset of the parameters: default or thesis.", autocompletion=preset_names),
+]
 CalibrationOption = Annotated[
     str,
     typer.Option(
@@ -36,10 +40,14 @@ CalibrationOption = Annotated[
 ]
 SetOption = Annotated[
     list[str] | None,
-    typer.Option("--set", help="Set a parameter, e.g. tracker.huber=0.02; repeatable.", metavar="KEY=VALUE"),
+    typer.Option(
+        "--set",
+        help="Set a parameter, e.g. tracker.huber=0.02; repeatable.",
+        metavar="KEY=VALUE",
+        autocompletion=parameter_names,
+    ),
 ]
 QuietOption = Annotated[bool, typer.Option("--quiet", help="No progress bar and no table.")]
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the metrics as one JSON object instead of a table.")]
 ReportOption = Annotated[
     bool, typer.Option("--report/--no-report", help="Keep small images and write report.html into the run folder.")
 ]
@@ -52,13 +60,16 @@ RerunOption = Annotated[
     Path | None,
     typer.Option("--rerun", help="Also log the run for the viewer Rerun (extra rerun).", metavar="FILE.rrd"),
 ]
+LogOption = Annotated[
+    Path | None, typer.Option("--log", help="File for one JSON object per line and event of the run.", metavar="FILE")
+]
 
 
 @app.command()
 def run(
     sequence: Annotated[
-        Path, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
-    ],
+        Path | None, typer.Argument(help="Recording: folder, file or archive; `dudmap info` says what is found.")
+    ] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<recording>.")] = None,
     config: ConfigOption = None,
     assignments: SetOption = None,
@@ -93,11 +104,31 @@ def run(
     localize: Annotated[
         bool, typer.Option("--localize", help="Only find the camera in the map of --map; nothing is fused or changed.")
     ] = False,
+    max_memory: Annotated[
+        str | None,
+        typer.Option(
+            "--max-memory", help="Largest memory of the process, such as 1GB; the rest of the map waits on disk."
+        ),
+    ] = None,
+    resume: Annotated[
+        Path | None,
+        typer.Option("--resume", help="Go on with the interrupted run in this folder; alone.", metavar="RUN"),
+    ] = None,
+    checkpoint_every: Annotated[
+        float | None,
+        typer.Option(
+            "--checkpoint-every",
+            help="Seconds from one checkpoint to the next; 0 for none. Default: as often as takes 2 % of the time.",
+            min=0,
+        ),
+    ] = None,
     report: ReportOption = True,
     view: ViewOption = False,
     host: HostOption = "127.0.0.1",
     port: PortOption = 8080,
+    token: TokenOption = None,
     rerun: RerunOption = None,
+    log: LogOption = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -110,8 +141,17 @@ def run(
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
+    from dudmap.pipeline.storing import Storing
     from dudmap.sequences import open_sequence
 
+    if resume is not None:
+        if sequence is not None or out is not None:
+            raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
+        page = (host, port, token) if view else None
+        _resume(resume, page=page, rerun=rerun, log=log, quiet=quiet, as_json=as_json)
+        return
+    if sequence is None:
+        raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
     parameters = read_config(config, preset, assignments or [])
@@ -128,12 +168,46 @@ def run(
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
-    with observers(report=report, page=(host, port) if view else None, rerun=rerun) as watching:
+    opened = {"path": str(sequence.resolve()), "camera": camera, "topics": topics}
+    storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
+    with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize, observers=watching,
+            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
+            max_memory=None if max_memory is None else memory_size(max_memory), observers=watching, storing=storing,
         )  # fmt: skip
+        print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
+
+
+def memory_size(text: str) -> int:
+    """Number of bytes of a text such as 1GB or 800MB.
+
+    Raises:
+        ConfigError: It is no amount of memory.
+    """
+    from pydantic import ByteSize, TypeAdapter, ValidationError
+
+    try:
+        return int(TypeAdapter(ByteSize).validate_python(text))
+    except ValidationError:
+        raise ConfigError(f"found --max-memory {text}; expected an amount of memory such as 1GB or 800MB") from None
+
+
+def _resume(
+    folder: Path,
+    *,
+    page: tuple[str, int, str | None] | None,
+    rerun: Path | None,
+    log: Path | None,
+    quiet: bool,
+    as_json: bool,
+) -> None:
+    """Go on with an interrupted run."""
+    from dudmap.pipeline.resume import resume, wants_report
+
+    with observers(report=wants_report(folder), page=page, rerun=rerun, log=log) as watching:
+        done = resume(folder, progress=not quiet, observers=watching)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
@@ -178,9 +252,7 @@ def free_folder(wanted: Path) -> Path:
 def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
     """Print the metrics to stdout: as one JSON object, as a table, or not at all."""
     if as_json:
-        import json
-
-        typer.echo(json.dumps(metrics))
+        answer(metrics, "", as_json=True)
     elif not quiet:
         from rich.console import Console
 

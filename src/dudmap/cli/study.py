@@ -6,6 +6,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from dudmap.cli.output import JsonOption, answer
+from dudmap.extras import STUDY, need
+
 if TYPE_CHECKING:
     from collections.abc import Callable
 
@@ -54,17 +57,18 @@ def run(
     keep: KeepOption = False,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
     from dudmap.study.plan import load_plan
-    from dudmap.study.study import need_libraries, run_study
+    from dudmap.study.study import run_study
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / design.stem
     report = _shown_with(cost_per_core_hour)
-    typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report))
-    typer.echo(f"written to {out}")
+    outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
+    _answer(outcome, out, as_json=as_json)
 
 
 @app.command()
@@ -83,21 +87,22 @@ def thesis(
     keep: KeepOption = False,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
-    from dudmap.study.study import need_libraries, run_study
+    from dudmap.study.study import run_study
     from dudmap.study.thesis import published_report, thesis_plan
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     if published:
         out = out or Path("runs/study/thesis-published")
-        typer.echo(published_report(out))
+        outcome = published_report(out)
     else:
         plan = thesis_plan(table, recordings or (), frames)
         out = out or Path("runs/study") / f"thesis-{table}"
         report = _shown_with(cost_per_core_hour)
-        typer.echo(run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report))
-    typer.echo(f"written to {out}")
+        outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
+    _answer(outcome, out, as_json=as_json)
 
 
 @app.command()
@@ -108,18 +113,22 @@ def tune(
     max_runs: MaxRunsOption = 1000,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
+    as_json: JsonOption = False,
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
     from dudmap.study.plan import load_plan
-    from dudmap.study.study import need_libraries
     from dudmap.study.tune import run_tune
 
-    need_libraries()
+    need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / f"{design.stem}-tune"
     report = _shown_with(cost_per_core_hour)
-    typer.echo(run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=report))
-    typer.echo(f"written to {out}")
+    outcome = run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=report)
+    _answer(outcome, out, as_json=as_json)
+
+
+def _answer(outcome: str, out: Path, *, as_json: bool) -> None:
+    answer({"outcome": outcome, "out": out}, f"{outcome}\nwritten to {out}", as_json=as_json)
 
 
 def _executor(jobs: int, cluster: str) -> "Executor":

@@ -6,6 +6,7 @@ from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
 from dudmap.errors import ConfigError
 
 app = typer.Typer(add_completion=False)
@@ -88,6 +89,7 @@ def synth(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Render a synthetic recording with exact ground truth.
 
@@ -120,21 +122,16 @@ def synth(
         sensor=sensor,
         faults=parse_faults(fault or [], model.faults if model else None),
     )
-    if quiet:
-        write_folder(sequence, out, overwrite=overwrite)
-        return
     import time
 
-    from rich.console import Console
-    from rich.progress import Progress
+    from dudmap.cli.progress import counted
 
-    console = Console(stderr=True)
-    start = time.perf_counter()
-    with Progress(console=console, disable=not console.is_terminal) as bar:
-        task = bar.add_task("rendering", total=len(sequence))
-        write_folder(sequence, out, overwrite=overwrite, progress=lambda done: bar.update(task, completed=done))
+    start, count = time.perf_counter(), len(sequence)
+    with counted("rendering", quiet=quiet or as_json) as progress:
+        write_folder(sequence, out, overwrite=overwrite, progress=lambda done: progress(done, count))
     seconds = time.perf_counter() - start
-    console.print(f"{out}: {len(sequence)} frames of {sequence.name} in {seconds:.1f} s", highlight=False)
+    tree = {"out": out, "frames": count, "sequence": sequence.name, "seconds": round(seconds, 3)}
+    answer(tree, f"{out}: {count} frames of {sequence.name} in {seconds:.1f} s", as_json=as_json, quiet=quiet)
 
 
 def _names(movers: list[str] | None) -> list[str] | None:

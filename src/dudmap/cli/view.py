@@ -9,10 +9,21 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.errors import DudmapError
+
 if TYPE_CHECKING:
     from dudmap.pipeline.observer import RunObserver
 
 app = typer.Typer(add_completion=False)
+
+TokenOption = Annotated[
+    str | None,
+    typer.Option(
+        "--token",
+        help="Secret part of the page's address; default: none on this machine, a random one with another --host.",
+        metavar="TEXT",
+    ),
+]
 
 
 @app.command()
@@ -22,24 +33,34 @@ def view(
         str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines see the page.")
     ] = "127.0.0.1",
     port: Annotated[int, typer.Option("--port", help="Port to serve at.", min=1, max=65535)] = 8080,
+    token: TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
     from dudmap.viewing.stored_view import open_run
 
-    window = open_run(run, host, port)
-    typer.echo(f"{window.url} shows {run}; ctrl-C ends it", err=True)
+    window = open_run(run, host, port, token)
+    typer.echo(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)
     _wait()
     window.stop()
 
 
 @contextmanager
-def observers(*, report: bool, page: tuple[str, int] | None, rerun: Path | None) -> "Iterator[tuple[RunObserver, ...]]":
-    """Observers of a run as wanted: its report, the page at host and port, the log for Rerun.
+def observers(
+    *, report: bool, page: tuple[str, int, str | None] | None, rerun: Path | None, log: Path | None = None
+) -> "Iterator[tuple[RunObserver, ...]]":
+    """Observers of a run as wanted: its report, the page at host and port with a token, the log for Rerun, the log
+    of events.
 
-    A page stays open after the run until ctrl-C, unless nobody sits at the terminal.
+    An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
+    until ctrl-C, unless nobody sits at the terminal.
     """
+    from dudmap.pipeline.crash_report import report_crash
+    from dudmap.pipeline.event_log import EventLog
+
+    events = EventLog(log)
     with ExitStack() as stack:
-        watching: list[RunObserver] = []
+        stack.callback(events.close)
+        watching: list[RunObserver] = [events]
         if report:
             from dudmap.viewing.report import ReportObserver
 
@@ -52,13 +73,19 @@ def observers(*, report: bool, page: tuple[str, int] | None, rerun: Path | None)
             from dudmap.viewing.live_view import LiveView
             from dudmap.viewing.window import Window
 
-            window = Window(*page, "dudmap")
+            host, port, token = page
+            window = Window(host, port, "dudmap", token)
             stack.callback(window.stop)
             live_view = LiveView(window)
             stack.callback(live_view.close)
             watching.append(live_view)
-            typer.echo(f"{window.url} shows the run", err=True)
-        yield tuple(watching)
+            typer.echo(f"{window.url} shows the run {window.access.notice}", err=True)
+        try:
+            yield tuple(watching)
+        except (DudmapError, OSError, typer.Exit):
+            raise
+        except Exception as error:  # a defect of ours, whatever it is
+            raise report_crash(error, events.out or Path.cwd(), events.recent) from error
         if page is not None and sys.stdin.isatty():
             typer.echo("the page stays open; ctrl-C ends it", err=True)
             _wait()

@@ -6,27 +6,34 @@ from typing import Annotated
 
 import typer
 
+from dudmap.cli.output import JsonOption, answer
+
 app = typer.Typer(add_completion=False)
 
 
 @app.command()
 def warmup(
     quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Compile all kernels in advance.
 
     Processes a small synthetic recording with every part of the system; the compiled kernels are cached on disk.
     """
+    from contextlib import nullcontext
+
     from rich.console import Console
 
-    console = Console(stderr=True, quiet=quiet)
-    start = time.perf_counter()
+    console = Console(stderr=True, quiet=quiet or as_json)
+    taken: dict[str, float] = {}
     for name, step in steps():
-        with console.status(name):
+        with console.status(name) if console.is_terminal else nullcontext():
             begin = time.perf_counter()
             step()
-        console.print(f"{name}: {time.perf_counter() - begin:.1f} s", highlight=False)
-    console.print(f"ready after {time.perf_counter() - start:.1f} s", highlight=False)
+        taken[name] = round(time.perf_counter() - begin, 3)
+        console.print(f"{name}: {taken[name]:.1f} s", highlight=False)
+    total = sum(taken.values())
+    answer({"seconds": total, "steps": taken}, f"ready after {total:.1f} s", as_json=as_json, quiet=quiet)
 
 
 def steps() -> list[tuple[str, Callable[[], object]]]:

@@ -1,6 +1,5 @@
 """Input files of an evaluation: trajectory, mesh and reference of a run folder, a recording, or named directly."""
 
-import json
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +11,7 @@ from dudmap.evaluation.trajectory import ate
 from dudmap.geometry.association import read_list, read_pairs
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import DAMAGE, read_json
 from dudmap.sequences import is_recording, open_sequence, reader_of
 from dudmap.sequences.tum import TumSequence
 
@@ -114,8 +114,8 @@ def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float
 def _num_frames(run: Path | None, reference: Path | None) -> int | None:
     if run is not None and (run / "metrics.json").is_file():
         try:
-            return int(json.loads((run / "metrics.json").read_text(encoding="utf-8"))["frames"])
-        except (ValueError, KeyError, TypeError) as error:
+            return int(read_json(run / "metrics.json")["frames"])
+        except DAMAGE as error:
             raise DatasetError(f"{run / 'metrics.json'} does not tell the number of frames: {error}") from error
     if reference is None:
         return None

@@ -6,11 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_path
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
 from dudmap.evaluation.trajectory import AteResult, RpeResult
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -90,9 +92,9 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
         DatasetError: The file does not hold these arrays.
     """
     try:
-        with np.load(residuals) as data:
+        with open_arrays(residuals) as data:
             edges, counts, prior, sigma = (data[key].astype(float) for key in ("edges", "counts", "prior", "sigma"))
-    except (OSError, ValueError, KeyError) as error:
+    except DAMAGE as error:
         raise DatasetError(f"{residuals} does not hold edges, counts, prior and sigma of residuals: {error}") from error
     widths, r = np.diff(edges), np.linspace(edges[0], edges[-1], 600)
     axes.bar(
@@ -185,6 +187,7 @@ def _rules(axes: "Axes", levels: dict[str, float]) -> None:
 
 def _save(figure: "Figure", path: Path) -> None:
     try:
-        figure.savefig(path)
+        with atomic_path(path) as temporary:
+            figure.savefig(temporary)
     except OSError as error:
         raise DudmapError(f"cannot write the plot {path}: {error.strerror or error}") from error

@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from dudmap.errors import ConfigError
+from dudmap.atomic_file import put_in_place
 from dudmap.exporting import ros_messages as ros
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
+from dudmap.extras import extra
 from dudmap.geometry import se3
 from dudmap.geometry.mesh_simplification import simplified
 
@@ -25,14 +26,12 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
     mesh come at the time of the first pose.
 
     Raises:
-        ConfigError: rosbags is not installed.
+        MissingExtraError: rosbags is not installed.
         OSError: The file cannot be written.
     """
-    try:
+    with extra("ros-bags", "writing .mcap"):
         from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise ConfigError("writing .mcap needs the library rosbags; pip install 'dudmap[ros-bags]'") from None
     store = get_typestore(Stores.ROS2_JAZZY)
     types = ros.MessageTypes(store.types.__getitem__)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
@@ -46,7 +45,7 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
                 if topic not in connections:
                     connections[topic] = writer.add_connection(topic, kind, typestore=store)
                 writer.write(connections[topic], round(seconds * 1e9), store.serialize_cdr(message, kind))
-        (bag / "run.mcap").replace(path)
+        put_in_place(bag / "run.mcap", path)
 
 
 def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:

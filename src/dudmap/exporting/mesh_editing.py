@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError, MapError
 from dudmap.exporting.options import Box, ExportOptions
+from dudmap.extras import extra
 from dudmap.geometry.mesh import Mesh
 
 
@@ -109,14 +110,12 @@ def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
     Vertices take colour and normal of the nearest vertex of the given mesh.
 
     Raises:
-        ConfigError: fast-simplification is not installed.
+        MissingExtraError: fast-simplification is not installed.
     """
     if len(mesh.faces) <= max_triangles:
         return mesh
-    try:
+    with extra("export", "--max-triangles"):
         from fast_simplification import simplify
-    except ImportError:
-        raise ConfigError("--max-triangles needs fast-simplification; pip install 'dudmap[export]'") from None
     from scipy.spatial import KDTree
 
     vertices, faces, *_ = simplify(mesh.vertices.astype(np.float64), mesh.faces, target_count=max_triangles)

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.atomic_file import atomic_file
-from dudmap.errors import ConfigError
+from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.exporting.mesh_editing import edited
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
+from dudmap.extras import extra
 from dudmap.geometry.mesh import Mesh
 
 LAS_STEP = 0.0001
@@ -59,14 +59,12 @@ def write_laz(run: RunContent, path: Path, options: ExportOptions) -> None:
 
     Raises:
         MapError: There is no mesh.
-        ConfigError: laspy or lazrs is not installed.
+        MissingExtraError: laspy or lazrs is not installed.
         OSError: The file cannot be written.
     """
-    try:
+    with extra("export", "writing .laz"):
         import laspy
         import lazrs  # noqa: F401 - laspy compresses with it
-    except ImportError:
-        raise ConfigError("writing .laz needs the libraries laspy and lazrs; pip install 'dudmap[export]'") from None
     points = _points(run, options)
     header = laspy.LasHeader(point_format=7, version="1.4")
     header.scales, header.offsets = np.full(3, LAS_STEP), np.floor(points.vertices.min(axis=0)).astype(float)
@@ -84,22 +82,16 @@ def write_e57(run: RunContent, path: Path, options: ExportOptions) -> None:
 
     Raises:
         MapError: There is no mesh.
-        ConfigError: pye57 is not installed.
+        MissingExtraError: pye57 is not installed.
         OSError: The file cannot be written.
     """
-    try:
+    with extra("export", "writing .e57"):
         import pye57
-    except ImportError:
-        raise ConfigError("writing .e57 needs the library pye57; pip install 'dudmap[export]'") from None
     points = _points(run, options)
     x, y, z = points.vertices.astype(np.float64).T
     red, green, blue = points.colors.T
     scan = {"cartesianX": x, "cartesianY": y, "cartesianZ": z, "colorRed": red, "colorGreen": green, "colorBlue": blue}
-    partial = path.with_name(f".{path.name}.part")
-    try:
-        file = pye57.E57(str(partial), mode="w")
+    with atomic_path(path) as temporary:
+        file = pye57.E57(str(temporary), mode="w")
         file.write_scan_raw({name: np.ascontiguousarray(values) for name, values in scan.items()}, name="map")
         file.close()
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)

@@ -1,6 +1,5 @@
 """The results in a run folder, as exporters take them."""
 
-import json
 import re
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,6 +14,7 @@ from dudmap.errors import DatasetError, MapError
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
 
 if TYPE_CHECKING:
     from dudmap.mapping.volume import TsdfVolume
@@ -99,8 +99,8 @@ class RunContent:
         if not path.is_file():
             return []
         try:
-            return [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines() if line.strip()]
-        except ValueError as error:
+            return [parse_json(line) for line in read_text(path).splitlines() if line.strip()]
+        except DAMAGE as error:
             raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
 
     @cached_property
@@ -146,8 +146,8 @@ def _check_version(folder: Path) -> None:
     if not path.is_file():
         return
     try:
-        written = json.loads(path.read_text(encoding="utf-8")).get("versions", {}).get("dudmap", "0")
-    except (ValueError, AttributeError) as error:
+        written = str(read_json(path).get("versions", {}).get("dudmap", "0"))
+    except DAMAGE as error:
         raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
     if _numbers(written) > _numbers(__version__):
         raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from dudmap.atomic_file import write_text
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
 from dudmap.geometry import se3
@@ -27,7 +28,7 @@ def write_kitti(run: RunContent, path: Path, options: ExportOptions) -> None:
         OSError: The file cannot be written.
     """
     rows = [" ".join(f"{number:.9f}" for number in T[:3].reshape(-1)) for T in run.trajectory.Ts_world_camera]
-    path.write_text("\n".join(rows) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(rows) + "\n")
 
 
 def write_euroc(run: RunContent, path: Path, options: ExportOptions) -> None:
@@ -41,4 +42,4 @@ def write_euroc(run: RunContent, path: Path, options: ExportOptions) -> None:
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
         numbers = (*T[:3, 3], w, x, y, z)
         lines.append(f"{round(stamp * 1e9)}," + ",".join(f"{number:.9f}" for number in numbers))
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    write_text(path, "\n".join(lines) + "\n")

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap.errors import ConfigError
+from dudmap.atomic_file import put_in_place
 from dudmap.exporting.gltf import linear_light
 from dudmap.exporting.gravity import up_of, y_up
 from dudmap.exporting.mesh_editing import edited, rotated
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
+from dudmap.extras import extra
 
 MODULES = "Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"
 """Modules of usd-core, imported by name: they give their classes at run time only, and type checkers see none."""
@@ -22,15 +23,14 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
 
     Raises:
         MapError: There is no mesh.
-        ConfigError: usd-core is not installed, or an option is invalid.
+        ConfigError: An option is invalid.
+        MissingExtraError: usd-core is not installed.
         OSError: The file cannot be written.
     """
-    try:
+    with extra("export", "writing .usdz"):
         sdf, usd, geom, utils, vt = (
             import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt")
         )
-    except ImportError:
-        raise ConfigError("writing .usdz needs the library usd-core; pip install 'dudmap[export]'") from None
     mesh = rotated(edited(run.surface, options), y_up(up_of(run, options)))
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
         layer = Path(folder) / "map.usdc"
@@ -54,4 +54,4 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
         packed = Path(folder) / "packed.usdz"
         if not utils.CreateNewUsdzPackage(sdf.AssetPath(str(layer)), str(packed)):
             raise OSError(f"usd-core could not write {path}")
-        packed.replace(path)
+        put_in_place(packed, path)

@@ -9,14 +9,16 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting.mesh_editing import edited
 from dudmap.exporting.options import ExportOptions
 from dudmap.exporting.run_content import RunContent
-from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.geometry.lens import Lens
 from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.other_view import OtherView
 from dudmap.sequences.images import read_mask
 
 if TYPE_CHECKING:
@@ -35,13 +37,15 @@ class View(NamedTuple):
 
     Attributes:
         name: File name without its ending.
-        frame: Colour and depth.
-        moving: (H, W) bool, what moves.
+        color: (h, w, 3) uint8, as recorded.
+        depth: (h, w) float32, metres, seen from the colour camera; of a camera beside the depth camera with gaps.
+        moving: (h, w) bool, what moves in the colour image.
         T_world_color: (4, 4) pose of the colour image.
     """
 
     name: str
-    frame: Frame
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
     moving: NDArray[np.bool_]
     T_world_color: NDArray[np.float64]
 
@@ -51,7 +55,7 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
     training) and the seed points points.ply. Poses are camera to world with OpenGL's camera axes.
 
     Raises:
-        ConfigError: The recording is not named, or its colour is not registered to depth.
+        ConfigError: The recording is not named.
         DatasetError: The recording or the masks cannot be read, or do not belong to the run.
         MapError: There is no mesh.
         OSError: A file cannot be written.
@@ -64,9 +68,9 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
     frames = []
     for view in _views(run, sequence, options.every):
         name = f"{view.name}.png"
-        millimetres = np.rint(1000 * view.frame.depth)
+        millimetres = np.rint(1000 * view.depth)
         depth = np.where(millimetres > 65535, 0, millimetres).astype(np.uint16)
-        for folder, image in zip(folders, (view.frame.color, depth, _kept(view)), strict=True):
+        for folder, image in zip(folders, (view.color, depth, _kept(view)), strict=True):
             _save(folder / name, image)
         frames.append(
             {
@@ -74,14 +78,14 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
                 "transform_matrix": (view.T_world_color @ CV_GL).tolist(),
             }
         )  # fmt: skip
-    camera = sequence.camera
+    camera = _color_camera(run, sequence)
     lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), (*camera.distortion, *(0.0,) * 5), strict=False))
     tree = {
         "camera_model": "OPENCV", "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + PIXEL,
         "cy": camera.cy + PIXEL, "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 0.001,
         "ply_file_path": "points.ply", "frames": frames,
     }  # fmt: skip
-    path.write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    write_text(path, json.dumps(tree, indent=2) + "\n")
 
 
 def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
@@ -89,30 +93,30 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
     masks/ (``NAME.png.png``, 0 = moves, as COLMAP's ``ImageReader.mask_path`` wants them).
 
     Raises:
-        ConfigError: The recording is not named, or its colour is not registered to depth.
+        ConfigError: The recording is not named.
         DatasetError: The recording or the masks cannot be read, or do not belong to the run.
         MapError: There is no mesh.
         OSError: A file cannot be written.
     """
     sequence, seeds = _open(run, options), _seeds(run, options)
-    folder, camera = path.parent, sequence.camera
+    folder, camera = path.parent, _color_camera(run, sequence)
     for name in ("images", "masks"):
         (folder / name).mkdir(exist_ok=True)
     images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
     for number, view in enumerate(_views(run, sequence, options.every), start=1):
         name = f"{view.name}.png"
-        _save(folder / "images" / name, view.frame.color)
+        _save(folder / "images" / name, view.color)
         _save(folder / "masks" / f"{name}.png", _kept(view))
         T = se3.inverse(view.T_world_color)
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
         numbers = " ".join(f"{value:.9f}" for value in (w, x, y, z, *T[:3, 3]))
         images += [f"{number} {numbers} 1 {name}", ""]
-    (folder / "images.txt").write_text("\n".join(images) + "\n", encoding="utf-8")
+    write_text(folder / "images.txt", "\n".join(images) + "\n")
     points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     for number, (xyz, rgb) in enumerate(zip(seeds.vertices.tolist(), seeds.colors.tolist(), strict=True), start=1):
         points.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
-    (folder / "points3D.txt").write_text("\n".join(points) + "\n", encoding="utf-8")
-    path.write_text(f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n", encoding="utf-8")
+    write_text(folder / "points3D.txt", "\n".join(points) + "\n")
+    write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n")
 
 
 def _colmap_camera(camera: Camera) -> str:
@@ -121,21 +125,6 @@ def _colmap_camera(camera: Camera) -> str:
     model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV"}[len(camera.distortion)]
     numbers += [0.0] * 3 if model == "FULL_OPENCV" else []
     return f"{model} {camera.width} {camera.height} " + " ".join(f"{number:.9g}" for number in numbers)
-
-
-def open_recording(path: Path, camera: str | None = None) -> "Sequence":
-    """The recording of a run.
-
-    Raises:
-        ConfigError: Its colour images come from a camera of their own.
-        DatasetError: It cannot be read.
-    """
-    from dudmap.sequences import open_sequence
-
-    sequence = open_sequence(path, camera)
-    if sequence.calibration is not None:
-        raise ConfigError(f"the colour of {path} is not registered to depth, which this export needs; register it")
-    return sequence
 
 
 def index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
@@ -150,7 +139,17 @@ def _open(run: RunContent, options: ExportOptions) -> "Sequence":
     if options.every < 1:
         raise ConfigError(f"found --every {options.every}; expected 1 or more")
     run.mask_files()
-    return open_recording(options.sequence, options.camera)
+    from dudmap.sequences import open_sequence
+
+    sequence = open_sequence(options.sequence, options.camera)
+    if sequence.calibration is not None and run.calibration is None:
+        raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
+    return sequence
+
+
+def _color_camera(run: RunContent, sequence: "Sequence") -> Camera:
+    """Camera of the recorded colour images: that of depth if they are registered to it."""
+    return sequence.camera if sequence.calibration is None or run.calibration is None else run.calibration.camera
 
 
 def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
@@ -165,16 +164,23 @@ def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
     """
     masks, count = run.mask_files(), 0
     stamps = np.array(sorted(masks))
+    other = None
+    if sequence.calibration is not None:
+        other = OtherView(Lens(sequence.camera), Lens(_color_camera(run, sequence)))
     for index in range(0, len(sequence), every):
         moment = float(sequence.timestamps[index])
-        mask = index_at(stamps, moment)
-        if index_at(run.trajectory.timestamps, moment) is None or mask is None:
+        pose, mask = index_at(run.trajectory.timestamps, moment), index_at(stamps, moment)
+        if pose is None or mask is None:
             continue
         frame, moving = sequence[index], read_mask(masks[float(stamps[mask])])
-        if moving.shape != frame.color.shape[:2]:
+        if moving.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {run.folder} do not have the size of the images of {sequence.name}")
         taken = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
-        yield View(f"frame_{index:05d}", frame, moving, run.color_pose(taken))
+        depth, T_world_color = frame.depth, run.color_pose(taken)
+        if other is not None:
+            T_color_depth = se3.inverse(T_world_color) @ run.trajectory.Ts_world_camera[pose]
+            depth, moving = other.depth(depth, T_color_depth), other.mask(moving, depth, T_color_depth)
+        yield View(f"frame_{index:05d}", frame.color, depth, moving, T_world_color)
         count += 1
     if not count:
         raise DatasetError(f"no frame of {sequence.name} has a pose in {run.folder}; name the recording of that run")
@@ -190,4 +196,4 @@ def _save(path: Path, image: NDArray) -> None:
     import cv2
 
     data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1]
-    path.write_bytes(data.tobytes())
+    write_bytes(path, data.tobytes(), sync=False)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
+from dudmap.input_files import read_text
 
 LARGEST_GAP = 0.02
 """Largest time difference of an associated pair, seconds (that of the TUM benchmark's script)."""
@@ -30,7 +31,7 @@ def read_rows(path: Path, columns: str) -> list[tuple[int, list[str]]]:
         DatasetError: The file cannot be read or a line does not have these columns.
     """
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
     rows = []

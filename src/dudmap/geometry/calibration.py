@@ -9,9 +9,11 @@ import numpy as np
 import tomli_w
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_text
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, read_toml
 
 PARAMETERS = (
     "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
@@ -128,7 +130,7 @@ class Calibration:
     def save(self, path: str | Path) -> None:
         """Write a TOML file."""
         text = "# Colour camera relative to the depth camera: metres, radians, pixels, seconds\n"
-        Path(path).write_text(text + tomli_w.dumps(self.tree()), encoding="utf-8")
+        write_text(path, text + tomli_w.dumps(self.tree()))
 
     @classmethod
     def load(cls, path: str | Path) -> "Calibration":
@@ -138,7 +140,7 @@ class Calibration:
             DatasetError: The file is missing, not TOML, or lacks a value or holds an invalid one.
         """
         try:
-            tree = tomllib.loads(Path(path).read_text(encoding="utf-8"))
+            tree = read_toml(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"cannot read the calibration {path}: {error}") from error
         except tomllib.TOMLDecodeError as error:
@@ -156,5 +158,5 @@ class Calibration:
             )
         except KeyError as error:
             raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
-        except (TypeError, ValueError, AttributeError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"cannot understand the calibration {path}: {error}") from error

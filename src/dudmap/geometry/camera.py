@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 
 Scalar = TypeVar("Scalar", bound=np.floating)
+LARGEST_PIXELS = 2**26
+"""Largest number of pixels of an image, 8192x8192; the images of phones have up to 50 million."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,8 @@ class Camera:
             )
         if self.width < 16 or self.height < 16:
             raise DatasetError(f"camera image is {self.width}x{self.height}; at least 16x16 pixels are needed")
+        if self.width * self.height > LARGEST_PIXELS:
+            raise DatasetError(f"camera image is {self.width}x{self.height}; at most {LARGEST_PIXELS} pixels are read")
         if len(self.distortion) not in (0, 4, 5):
             raise DatasetError(
                 f"camera has {len(self.distortion)} distortion coefficients; expected none, 4 (k1 k2 p1 p2) or 5 (k3)"

@@ -1,13 +1,17 @@
 """Triangle mesh with colours and normals."""
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file, atomic_path
 from dudmap.errors import MapError
+from dudmap.input_files import foreign, open_plain
 
 FORMATS = (".ply", ".obj", ".glb", ".stl")
 _PLY_VERTEX = np.dtype([("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)])
@@ -46,9 +50,11 @@ class Mesh:
             raise MapError(f"cannot write a mesh as {path.name!r}; the ending must be one of {', '.join(FORMATS)}")
         try:
             if path.suffix.lower() == ".ply":
-                self._save_ply(path)
+                with atomic_file(path) as file:
+                    self._save_ply(file)
             else:
-                self._as_trimesh().export(path)
+                with atomic_path(path) as temporary:
+                    self._as_trimesh().export(temporary)
         except OSError as error:
             raise MapError(f"cannot write the mesh to {path}: {error}") from error
 
@@ -59,31 +65,21 @@ class Mesh:
             self.vertices, self.faces, vertex_normals=self.normals, vertex_colors=self.colors, process=False
         )
 
-    def _save_ply(self, path: Path) -> None:
+    def _save_ply(self, file: IO[bytes]) -> None:
         """Binary PLY with float32 normals; trimesh's exporter is three times slower on a million faces."""
-        vertex = np.empty(len(self.vertices), _PLY_VERTEX)
-        vertex["xyz"], vertex["normal"], vertex["rgb"] = self.vertices, self.normals, self.colors
-        face = np.empty(len(self.faces), _PLY_FACE)
-        face["count"], face["indices"] = 3, self.faces
-        with path.open("wb") as file:
-            file.write(_ply_header(len(vertex), len(face)).encode("ascii"))
-            file.write(vertex.tobytes())
-            file.write(face.tobytes())
+        vertex, face = ply_arrays(self)
+        file.write(ply_header(len(vertex), len(face)).encode("ascii"))
+        file.write(vertex.tobytes())
+        file.write(face.tobytes())
 
     @classmethod
     def _load_ply(cls, path: Path) -> "Mesh | None":
         """Read a file that ``save`` wrote, None for any other: trimesh takes 2 s for a million triangles."""
-        with path.open("rb") as file:
-            head = file.read(1024)
-            counts = re.findall(rb"element (?:vertex|face) (\d+)", head)
-            header = _ply_header(*(int(count) for count in [*counts, 0][:2])).encode("ascii") if counts else b""
-            if not header or not head.startswith(header):
-                return None
-            file.seek(len(header))
-            vertex = np.fromfile(file, _PLY_VERTEX, int(counts[0]))
-            face = np.fromfile(file, _PLY_FACE, int(counts[1]) if len(counts) > 1 else 0)
-        whole = len(vertex) == int(counts[0]) and (len(counts) == 1 or len(face) == int(counts[1]))
-        if not whole or np.any(face["indices"] < 0) or np.any(face["indices"] >= len(vertex)):
+        layout = ply_layout(path)
+        if layout is None:
+            return None
+        vertex, face = layout
+        if np.any(face["indices"] < 0) or np.any(face["indices"] >= len(vertex)):
             raise MapError(f"the mesh {path} is cut off or damaged")
         arrays = vertex["xyz"], face["indices"], vertex["rgb"], vertex["normal"]
         return cls(*(np.ascontiguousarray(array) for array in arrays))
@@ -102,19 +98,28 @@ class Mesh:
             raise MapError(f"cannot read the mesh {path}: {error}") from error
         if own is not None and len(own.vertices) > 0:
             return own
+        if path.suffix.lower() not in FORMATS:  # others may be archives, or name further files
+            raise MapError(f"cannot read the mesh {path}; the ending must be one of {', '.join(FORMATS)}")
+        with foreign(MapError, f"the mesh {path}"):
+            return cls._load_foreign(path)
+
+    @classmethod
+    def _load_foreign(cls, path: Path) -> "Mesh":
+        """Read a file that another program wrote; materials, which name further files, are left out."""
         import trimesh
         from trimesh.visual import ColorVisuals, TextureVisuals
 
-        try:
-            loaded = trimesh.load(path, process=False, force=None)
-        except (OSError, ValueError, NotImplementedError, LookupError, TypeError) as error:  # trimesh on broken headers
-            raise MapError(f"cannot read the mesh {path}: {error}") from error
+        options: dict[str, Any] = {"skip_materials": True} if path.suffix.lower() == ".obj" else {}
+        with open_plain(path) as file:
+            loaded = trimesh.load(file, file_type=path.suffix.lower()[1:], process=False, force=None, **options)
         if isinstance(loaded, trimesh.Scene):
             loaded = loaded.to_geometry()
         vertices = np.asarray(getattr(loaded, "vertices", np.empty((0, 3))), dtype=np.float32)
         if len(vertices) == 0:
             raise MapError(f"the mesh {path} holds no vertices")
         faces = np.asarray(getattr(loaded, "faces", np.empty((0, 3))), dtype=np.int32).reshape(-1, 3)
+        if vertices.shape != (len(vertices), 3) or (len(faces) and not 0 <= faces.min() <= faces.max() < len(vertices)):
+            raise MapError(f"the mesh {path} is damaged: vertices without three coordinates, or faces without vertices")
         if isinstance(loaded, trimesh.Trimesh):
             visual = loaded.visual.to_color() if isinstance(loaded.visual, TextureVisuals) else loaded.visual
             assert isinstance(visual, ColorVisuals)
@@ -128,7 +133,55 @@ class Mesh:
         return cls(vertices, faces, colors, normals)
 
 
-def _ply_header(vertices: int, faces: int) -> str:
+def joined(parts: Sequence[Mesh]) -> Mesh:
+    """Meshes as one, which shares no vertices between them."""
+    if not parts:
+        empty = np.zeros((0, 3), dtype=np.float32)
+        return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)
+    counts = np.array([len(part.vertices) for part in parts])
+    first = (np.cumsum(counts) - counts).astype(np.int32)
+    return Mesh(
+        np.concatenate([part.vertices for part in parts]),
+        np.concatenate([part.faces + start for part, start in zip(parts, first, strict=True)]),
+        np.concatenate([part.colors for part in parts]),
+        np.concatenate([part.normals for part in parts]),
+    )
+
+
+def ply_arrays(mesh: Mesh, first: int = 0) -> tuple[NDArray, NDArray]:
+    """Vertices and faces as they stand in a PLY file, in which the vertices of this mesh begin at number ``first``."""
+    vertex = np.empty(len(mesh.vertices), _PLY_VERTEX)
+    vertex["xyz"], vertex["normal"], vertex["rgb"] = mesh.vertices, mesh.normals, mesh.colors
+    face = np.empty(len(mesh.faces), _PLY_FACE)
+    face["count"], face["indices"] = 3, mesh.faces + np.int32(first)
+    return vertex, face
+
+
+def ply_layout(path: Path) -> tuple[NDArray, NDArray] | None:
+    """Vertices and faces of a PLY file that ``Mesh.save`` wrote, mapped into memory; None for any other file.
+
+    Raises:
+        MapError: The file is cut off.
+        OSError: It cannot be read.
+    """
+    with open_plain(path) as file:
+        head = file.read(1024)
+    counts = [int(count) for count in re.findall(rb"element (?:vertex|face) (\d+)", head)[:2]]
+    vertices, faces = (*counts, 0, 0)[:2]
+    header = ply_header(vertices, faces).encode("ascii")
+    if not counts or not head.startswith(header):
+        return None
+    end = len(header) + vertices * _PLY_VERTEX.itemsize
+    if path.stat().st_size < end + faces * _PLY_FACE.itemsize:
+        raise MapError(f"the mesh {path} is cut off or damaged")
+
+    def mapped(kind: np.dtype, offset: int, count: int) -> NDArray:
+        return np.memmap(path, kind, "r", offset, count) if count else np.empty(0, kind)
+
+    return mapped(_PLY_VERTEX, len(header), vertices), mapped(_PLY_FACE, end, faces)
+
+
+def ply_header(vertices: int, faces: int) -> str:
     """Header of a binary PLY file as ``Mesh.save`` writes it; a point cloud has no element ``face``."""
     lines = ["ply", "format binary_little_endian 1.0", "comment dudmap", f"element vertex {vertices}"]
     lines += [f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")]

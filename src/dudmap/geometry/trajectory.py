@@ -7,8 +7,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_text
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
+from dudmap.input_files import read_text
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +59,11 @@ class Trajectory:
 
     def save(self, path: str | Path) -> None:
         """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""
-        with Path(path).open("w", encoding="utf-8") as file:
-            file.write("# timestamp tx ty tz qx qy qz qw\n")
-            for stamp, T in zip(self.timestamps, self.Ts_world_camera, strict=True):
-                numbers = (*T[:3, 3], *se3.rotation_to_quat_xyzw(T[:3, :3]))
-                file.write(f"{stamp:.6f} " + " ".join(f"{number:.9f}" for number in numbers) + "\n")
+        lines = ["# timestamp tx ty tz qx qy qz qw"]
+        for stamp, T in zip(self.timestamps, self.Ts_world_camera, strict=True):
+            numbers = (*T[:3, 3], *se3.rotation_to_quat_xyzw(T[:3, :3]))
+            lines.append(f"{stamp:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
+        write_text(path, "\n".join(lines) + "\n")
 
     @classmethod
     def load(cls, path: str | Path) -> "Trajectory":
@@ -72,7 +74,7 @@ class Trajectory:
         """
         path = Path(path)
         try:
-            text = path.read_text(encoding="utf-8")
+            text = read_text(path)
         except (OSError, UnicodeDecodeError) as error:
             raise DatasetError(f"cannot read the trajectory {path}: {error}") from error
         rows: list[list[float]] = []

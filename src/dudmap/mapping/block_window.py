@@ -23,7 +23,7 @@ class BlockWindow:
         cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
         stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
         near: (n,) int32, the slots inside.
-        origin: (3,) int64 coordinates of the first block; None before the first ``look_at``.
+        origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
     """
 
     def __init__(self, block_size: float, cells: int) -> None:
@@ -35,11 +35,15 @@ class BlockWindow:
         self.near = np.empty(0, dtype=np.int32)
         self.origin: NDArray[np.int64] | None = None
 
-    def look_at(self, middle: NDArray[np.float64], blocks: VoxelBlocks) -> None:
-        """Centre the window on a point (3,), metres, if its centre is more than ``MARGIN`` blocks away."""
+    def moved(self, middle: NDArray[np.float64]) -> NDArray[np.int64] | None:
+        """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
+        away, so that the window can stay."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
-        if self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN:
-            return
+        stays = self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN
+        return None if stays else origin
+
+    def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
+        """Place the window at an origin (3,)."""
         self.origin = origin
         self.cells.fill(-1)
         self.stamps.fill(0)

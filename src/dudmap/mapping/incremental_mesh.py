@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.mesh import Mesh, joined
 from dudmap.mapping.volume import TsdfVolume
 
 EDGE = 4
@@ -54,6 +54,10 @@ class IncrementalMesh:
             self._coords_of = more
         self._coords_of[slots] = coords
         stale = _touched(changed)
+        if self._volume.pager is not None:  # a block that waits on disk has left its slot, not the map
+            corners = np.array([[i, j, k] for i in (-1, EDGE) for j in (-1, EDGE) for k in (-1, EDGE)], dtype=np.int32)
+            away = self._volume.pager.is_away((stale[:, None] * EDGE + corners).reshape(-1, 3))
+            stale = stale[~np.any(away.reshape(-1, 8), axis=1)]
         if len(stale) == 0:
             return removed
         meshes = self._extract(stale)
@@ -67,17 +71,7 @@ class IncrementalMesh:
 
     def mesh(self) -> Mesh:
         """All chunks as one mesh."""
-        parts = list(self.chunks.values())
-        if not parts:
-            return _empty_mesh()
-        counts = np.array([len(part.vertices) for part in parts])
-        first = (np.cumsum(counts) - counts).astype(np.int32)
-        return Mesh(
-            np.concatenate([part.vertices for part in parts]),
-            np.concatenate([part.faces + start for part, start in zip(parts, first, strict=True)]),
-            np.concatenate([part.colors for part in parts]),
-            np.concatenate([part.normals for part in parts]),
-        )
+        return joined(list(self.chunks.values()))
 
     def _extract(self, stale: NDArray[np.int32]) -> list[Mesh]:
         """Mesh of each of these chunks (n, 3)."""
@@ -94,7 +88,7 @@ class IncrementalMesh:
         once = np.ones(len(chosen), dtype=bool)
         once[1:] = chosen[1:] != chosen[:-1]
         meshes = self._volume.extract_chunks(chosen[once], groups[once])
-        return meshes + [_empty_mesh()] * (len(stale) - len(meshes))
+        return meshes + [joined([])] * (len(stale) - len(meshes))
 
 
 def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -105,8 +99,3 @@ def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
     unique = np.unique(packed)
     axes = [(unique >> shift) & ((1 << 21) - 1) for shift in (42, 21, 0)]
     return (np.stack(axes, axis=1) - (1 << 20)).astype(np.int32)
-
-
-def _empty_mesh() -> Mesh:
-    empty = np.zeros((0, 3), dtype=np.float32)
-    return Mesh(empty, np.zeros((0, 3), dtype=np.int32), np.zeros((0, 3), dtype=np.uint8), empty)

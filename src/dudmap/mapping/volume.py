@@ -1,17 +1,17 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
-from dudmap.geometry.mesh import Mesh
+from dudmap.geometry.mesh import Mesh, joined
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.parameters import (
@@ -24,14 +24,16 @@ from dudmap.kernels.parameters import (
     RaycastResult,
     VoxelGrid,
 )
+from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
 from dudmap.mapping.block_window import BlockWindow
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.mapping.map_file import read_map, write_map
+from dudmap.mapping.memory_limit import MemoryLimit
+from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
 
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
 _MAP_IDS = itertools.count()
-FORMAT = "dudmap map 1"
 INTENSITY = 0xFF
 """Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_JUMP = 5.0
@@ -49,11 +51,14 @@ class TsdfVolume:
         config: Voxel size, truncation, weights.
         sensor: Noise of the depth readings.
         depth_max: Farthest reading that will be integrated, metres.
-        extent: Depth that the window covers, metres; None covers ``depth_max``.
         backend: Compute device, of this map alone; None takes the CPU.
+        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the blocks
+            farthest from the view wait on disk. None keeps all in memory.
+        extent: Depth that the window covers, metres; None covers ``depth_max``.
 
     Attributes:
-        blocks: The blocks of the map.
+        blocks: The blocks of the map that are in memory.
+        pager: Moves the others; None if all are in memory.
         window: Those around the view.
         voxel_size, block_size: Edge of a voxel and of a block, metres.
         band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
@@ -70,10 +75,12 @@ class TsdfVolume:
         config: VolumeConfig | None = None,
         sensor: SensorConfig | None = None,
         depth_max: float = 6.0,
-        extent: float | None = None,
         backend: Backend | None = None,
+        max_blocks: int | MemoryLimit | None = None,
+        extent: float | None = None,
     ) -> None:
         self.camera = camera
+        self.pager = None if max_blocks is None else BlockPager(max_blocks)
         self.config = config or VolumeConfig()
         self.sensor = sensor or SensorConfig()
         self.depth_max = depth_max
@@ -99,7 +106,9 @@ class TsdfVolume:
     def clear(self) -> None:
         """Remove everything that was integrated."""
         self.window = BlockWindow(self.block_size, self._window_cells)
-        self.blocks = VoxelBlocks()
+        self.blocks = VoxelBlocks() if self.pager is None else self.pager.new_blocks()
+        if self.pager is not None:
+            self.pager.clear()
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
 
@@ -110,12 +119,12 @@ class TsdfVolume:
 
     @property
     def num_blocks(self) -> int:
-        """Blocks that own voxels."""
-        return self.blocks.num_voxel_blocks
+        """Blocks that own voxels, also those that are not in memory."""
+        return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
 
     @property
     def num_free_blocks(self) -> int:
-        """Blocks known to be free space; they own no voxels."""
+        """Blocks in memory known to be free space; they own no voxels."""
         return self.blocks.num_free(self.config.free_after)
 
     @property
@@ -170,8 +179,8 @@ class TsdfVolume:
         depth[~((depth > 0) & (depth <= self.depth_max))] = 0
         if static_mask is not None:
             depth[~static_mask] = 0
-        self._frame_number += 1
         self.look_at(T_world_camera)
+        self._frame_number += 1
         self._integrator.integrate(
             self.blocks, self.window, self.camera, depth, frame.color, weights, T_world_camera, self._frame_number,
             count,
@@ -180,13 +189,13 @@ class TsdfVolume:
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
-        self.blocks, self.window = other.blocks, other.window
+        self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id = other._frame_number, other.map_id
 
-    def for_camera(self, camera: Camera) -> "TsdfVolume":
+    def for_camera(self, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> "TsdfVolume":
         """This map for frames of another camera. It takes over the blocks: this volume must not be used afterwards."""
-        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend=self.backend)
-        other.blocks, other._frame_number = self.blocks, self._frame_number
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, self.backend, max_blocks)
+        other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
         return other
 
     def take_colors(self, other: "TsdfVolume") -> None:
@@ -195,20 +204,35 @@ class TsdfVolume:
         A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
         """
         assert other.config == self.config
-        slots = self.active_slots
-        there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
-        known = there >= 0
-        intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
-        intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
-        colors[known] = other.blocks.colors[there[known]]
-        self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
-        self.blocks.colors[slots] = colors
-        self._frame_number += 1
-        self.blocks.written[slots] = self._frame_number
+        number = self._frame_number + 1
+        for first in self._visited_regions():
+            other._bring(first, first + REGION)
+            slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
+            slots = slots[slots >= 0]
+            there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
+            known = there >= 0
+            intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
+            intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
+            colors[known] = other.blocks.colors[there[known]]
+            self.blocks.geometry[slots] = (self.blocks.geometry[slots] & ~INTENSITY) | intensities
+            self.blocks.colors[slots] = colors
+            self.blocks.written[slots] = number
+            if self.pager is not None:
+                self.pager.changed(first)
+        self._frame_number = number
+
+    def page_out(self) -> None:
+        """Have all blocks wait on disk, where the map may do so, until they are needed again."""
+        if self.pager is not None:
+            self.blocks = self.pager.page_out(self.blocks, self._frame_number)
+            self.window = BlockWindow(self.block_size, self._window_cells)
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
-        self.window.look_at(T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach, self.blocks)
+        middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
+        origin = self.window.moved(middle)
+        if origin is not None:
+            self._place_window(origin)
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -268,6 +292,8 @@ class TsdfVolume:
         """
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        if self.pager is not None:
+            return joined(list(self.extract_pieces()))
         slots, blocks = self.active_slots, self.blocks
         return Mesh(
             *self.backend.extract_mesh(
@@ -275,6 +301,46 @@ class TsdfVolume:
                 self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
             )
         )  # fmt: skip
+
+    def extract_pieces(self) -> Iterator[Mesh]:
+        """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
+
+        Blocks that are not in memory come and go meanwhile; frames must not be integrated until the end.
+        """
+        reach = np.arange(-1, REGION + 1, dtype=np.int32)
+        offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+        inner = np.all((offsets >= 0) & (offsets < REGION), axis=1)
+        for first in self._visited_regions():
+            slots = self.slots_at(first + offsets)
+            exists = slots >= 0
+            if np.any(exists & inner):
+                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1))
+
+    def records(self) -> Iterator[BlockRecords]:
+        """Copies of all blocks, in parts: everything at once if it is in memory, else region by region."""
+        if self.pager is None:
+            yield self.blocks.records(np.arange(self.blocks.num_entries))
+            return
+        for first in self._visited_regions():
+            yield self.blocks.records(self.blocks.entries_in(first, first + REGION))
+
+    def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
+        """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
+        for region in regions_of(self.blocks, self.pager):
+            first = np.array(region, dtype=np.int32) * REGION
+            self._bring(first, first + REGION)
+            yield first
+        if self.pager is not None and self.window.origin is not None:
+            self._place_window(self.window.origin)
+
+    def _place_window(self, origin: NDArray[np.int64]) -> None:
+        self._bring(origin, origin + self.window.shape)
+        self.window.fill(origin, self.blocks)
+
+    def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
+        """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
+        if self.pager is not None:
+            self.pager.focus(self.blocks, low, high, self._frame_number)
 
     def _mesh_parameters(self, min_weight: int) -> MeshParameters:
         return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
@@ -318,25 +384,7 @@ class TsdfVolume:
         Raises:
             MapError: The file cannot be written.
         """
-        n, slots = self.blocks.num_entries, self.active_slots
-        try:
-            with atomic_file(path) as file:
-                np.savez_compressed(
-                    file,
-                    format=FORMAT,
-                    camera=np.array([self.camera.fx, self.camera.fy, self.camera.cx, self.camera.cy]),
-                    image=np.array([self.camera.width, self.camera.height]),
-                    config=self.config.model_dump_json(),
-                    sensor=self.sensor.model_dump_json(),
-                    depth_max=self.depth_max,
-                    coords=self.blocks.coords[:n].astype(np.int32),
-                    free_count=self.blocks.free_count[:n],
-                    entries=self.blocks.entry_of[slots],
-                    geometry=self.blocks.geometry[slots],
-                    colors=self.blocks.colors[slots],
-                )
-        except OSError as error:
-            raise MapError(f"cannot write the map to {path}: {error}") from error
+        write_map(path, self)
 
     @classmethod
     def load(cls, path: str | Path) -> "TsdfVolume":
@@ -345,23 +393,7 @@ class TsdfVolume:
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        import zipfile
-
-        try:
-            with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
-                if str(data["format"]) != FORMAT:
-                    raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
-                fx, fy, cx, cy = (float(value) for value in data["camera"])
-                width, height = (int(value) for value in data["image"])
-                volume = cls(
-                    Camera(fx, fy, cx, cy, width, height),
-                    VolumeConfig.model_validate_json(str(data["config"])),
-                    SensorConfig.model_validate_json(str(data["sensor"])),
-                    float(data["depth_max"]),
-                )
-                volume.blocks = VoxelBlocks.restored(
-                    data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
-                )
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-            raise MapError(f"{path} is not a readable map file: {error}") from error
+        content = read_map(path)
+        volume = cls(content.camera, content.config, content.sensor, content.depth_max)
+        volume.blocks = content.blocks
         return volume

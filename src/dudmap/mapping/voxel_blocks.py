@@ -1,5 +1,7 @@
 """Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,11 +14,34 @@ MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
 
+@dataclass(frozen=True, eq=False)
+class BlockRecords:
+    """Blocks taken out of a map.
+
+    Attributes:
+        coords: (n, 3) int16 block coordinates.
+        free_count: (n,) uint8 observations of emptiness.
+        owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
+        geometry, colors: (m, 512) int32 packed voxels.
+        fused: (m,) uint8 frames that were fused into a block, 255 or more.
+    """
+
+    coords: NDArray[np.int16]
+    free_count: NDArray[np.uint8]
+    owners: NDArray[np.int32]
+    geometry: NDArray[np.int32]
+    colors: NDArray[np.int32]
+    fused: NDArray[np.uint8]
+
+
 class VoxelBlocks:
     """The map's content, block by block.
 
     An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
     than their content and grow by factors.
+
+    Args:
+        slots: Number of slots to provide at the start. Those that are not used take no memory.
 
     Attributes:
         table: Hash table of entry numbers (``kernels/hashing.py``).
@@ -32,18 +57,18 @@ class VoxelBlocks:
         num_slots: Number of slots in use or released.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, slots: int = 1 << 10) -> None:
         self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
         self.coords = np.empty((1 << 12, 3), dtype=np.int16)
         self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
         self.free_count = np.zeros(1 << 12, dtype=np.uint8)
         self.num_entries = 0
-        self.geometry = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self.colors = np.zeros((1 << 10, BLOCK**3), dtype=np.int32)
-        self.entry_of = np.full(1 << 10, -1, dtype=np.int32)
-        self.slot_coords = np.zeros((1 << 10, 3), dtype=np.int16)
-        self.written = np.zeros(1 << 10, dtype=np.int32)
-        self.fused = np.zeros(1 << 10, dtype=np.uint8)
+        self.geometry = np.zeros((slots, BLOCK**3), dtype=np.int32)
+        self.colors = np.zeros((slots, BLOCK**3), dtype=np.int32)
+        self.entry_of = np.full(slots, -1, dtype=np.int32)
+        self.slot_coords = np.zeros((slots, 3), dtype=np.int16)
+        self.written = np.zeros(slots, dtype=np.int32)
+        self.fused = np.zeros(slots, dtype=np.uint8)
         self.num_slots = 0
         self._released = np.empty(0, dtype=np.int32)
 
@@ -63,12 +88,13 @@ class VoxelBlocks:
 
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
         """
+        return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
+
+    @property
+    def slot_bytes(self) -> int:
+        """Bytes of a slot."""
         slots = (self.geometry, self.colors, self.slot_coords, self.entry_of, self.written, self.fused)
-        return (
-            self.num_slots * sum(_row_bytes(array) for array in slots)
-            + self.num_entries * self._index_bytes
-            + self.table.nbytes
-        )
+        return sum(_row_bytes(array) for array in slots)
 
     @property
     def entry_bytes(self) -> float:
@@ -131,6 +157,51 @@ class VoxelBlocks:
         self._released = np.concatenate([self._released, slots[::-1]])
         return entries
 
+    def entries_in(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Entries (n,) of the blocks from ``low`` up to, not including, ``high`` (3,), ascending."""
+        coords = self.coords[: self.num_entries]
+        return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
+
+    def records(self, entries: NDArray[np.integer]) -> BlockRecords:
+        """Copies of the blocks of entries (n,)."""
+        slots = self.slot_of[entries]
+        owners = np.flatnonzero(slots >= 0).astype(np.int32)
+        slots = slots[owners]
+        return BlockRecords(
+            self.coords[entries], self.free_count[entries], owners,
+            self.geometry[slots], self.colors[slots], self.fused[slots],
+        )  # fmt: skip
+
+    def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
+        """Forget entries (n,) and their voxels. The other entries are numbered anew; slots keep their numbers."""
+        n = self.num_entries
+        slots = self.slot_of[entries]
+        slots = np.sort(slots[slots >= 0])
+        kept = np.ones(n, dtype=bool)
+        kept[entries] = False
+        self.entry_of[slots] = -1
+        self.geometry[slots] = self.colors[slots] = 0
+        self.written[slots] = frame_number
+        self._released = np.concatenate([self._released, slots[::-1]])
+        number = (np.cumsum(kept) - 1).astype(np.int32)
+        owned = self.active_slots
+        self.entry_of[owned] = number[self.entry_of[owned]]
+        m = int(np.count_nonzero(kept))
+        for array, unused in ((self.coords, 0), (self.slot_of, -1), (self.free_count, 0)):
+            array[:m] = array[:n][kept]
+            array[m:n] = unused
+        self.num_entries = m
+        self.table.fill(hashing.EMPTY)
+        hashing.rebuild(self.table, self.coords, m)
+
+    def insert(self, records: BlockRecords, frame_number: int) -> None:
+        """Add blocks, none of which is known."""
+        entries = self.entries_at(records.coords, len(records.coords))
+        self.free_count[entries] = records.free_count
+        slots = self.allocate(entries[records.owners], frame_number)
+        self.geometry[slots], self.colors[slots] = records.geometry, records.colors
+        self.fused[slots] = records.fused
+
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
         entries = hashing.find_all(self.table, self.coords, coords)
@@ -153,7 +224,12 @@ class VoxelBlocks:
         geometry: NDArray[np.int32],
         colors: NDArray[np.int32],
     ) -> "VoxelBlocks":
-        """Blocks of a map file: all entries, and entry and voxels of each slot."""
+        """Blocks of a map file: all entries, and entry and voxels of each slot.
+
+        Raises:
+            ValueError: The arrays do not belong together, or a block is there twice.
+        """
+        _check_restored(coords, free_count, entries, geometry, colors)
         blocks, n, m = cls(), len(coords), len(entries)
         blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
         blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int16), free_count.copy(), n
@@ -165,6 +241,29 @@ class VoxelBlocks:
         blocks.slot_of = np.full(n, -1, dtype=np.int32)
         blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
         return blocks
+
+
+def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
+    """Check types, shapes and ranges of the arrays of a map file, which kernels take as they are.
+
+    Raises:
+        ValueError: They are not those of a map.
+    """
+    n, m = len(coords), len(entries)
+    wanted = {
+        "coords": (coords, np.int32, (n, 3)), "free_count": (free_count, np.uint8, (n,)),
+        "entries": (entries, np.int32, (m,)), "geometry": (geometry, np.int32, (m, BLOCK**3)),
+        "colors": (colors, np.int32, (m, BLOCK**3)),
+    }  # fmt: skip
+    for name, (array, kind, shape) in wanted.items():
+        if array.dtype != kind or array.shape != shape:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {np.dtype(kind)} {shape}")
+    if m and not (0 <= entries.min() and entries.max() < n and len(np.unique(entries)) == m):
+        raise ValueError("the voxels of a block belong to no block, or two to one")
+    if n and np.abs(coords.astype(np.int64)).max() > np.iinfo(np.int16).max:
+        raise ValueError("a block lies farther away than block coordinates reach")
+    if len(np.unique(coords, axis=0)) != n:
+        raise ValueError("a block is there twice")
 
 
 def grown(array: NDArray, capacity: int, value: int) -> NDArray:

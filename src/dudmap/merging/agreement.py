@@ -26,10 +26,14 @@ CLEAR_DISTANCE = 0.1
 bent map shift surface by centimetres, what is another place by decimetres."""
 MAX_DENIED = 0.01
 """Largest share of the compared surface that free space may deny. Runs of one place have up to 0.0014 (a real desk, two
-parts of one recording) or 0 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12."""
+parts of one recording) or 0 to 0.006 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12,
+floors of a building with other plants and boxes 0.006 to 0.024."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
 have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
+MANY_COLOR_SHARE = 0.985
+"""The same share for pairs among many runs, most of which do not show one place: floors of a rendered building with the
+same walls and doors and other pictures have up to 0.978, two maps of one floor 0.994 to 1.0."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,16 +55,16 @@ class Agreement:
     color_correlation: float
     color_share: float
 
-    def rejection_reason(self) -> str:
+    def rejection_reason(self, min_color_share: float = MIN_COLOR_SHARE) -> str:
         """Sentence on the first check that fails, empty if the maps can be joined."""
         if self.area < MIN_AREA or self.overlap < MIN_OVERLAP:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
         if self.denied > MAX_DENIED:
-            return f"{self.denied:.0%} of the surface of one lies in free space of the other: the geometry disagrees"
-        if self.color_correlation < MIN_CORRELATION or self.color_share < MIN_COLOR_SHARE:
+            return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
+        if self.color_correlation < MIN_CORRELATION or self.color_share < min_color_share:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
-                f"{self.color_share:.0%} of the common surface has the same colour"
+                f"{self.color_share:.1%} of the common surface has the same colour"
             )
         return ""
 

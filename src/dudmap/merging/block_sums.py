@@ -41,11 +41,28 @@ class BlockSums:
     color: NDArray[np.int32]
     free: NDArray[np.int64]
 
-    def __add__(self, other: "BlockSums") -> "BlockSums":
-        """Sums of both over the same blocks."""
-        assert np.array_equal(self.coords, other.coords)
-        names = list(self.__dataclass_fields__)[1:]
-        return BlockSums(self.coords, *(getattr(self, name) + getattr(other, name) for name in names))
+    @classmethod
+    def zeros(cls, coords: NDArray[np.int32]) -> "BlockSums":
+        """Sums over no map."""
+        shape = len(coords), VOXELS
+
+        def zeros(*shape: int, kind: type = np.int32) -> NDArray:
+            return np.zeros(shape, kind)
+
+        return cls(
+            coords, zeros(*shape), zeros(*shape, kind=np.int64), zeros(*shape), zeros(*shape), zeros(*shape),
+            zeros(*shape, 3), zeros(len(coords), kind=np.int64),
+        )  # fmt: skip
+
+    def rows(self, rows: NDArray[np.intp]) -> "BlockSums":
+        """Sums over some of the blocks."""
+        return BlockSums(*(getattr(self, name)[rows] for name in self.__dataclass_fields__))
+
+    def add(self, rows: NDArray[np.intp], other: "BlockSums") -> None:
+        """Add sums over the same blocks as ``rows`` (k,) of these."""
+        assert np.array_equal(self.coords[rows], other.coords)
+        for name in list(self.__dataclass_fields__)[1:]:
+            getattr(self, name)[rows] += getattr(other, name)
 
 
 def block_sums(

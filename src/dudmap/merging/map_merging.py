@@ -1,18 +1,22 @@
 """Joining two saved maps: relative pose, refinement, checks, fusion."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import SensorConfig
 from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.agreement import Agreement, agreement
+from dudmap.merging.agreement import MIN_COLOR_SHARE, Agreement, agreement
 from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
 from dudmap.merging.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
+from dudmap.places.place_recognition import Keyframe
 from dudmap.places.saved_map import SavedMap
 
 SURFACE_POINTS = 20_000
@@ -20,6 +24,7 @@ SURFACE_POINTS = 20_000
 MIN_KEYFRAMES, MIN_FEATURES = 2, 40
 """Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
 features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
+NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
 MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
 """Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
 degrees: that of a relocalised frame (``relocalization.max_distance``)."""
@@ -55,25 +60,54 @@ class MapPair:
         return out
 
 
+@dataclass(frozen=True, eq=False)
+class MapSurface:
+    """A map with points on its surface, to be compared with others."""
+
+    volume: TsdfVolume
+    points: SurfacePoints
+
+    @classmethod
+    def of(cls, saved: SavedMap) -> "MapSurface":
+        """That of a saved map.
+
+        Raises:
+            MapError: The map has no surface.
+        """
+        positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
+        return cls(saved.volume, surface_points(saved.volume, positions, SURFACE_POINTS))
+
+
 def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
     """Find the relative pose of two maps and decide whether they show the same place.
-
-    Relative poses that the features suggest are refined and checked one after the other; the first that passes all
-    checks is taken.
 
     Raises:
         ConfigError: The voxels differ in size.
         MapError: A map has no surface.
     """
     check_voxel_sizes([a.volume, b.volume])
-    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
-    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    found = suggested_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
     if not found:
-        return MapPair(None, "too few places of one were recognised in the other at the same relative pose")
-    of_a, of_b = (surface_points(saved.volume, _positions(saved), SURFACE_POINTS) for saved in (a, b))
+        return MapPair(None, NOT_RECOGNISED)
+    return decided(MapSurface.of(a), MapSurface.of(b), found)
+
+
+def suggested_poses(
+    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
+) -> list[Hypothesis]:
+    """Relative poses that enough features of two maps with these keyframes suggest, best first."""
+    found = relative_poses(a, b, camera, sensor=sensor)
+    return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+
+
+def decided(
+    a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], min_color_share: float = MIN_COLOR_SHARE
+) -> MapPair:
+    """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
+    is taken."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a.volume, b.volume, of_a, of_b, hypothesis)
+        pair = _checked(a, b, hypothesis, min_color_share)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -86,23 +120,18 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _positions(saved: SavedMap) -> NDArray[np.float64]:
-    """Positions (k, 3) of the keyframes."""
-    return np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
-
-
-def _checked(a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, hypothesis: Hypothesis) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, min_color_share: float) -> MapPair:
     """Refine a relative pose and check what follows from it."""
-    aligned = align_maps(a, b, of_a, of_b, hypothesis.T_a_b)
+    aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
         return MapPair(None, "their surfaces do not settle on each other", hypothesis, aligned)
     if aligned.stiffness < MIN_STIFFNESS:
         return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
     correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b
-    middle = of_b.points.mean(axis=0)
+    middle = b.points.points.mean(axis=0)
     moved = np.linalg.norm(correction[:3, :3] @ middle + correction[:3, 3] - middle)
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
-    checked = agreement(a, b, of_a, of_b, aligned.T_a_b)
-    reason = checked.rejection_reason()
+    checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
+    reason = checked.rejection_reason(min_color_share)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

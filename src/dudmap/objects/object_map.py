@@ -58,7 +58,7 @@ class ObjectVolume(TsdfVolume):
     """
 
     def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
-        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, EXTENT)
+        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, extent=EXTENT)
         self._T_object_window = np.eye(4)
         self._T_object_window[2, 3] = -self._reach
 

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file
 from dudmap.errors import DudmapError
 from dudmap.frames.frame import Frame
 
@@ -65,7 +66,8 @@ def save_sheet(
     _show(axes[1, 1], "rendered map: colour", np.where(view.depth[..., None] > 0, view.color, 255))
     _show(axes[1, 2], "rendered map: shape", shaded(view, T_world_camera))
     try:
-        figure.savefig(path, dpi=80, format="png")
+        with atomic_file(path) as file:
+            figure.savefig(file, dpi=80, format="png")
     except OSError as error:
         raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
 
@@ -101,7 +103,8 @@ def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
         drawn.append(_show(axes[2 * row + 1, column], "", shown, cmap="viridis", limits=(0, far)))
     figure.colorbar(drawn[0], ax=axes.ravel().tolist(), label="m", shrink=0.5)
     try:
-        figure.savefig(path, dpi=80, format="png")
+        with atomic_file(path) as file:
+            figure.savefig(file, dpi=80, format="png")
     except OSError as error:
         raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
 

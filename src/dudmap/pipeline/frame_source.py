@@ -58,26 +58,32 @@ class SourceFrame(NamedTuple):
 
 
 def read_ahead(
-    sequence: "Sequence", count: int, ahead: int = AHEAD, masks: "MaskFolder | None" = None, slam: "Slam | None" = None
+    sequence: "Sequence",
+    count: int,
+    ahead: int = AHEAD,
+    masks: "MaskFolder | None" = None,
+    slam: "Slam | None" = None,
+    start: int = 0,
 ) -> "Generator[FrameRead]":
-    """First ``count`` frames in order, read and prepared for ``slam`` by one thread up to ``ahead`` frames ahead."""
+    """Frames ``start`` to ``count`` - 1 in order; one thread reads and prepares them, up to ``ahead`` frames ahead."""
     reader = ThreadPoolExecutor(1, thread_name_prefix="dudmap-reader")
     pending: deque[Future[FrameRead]] = deque()
     try:
-        for index in range(count + ahead):
+        for index in range(start, count + ahead):
             if index < count:
                 pending.append(reader.submit(_read, sequence, index, masks, slam))
-            if index >= ahead:
+            if index >= start + ahead:
                 yield pending.popleft().result()
     finally:
         reader.shutdown(cancel_futures=True)
 
 
 def in_order(
-    sequence: "Sequence", count: int, ahead: int, masks: "MaskFolder | None", slam: "Slam"
+    sequence: "Sequence", count: int, ahead: int, masks: "MaskFolder | None", slam: "Slam", start: int = 0
 ) -> "Generator[SourceFrame]":
-    """Frames of a recording in order; none is dropped."""
-    for index, read in enumerate(read_ahead(sequence, count, ahead, masks, slam if ahead else None)):
+    """Frames of a recording in order, from number ``start`` on; none is dropped."""
+    frames = read_ahead(sequence, count, ahead, masks, slam if ahead else None, start)
+    for index, read in enumerate(frames, start):
         yield SourceFrame(index, read)
 
 

@@ -16,7 +16,7 @@ from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.replay import Arrival, newest
 from dudmap.pipeline.run import process_source
-from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, write_run_folder
+from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
@@ -58,17 +58,17 @@ def run_live(
 
     Raises:
         CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
-        DudmapError: The folder cannot be written, or no frame could be tracked.
+        DudmapError: Another process writes into the folder, it cannot be written, or no frame could be tracked.
     """
     from dudmap.slam import Slam
 
     out, calibration = Path(out), calibration or camera.calibration
     metrics = RunRecord(dropped=0)
     slam = Slam(camera.camera, config, calibration=calibration)
-    prepare_run_folder(out, None, save_masks=save_masks)
-    recorder = None if record is None else Recorder(Path(record), camera.camera, camera.calibration)
-    stopped = ""
-    with RunProgress(max_frames or camera.length, bar=progress) as display:
+    stopped, defect = "", False
+    with locked(out), RunProgress(max_frames or camera.length, bar=progress) as display:
+        prepare_run_folder(out, None, save_masks=save_masks)
+        recorder = None if record is None else Recorder(Path(record), camera.camera, camera.calibration)
         try:
             display.working("loading kernels")
             first = Slam(camera.camera, config, calibration=calibration)
@@ -87,12 +87,12 @@ def run_live(
             stopped = str(error)
             raise type(error)(f"{stopped}; the trajectory and the map up to there are in {out}") from error
         except BaseException as error:
-            stopped = repr(error)
+            stopped, defect = repr(error), not isinstance(error, OSError)
             raise
         finally:
             camera.close()
             display.working("writing")
-            report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map)
+            report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map, defect=defect)
             for observer in observers:
                 observer.finish(out)
             _finish(recorder, display)

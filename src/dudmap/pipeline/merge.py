@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import DudmapError, MapError
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
@@ -51,7 +52,7 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     if pair.T_a_b is None:
         raise MapError(f"{a} and {b} are not merged: {pair.reason}")
     merged = merged_map(*maps, pair.T_a_b)
-    trajectories = [*_trajectories(a, np.eye(4)), *_trajectories(b, pair.T_a_b)]
+    trajectories = [*run_trajectories(a, np.eye(4)), *run_trajectories(b, pair.T_a_b)]
     prepare_run_folder(out, None, save_masks=False)
     names = ["trajectory.txt", *(f"trajectory-{number}.txt" for number in range(2, len(trajectories) + 1))]
     for name, trajectory in zip(names, trajectories, strict=True):
@@ -61,15 +62,15 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     mesh = merged.volume.extract_mesh()
     mesh.save(out / "mesh.ply")
     if (a / "config.toml").is_file():
-        (out / "config.toml").write_bytes((a / "config.toml").read_bytes())
+        write_bytes(out / "config.toml", (a / "config.toml").read_bytes())
     tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
     tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
     tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
-    (out / MERGE_FILE).write_text(json.dumps(tree, indent=2) + "\n", encoding="utf-8")
+    write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
     return MergeReport(out, pair, tree)
 
 
-def _trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
+def run_trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
     """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several."""
     names = ["trajectory.txt"]
     if (folder / MERGE_FILE).is_file():

@@ -1,6 +1,7 @@
 """Metrics of a run, collected frame by frame."""
 
 import csv
+import io
 import json
 import time
 from dataclasses import dataclass, field
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_file, write_text
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
 from dudmap.pipeline.environment import peak_rss_mb
 
@@ -53,6 +55,14 @@ class RunRecord:
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
     _cpu_start: float = field(default_factory=time.process_time)
+
+    def elapsed(self) -> tuple[float, float]:
+        """Seconds, and seconds of processor time, since the run began."""
+        return time.perf_counter() - self._wall_start, time.process_time() - self._cpu_start
+
+    def continue_from(self, wall_s: float, cpu_s: float) -> None:
+        """Count the time on from that of a process that ended."""
+        self._wall_start, self._cpu_start = time.perf_counter() - wall_s, time.process_time() - cpu_s
 
     def add(
         self,
@@ -104,14 +114,15 @@ class RunRecord:
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
         columns = list(dict.fromkeys(key for row in self.rows for key in row))
-        with path.open("w", newline="", encoding="utf-8") as file:
-            writer = csv.DictWriter(file, columns, restval=0)
-            writer.writeheader()
-            writer.writerows(self.rows)
+        text = io.StringIO(newline="")
+        writer = csv.DictWriter(text, columns, restval=0)
+        writer.writeheader()
+        writer.writerows(self.rows)
+        write_text(path, text.getvalue())
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
-        path.write_text("".join(json.dumps(line) + "\n" for line in self.movers), encoding="utf-8")
+        write_text(path, "".join(json.dumps(line) + "\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:
         """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
@@ -125,7 +136,8 @@ class RunRecord:
             return
         edges = np.linspace(0, MAX_RESIDUAL, BINS + 1)
         mixture = fit_mixture(self.residuals, edges)
-        np.savez(path, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
+        with atomic_file(path) as file:
+            np.savez(file, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
         """Counts and times of all frames, under the keys of metrics.json."""

@@ -39,6 +39,7 @@ class RunProgress:
         self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="starting")
         self._times: deque[float] = deque(maxlen=30)
         self._lost = 0
+        self._said: set[str] = set()
 
     def __enter__(self) -> "RunProgress":
         self._bar.start()
@@ -74,6 +75,12 @@ class RunProgress:
     def note(self, sentence: str) -> None:
         """Print a sentence above the bar."""
         self.console.print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
+
+    def once(self, sentence: str) -> None:
+        """Print a sentence above the bar unless it was printed before."""
+        if sentence not in self._said:
+            self._said.add(sentence)
+            self.note(sentence)
 
     def working(self, what: str) -> None:
         """Show an activity other than the processing of a frame."""

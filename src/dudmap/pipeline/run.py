@@ -3,6 +3,7 @@
 import time
 from collections.abc import Callable
 from contextlib import closing
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,7 +12,8 @@ from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError
 from dudmap.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
-from dudmap.pipeline.run_folder import RunReport, prepare_run_folder, save_mask, write_run_folder
+from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
+from dudmap.pipeline.storing import RunState, RunStore, Storing
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
@@ -40,8 +42,10 @@ def run(
     calibration: "Calibration | None" = None,
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
+    max_memory: int | None = None,
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
+    storing: Storing | None = None,
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
@@ -53,7 +57,8 @@ def run(
     dynamic) with ``save_masks``, and movers/<id>.ply and .txt, mesh and poses of every rigid moving object, with
     ``movers.meshes``. Submaps that could not be merged with the largest one are written as trajectory-2.txt and
     mesh-2.ply and so on, each in its own world frame. Results of an earlier run in the same folder are removed first.
-    If the run is interrupted or fails, the results up to there are written.
+    If the run is interrupted or fails, the results up to there are written. With ``storing`` the folder also holds
+    state.db until the run is finished, from which ``dudmap.pipeline.resume.resume`` continues it.
 
     Args:
         sequence: The recording; its ground truth and masks are used for evaluation only.
@@ -76,16 +81,21 @@ def run(
         calibration: Of the colour camera; None takes that of the recording.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
+        max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
+            wait on disk. None keeps the whole map in memory. It changes no result.
         observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
+        storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
-            ``saved_map``.
-        DudmapError: The folder cannot be written, the recording cannot be used, or no frame could be tracked.
+            ``saved_map``; ``storing`` with ``live``.
+        DudmapError: Another process writes into the folder, it cannot be written, the recording cannot be used, or no
+            frame could be tracked.
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.calibration.depth_model import DepthModel
+    from dudmap.mapping.memory_limit import MemoryLimit
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -100,72 +110,164 @@ def run(
         )
     if saved_map is None and localize:
         raise ConfigError("there is nothing to localize in; name the run folder of a saved map (--map)")
+    if max_memory is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a memory limit, but two passes need two maps; expected 1 pass")
     if saved_map is not None and passes == 2:
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
+    if storing is not None and live:
+        raise ConfigError("a live replay cannot be stored: it does not stop for what is missed; drop live or storing")
     given_masks = None if masks is None else _open_masks(masks, sequence)
     model = None if depth_model is None else DepthModel.load(Path(depth_model))
     calibration = calibration or sequence.calibration
     slam = Slam(
         sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
-        localize=localize,
+        localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
     )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
-    finished: tuple[Slam, RunRecord] | None = None
-    prepare_run_folder(out, masks, save_masks=save_masks)
-    stopped = ""
-    with RunProgress(count * passes, bar=progress) as display:
+    state = RunState(slam, record, calibration, model)
+    display = RunProgress(count * passes, bar=progress)
+    job = Job(
+        sequence,
+        config,
+        out,
+        count,
+        display,
+        given_masks,
+        save_masks,
+        save_map,
+        ahead,
+        live,
+        passes,
+        observe,
+        observers,
+    )
+    with locked(out):
+        prepare_run_folder(out, masks, save_masks=save_masks)
+        store = None if storing is None else RunStore(out, storing.every, display.note)
+        if store is not None and storing is not None:
+            options = {
+                "recording": storing.recording, "report": storing.report, "every": storing.every, "count": count,
+                "masks": None if masks is None else str(Path(masks).resolve()), "save_masks": save_masks,
+                "save_map": save_map, "ahead": ahead, "passes": passes, "config": config.model_dump_json(),
+                "max_memory": max_memory,
+            }  # fmt: skip
+            store.begin(state, sequence, options)
+        return job.carry_out(state, store)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A run as it was ordered; for the attributes see ``run``."""
+
+    sequence: "Sequence"
+    config: Config
+    out: Path
+    count: int
+    display: RunProgress
+    masks: "MaskFolder | None" = None
+    save_masks: bool = False
+    save_map: bool = True
+    ahead: int = AHEAD
+    live: bool = False
+    passes: int = 1
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None
+    observers: "tuple[RunObserver, ...]" = ()
+
+    def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
+        """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
+        out, display, stopped, defect = self.out, self.display, "", False
+        with display:
+            try:
+                if self.live:
+                    display.working("loading kernels")
+                    load_kernels(self._system(state, None), self.sequence, self.count)
+                self._process(state, store)
+                if len(state.slam.maps) > 1:
+                    display.note(_unmerged_submaps(state.slam))
+                if state.record.dropped:
+                    display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
+            except KeyboardInterrupt:
+                stopped = f"interrupted after {len(state.record.rows)} frames{_of_second(state.finished)}"
+                raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+            except DudmapError as error:
+                stopped = str(error)
+                raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
+            except BaseException as error:
+                stopped, defect = repr(error), not isinstance(error, OSError)
+                raise
+            finally:
+                report = self._finish(state, store, stopped, defect=defect)
+        record = state.record
+        if record.rows and not len(report.trajectory):
+            raise DudmapError(
+                f"none of the {self.count} frames could be tracked; the first: {record.lost[0]['reason']}"
+            )
+        if not record.rows:
+            raise DatasetError(f"none of the {self.count} frames could be read; the first: {record.unreadable[0]}")
+        return report
+
+    def _process(self, state: RunState, store: RunStore | None) -> None:
+        """Process the frames of all passes that are left."""
+        for number in range(state.number, self.passes):
+            if number > state.number:
+                state.finished = state.slam, state.record
+                masked = state.record.masked and 0
+                state.slam, state.record = self._system(state, state.slam), RunRecord(masked=masked, dropped=None)
+                state.number, state.next = number, 0
+            last = number == self.passes - 1
+            for observer in self.observers:
+                if state.next:
+                    observer.resume(state.slam, self.out, self.count, state.next)
+                else:
+                    observer.start(state.slam, self.out, self.count)
+            with closing(
+                in_real_time(self.sequence, self.count, self.masks)
+                if self.live
+                else in_order(self.sequence, self.count, self.ahead, self.masks, state.slam, state.next)
+            ) as frames:
+                for frame in frames:
+                    process_source(
+                        frame,
+                        state.slam,
+                        state.record,
+                        self.display,
+                        self.out if self.save_masks and last else None,
+                        self.observe if last else None,
+                        self.observers,
+                    )
+                    state.next = frame.number + 1
+                    if store is not None:
+                        store.frame(state, frame.read.frame)
+        if store is not None:
+            store.end(state)
+
+    def _system(self, state: RunState, first_pass: "Slam | None") -> "Slam":
+        """A new system for this recording."""
+        from dudmap.slam import Slam
+
+        return Slam(
+            self.sequence.camera, self.config, first_pass=first_pass, depth_model=state.model,
+            calibration=state.calibration,
+        )  # fmt: skip
+
+    def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
+        """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
+        self.display.working("writing")
+        slam, record = state.slam, state.record
+        if stopped and state.finished is not None:  # the first pass is complete, the second is not
+            slam, record = state.finished
+        complete = False
         try:
-            if live:
-                display.working("loading kernels")
-                load_kernels(Slam(sequence.camera, config, calibration=calibration), sequence, count)
-            for number in range(passes):
-                if number > 0:
-                    finished = slam, record
-                    slam = Slam(sequence.camera, config, first_pass=slam, depth_model=model, calibration=calibration)
-                    record = RunRecord(masked=record.masked and 0, dropped=None)
-                last = number == passes - 1
-                for observer in observers:
-                    observer.start(slam, out, count)
-                with closing(
-                    in_real_time(sequence, count, given_masks)
-                    if live
-                    else in_order(sequence, count, ahead, given_masks, slam)
-                ) as frames:
-                    for frame in frames:
-                        process_source(
-                            frame,
-                            slam,
-                            record,
-                            display,
-                            out if save_masks and last else None,
-                            observe if last else None,
-                            observers,
-                        )
-            if len(slam.maps) > 1:
-                display.note(_unmerged_submaps(slam))
-            if record.dropped:
-                display.note(f"live: {record.dropped} of {count} frames were dropped")
-        except KeyboardInterrupt:
-            stopped = f"interrupted after {len(record.rows)} frames{_of_second(finished)}"
-            raise KeyboardInterrupt(f"{stopped}; {_saved(finished)} in {out}") from None
-        except DudmapError as error:
-            stopped = str(error)
-            raise type(error)(f"{stopped}; {_saved(finished)} in {out}") from error
-        except BaseException as error:
-            stopped = repr(error)
-            raise
+            report = write_run_folder(
+                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map, defect=defect
+            )
+            for observer in self.observers:
+                observer.finish(self.out)
+            complete = not stopped
         finally:
-            display.working("writing")
-            if stopped and finished is not None:  # the first pass is complete, the second is not
-                slam, record = finished
-            report = write_run_folder(out, slam, record, sequence, config, stopped, save_map=save_map)
-            for observer in observers:
-                observer.finish(out)
-    if record.rows and not len(report.trajectory):
-        raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
-    if not record.rows:
-        raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
-    return report
+            if store is not None:
+                store.close(finished=complete)
+        return report
 
 
 def _unmerged_submaps(slam: "Slam") -> str:
@@ -206,6 +308,8 @@ def process_source(
     if isinstance(read.frame, FrameError):
         record.unreadable.append(str(read.frame))
         display.note(f"skipped: {read.frame}")
+        for observer in observers:
+            observer.event("unreadable", frame=index, reason=str(read.frame))
         return
     true_mask = read.true_mask
     if isinstance(true_mask, FrameError):
@@ -224,11 +328,17 @@ def process_source(
     delays = {} if source.arrival is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     if mask_folder is not None:
-        save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+        try:
+            save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+        except OSError as error:
+            display.once(f"masks cannot be written: {error}; make room on the disk of the run folder")
     if observe is not None:
         observe(index, read, result)
     for observer in observers:
-        observer.frame(index, read, result, 1000 * (end - start))
+        try:
+            observer.frame(index, read, result, 1000 * (end - start))
+        except OSError as error:
+            display.once(f"images for the report cannot be written: {error}; make room on the disk of the run folder")
     if result.calibrated:
         display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
     display.frame(index, result, record.dropped)

@@ -1,7 +1,8 @@
 """The run folder: creation, cleaning and writing of all result files."""
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -10,13 +11,17 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
+from dudmap.geometry.mesh_pieces import save_pieces
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.pipeline.storing import FILES as STATE_FILES
 from dudmap.sequences import is_recording
+from dudmap.state.run_lock import RunLock
 
 if TYPE_CHECKING:
     from dudmap.cameras import LiveCamera
@@ -29,6 +34,11 @@ FILES = (
     "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz", "merge.json",
     "report.html",
 )  # fmt: skip
+PARTS = (
+    "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt", "thumbnails/*.jpg",
+    "crash-[0-9]*.txt",
+)  # fmt: skip
+"""Patterns of further files of a run, which are removed before the next run as well."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
@@ -52,10 +62,31 @@ class RunReport:
 
 
 def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
-    """Write a mask (H, W) as an image, 255 = dynamic."""
+    """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
     import cv2
 
-    path.write_bytes(cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes())
+    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False)
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other processes from writing into the run folder, which is created if needed.
+
+    What a process that was killed has left half written is removed.
+
+    Raises:
+        DudmapError: Another process writes into the folder, or it cannot be created or written.
+    """
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+        lock = RunLock(out)
+    except OSError as error:
+        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+    with lock:
+        for folder in (out, *(out / name for name in ("masks", "movers", "thumbnails"))):
+            for path in folder.glob(UNFINISHED):
+                path.unlink(missing_ok=True)
+        yield
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
@@ -73,14 +104,13 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
     try:
         out.mkdir(parents=True, exist_ok=True)
         probe = out / ".dudmap-probe"
-        probe.write_bytes(b"")
+        probe.touch()
         probe.unlink()
-        for name in FILES + SCORES:
+        for name in FILES + SCORES + STATE_FILES:
             (out / name).unlink(missing_ok=True)
         for mask in (out / "masks").glob("*.png"):
             mask.unlink()
-        parts = "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt", "thumbnails/*.jpg"
-        for part in (path for pattern in parts for path in out.glob(pattern)):
+        for part in (path for pattern in PARTS for path in out.glob(pattern)):
             part.unlink()
         if save_masks:
             (out / "masks").mkdir(exist_ok=True)
@@ -97,12 +127,17 @@ def write_run_folder(
     stopped: str,
     *,
     save_map: bool,
+    defect: bool = False,
 ) -> RunReport:
     """Write all files of the run folder; a file that fails does not prevent the others.
 
+    After a defect of dudmap itself, what cannot be made of the state that it left is listed under ``not_written`` in
+    metrics.json, so that the error is not replaced by another one.
+
     Raises:
-        DudmapError: A file could not be written.
+        DudmapError: A file could not be written, other than after a defect.
     """
+    foreseen = Exception if defect else (OSError, MapError)
     (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= record.metrics()
@@ -115,16 +150,20 @@ def write_run_folder(
     metrics["calibration"] = calibration.tree()
 
     def save_mesh() -> None:
-        mesh = volume.extract_mesh()
-        metrics.update(mesh_vertices=len(mesh.vertices), mesh_triangles=len(mesh.faces))
-        mesh.save(out / "mesh.ply")
+        if volume.pager is not None:  # the mesh may not fit into the memory either
+            vertices, triangles = save_pieces(volume.extract_pieces(), out / "mesh.ply")
+        else:
+            mesh = volume.extract_mesh()
+            vertices, triangles = len(mesh.vertices), len(mesh.faces)
+            mesh.save(out / "mesh.ply")
+        metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
 
     def save_metrics() -> None:
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
         metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
-        (out / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
     steps: list[Callable[[], None]] = [
         lambda: trajectory.save(out / "trajectory.txt"),
@@ -158,11 +197,13 @@ def write_run_folder(
         for step in steps:
             try:
                 step()
-            except (OSError, MapError) as error:
-                problems.append(str(error))
+            except foreseen as error:
+                problems.append(str(error) or repr(error))
     finally:
+        if problems:
+            metrics["not_written"] = problems
         save_metrics()
-    if problems:
+    if problems and not defect:
         raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
     return RunReport(out, metrics, trajectory)
 

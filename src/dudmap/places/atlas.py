@@ -15,6 +15,7 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.place_recognition import KeyframeDatabase
@@ -63,10 +64,16 @@ class Atlas:
         self.poses: list[TimedPose] = []
         self.saved: int | None = None
 
-    def go_on_in(self, saved: SavedMap, camera: Camera) -> None:
-        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera."""
+    def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
+        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera.
+
+        Args:
+            saved: The map.
+            camera: The camera.
+            max_blocks: As of ``TsdfVolume``.
+        """
         self.saved = self.current
-        self.volumes[self.current] = saved.volume.for_camera(camera)
+        self.volumes[self.current] = saved.volume.for_camera(camera, max_blocks)
         self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
 
     @property

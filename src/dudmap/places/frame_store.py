@@ -24,6 +24,8 @@ DEPTH_UNIT = 0.0005
 JPEG_QUALITY = 95
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` waits for it."""
+EncodedFrame = tuple[bytes, bytes, bytes]
+"""Depth, colour and mask of a stored frame as files."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +67,7 @@ class FrameStore:
         Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
         counts: Number of fused frames that each represents.
         submaps: Numbers of their submaps.
+        archived: Returns a frame that is not in the file of this store, but in the database of a continued run.
     """
 
     def __init__(
@@ -83,10 +86,12 @@ class FrameStore:
         self.Ts_world_camera: list[NDArray[np.float64]] = []
         self.counts: list[int] = []
         self.submaps: list[int] = []
-        self._offsets: list[tuple[int, int, int, int]] = []  # start in the file; bytes of depth, colour, mask
+        self.archived: Callable[[int], EncodedFrame] | None = None
+        # start in the file; bytes of depth, colour, mask; None for an archived frame
+        self._offsets: list[tuple[int, int, int, int] | None] = []
         self._file: IO[bytes] | None = None
         self._encoder: ThreadPoolExecutor | None = None
-        self._pending: deque[Future[tuple[bytes, bytes, bytes]]] = deque()
+        self._pending: deque[Future[EncodedFrame]] = deque()
 
     @classmethod
     def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
@@ -149,13 +154,10 @@ class FrameStore:
         """The stored frame of a number, 0 = oldest."""
         import cv2
 
-        self._write(0)
-        assert self._file is not None
-        start, *sizes = self._offsets[number]
-        self._file.seek(start)
+        kinds = cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE
         images = [
-            cv2.imdecode(np.frombuffer(self._file.read(size), np.uint8), flags)
-            for size, flags in zip(sizes, (cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE), strict=True)
+            cv2.imdecode(np.frombuffer(part, np.uint8), flags)
+            for part, flags in zip(self.encoded(number), kinds, strict=True)
         ]
         steps, bgr, mask = (np.asarray(image) for image in images)
         depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
@@ -163,6 +165,29 @@ class FrameStore:
         frame = Frame(self.timestamps[number], depth, rgb, self.color_timestamps[number])
         frame = frame if self.registered is None else self.registered(frame)
         return StoredFrame(frame, mask > 0, self.Ts_world_camera[number], self.counts[number])
+
+    def encoded(self, number: int) -> EncodedFrame:
+        """The files of a stored frame."""
+        self._write(0)
+        place = self._offsets[number]
+        if place is None:
+            assert self.archived is not None
+            return self.archived(number)
+        assert self._file is not None
+        start, *sizes = place
+        self._file.seek(start)
+        depth, color, mask = (self._file.read(size) for size in sizes)
+        return depth, color, mask
+
+    def places(self) -> list[object]:
+        """Where each stored frame is in the file, never the same for two frames; waits until all are encoded."""
+        self._write(0)
+        return list(self._offsets)
+
+    def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
+        """Take the frames, whose times and poses are set, from an archive."""
+        self.archived = archived
+        self._offsets = [None] * len(self)
 
     def __iter__(self) -> Iterator[StoredFrame]:
         return (self[number] for number in range(len(self)))
@@ -207,7 +232,7 @@ class FrameStore:
             self._offsets.append((start, len(parts[0]), len(parts[1]), len(parts[2])))
 
 
-def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> tuple[bytes, bytes, bytes]:
+def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:
     """Depth as 16-bit PNG, exposed colour as JPEG, static mask as 1-bit PNG."""
     import cv2
 

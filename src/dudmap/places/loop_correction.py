@@ -92,8 +92,10 @@ class LoopCorrector:
         Ts_new = optimize(Ts, edges)
         if not np.all(np.isfinite(Ts_new)):
             return None
+        self.atlas.volume.page_out()  # two maps need not fit into the memory
         volume = self.atlas.make_volume()
         history.reintegrate(volume, nodes, list(Ts_new))
+        volume.page_out()
         if self._fits_worse(volume, nodes, Ts, Ts_new):
             return None
         self.edges.append(loop)

@@ -1,7 +1,6 @@
 """A map on disk that a later run goes on in: its volume, its keyframes and how well frames used to fit it."""
 
-import zipfile
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
 from dudmap.errors import ConfigError, MapError
+from dudmap.input_files import DAMAGE, open_arrays
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.place_recognition import Keyframe, PlacedFeatures
 from dudmap.tracking.quality_monitor import RegistrationHistory
@@ -103,7 +103,7 @@ def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistor
         MapError: The file is missing, damaged or of a newer version.
     """
     try:
-        with Path(path).open("rb") as file, np.load(file, allow_pickle=False) as data:
+        with open_arrays(path) as data:
             kind, _, version = str(data["format"]).rpartition(" ")
             if kind != KIND or not version.isdigit():
                 raise MapError(f"{path} is no keyframe file of dudmap: its format is {str(data['format'])!r}")
@@ -111,6 +111,7 @@ def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistor
                 raise MapError(
                     f"{path} has version {version} and this program reads up to {VERSION}; update dudmap to use the map"
                 )
+            _check_arrays(data)
             ends = np.cumsum(data["counts"])[:-1]
             points = np.split(data["points"].astype(np.float64), ends)
             descriptors = np.split(data["descriptors"].astype(np.float32), ends)
@@ -126,8 +127,32 @@ def load_keyframes(path: str | Path) -> tuple[list[Keyframe], RegistrationHistor
                 *(tuple(float(x) for x in data[name]) for name in ("residuals", "shares", "colors"))
             )
             return keyframes, registrations, float(data["voxel_size"])
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zipfile.LargeZipFile) as error:
+    except DAMAGE as error:
         raise MapError(f"{path} is not a readable keyframe file: {error}") from error
+
+
+def _check_arrays(data: "Mapping[str, NDArray]") -> None:
+    """Check the arrays of a keyframe file.
+
+    Raises:
+        ValueError: Their types, shapes or values are not those of keyframes.
+    """
+    n, total = len(data["counts"]), len(data["points"])
+    wanted = {
+        "counts": ("iu", (n,)), "timestamps": ("f", (n,)), "Ts_world_camera": ("f", (n, 4, 4)),
+        "points": ("f", (total, 3)), "descriptors": ("f", (total, 128)), "residuals": ("f", None),
+        "shares": ("f", None), "colors": ("f", None), "voxel_size": ("f", ()),
+    }  # fmt: skip
+    for name, (kinds, shape) in wanted.items():
+        array = data[name]
+        if array.dtype.kind not in kinds or array.shape != (shape if shape is not None else (array.size,)):
+            raise ValueError(f"{name} is {array.dtype} {array.shape}")
+    if np.any(data["counts"] < 0) or np.any(data["counts"] > total):
+        raise ValueError("a keyframe has an impossible number of features")
+    if not all(np.isfinite(data[name]).all() for name in ("timestamps", "Ts_world_camera", "points", "descriptors")):
+        raise ValueError("a time, a pose or a feature is not finite")
+    if not data["voxel_size"] > 0:
+        raise ValueError(f"the voxel size is {data['voxel_size']} m")
 
 
 def _stacked(parts: Iterable[NDArray], width: int, dtype: type) -> NDArray:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
+from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
     from dudmap.frames.frame import Frame
@@ -156,14 +157,16 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **opti
             format lacks.
     """
     path = Path(path)
-    place, reader = _find(path)
+    with damaged(DatasetError, f"the recording {path}"):
+        place, reader = _find(path)
     given = {name: value for name, value in options.items() if value is not None}
     foreign = [f"--{name}" for name in given if name not in reader.options]
     if foreign:
         raise DatasetError(
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
         )
-    return reader(place, camera, **given)
+    with damaged(DatasetError, f"the recording {place}"):
+        return reader(place, camera, **given)
 
 
 def _find(path: Path) -> tuple[Path, Reader]:

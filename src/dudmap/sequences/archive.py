@@ -1,5 +1,6 @@
 """Recordings in archives: unpacked once into a cache, with everything refused that an image sequence does not need."""
 
+import errno
 import hashlib
 import os
 import shutil
@@ -7,7 +8,6 @@ import stat
 import tarfile
 import tempfile
 import zipfile
-import zlib
 from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
@@ -15,14 +15,11 @@ from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
 
 from dudmap.errors import DatasetError
+from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES
 
 SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 LARGEST_BYTES = 256 * 2**30
 """Largest unpacked size. The largest recording of the data sets that are read (a CoRBS scene) has less than 30 GB."""
-LARGEST_RATIO = 100
-"""Largest unpacked over packed size. Images hardly shrink, depth as text shrinks to a tenth; deflate reaches 1000."""
-RATIO_FREE_BYTES = 64 * 2**20
-"""Unpacked size below which the ratio does not matter."""
 LARGEST_COUNT = 1_000_000
 """Largest number of members, 4.6 hours of colour and depth files at 30 frames a second."""
 CHUNK = 2**20
@@ -79,7 +76,9 @@ def unpack(path: Path) -> Path:
             _unpack_into(path, content, status.st_size)
             (content.parent / ORIGIN).write_text(str(path.resolve()), encoding="utf-8")
             _publish(content.parent, place)
-    except (zipfile.BadZipFile, tarfile.TarError, EOFError, RuntimeError, NotImplementedError, zlib.error) as error:
+    except (zipfile.BadZipFile, tarfile.TarError, RuntimeError, *DAMAGE) as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            raise
         raise DatasetError(f"cannot unpack {path}: {error}") from error
     return folder
 

@@ -12,13 +12,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
+from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
 from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
+from dudmap.sequences.bag_limits import check_bag, limit_decompression
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
 from dudmap.sequences.lens import Lens
 
@@ -55,7 +58,8 @@ class RosBag:
         topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
 
     Raises:
-        DatasetError: The package rosbags is missing, the bag is damaged, topics are missing, or the intrinsics or the
+        MissingExtraError: The package rosbags is missing.
+        DatasetError: The bag is damaged, topics are missing, or the intrinsics or the
             place of the colour camera are not known.
     """
 
@@ -69,6 +73,11 @@ class RosBag:
         self._reader = _open(self.path)
         self._stream = MessageStream(self._reader)
         weakref.finalize(self, _close, self._reader, self._stream)
+        with foreign(DatasetError, f"the bag {self.path}"):
+            self._find_frames(chosen, camera)
+
+    def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
+        """Set topics, times and pairs of messages, and the cameras."""
         self._topics = bag_topics.find(self._reader.connections, chosen, str(self.path))
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
@@ -97,6 +106,10 @@ class RosBag:
         """
         index = range(len(self))[index]
         name = f"frame {index} of {self.path}"
+        with foreign(FrameError, name):
+            return self._frame(index, name)
+
+    def _frame(self, index: int, name: str) -> Frame:
         color, depth = self._messages(index)
         image = bag_images.color_of(color, f"the colour image of {name}")
         values = bag_images.depth_of(depth, self.camera.depth_scale, f"the depth image of {name}")
@@ -118,6 +131,10 @@ class RosBag:
     @cached_property
     def ground_truth(self) -> Trajectory | None:
         """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
+        with foreign(DatasetError, f"the poses in /tf of {self.path}"):
+            return self._true_poses()
+
+    def _true_poses(self) -> Trajectory | None:
         world, frame = self._topics.world, self._depth_frame
         if not self._transforms.reaches(world, frame):
             return None
@@ -279,22 +296,21 @@ class RosBag:
 
 def starts_with(path: Path, magic: bytes) -> bool:
     """Whether a file starts with these bytes."""
-    with path.open("rb") as file:
+    if not path.is_file():
+        return False
+    with open_plain(path) as file:
         return file.read(len(magic)) == magic
 
 
 def _open(path: Path) -> "AnyReader":
-    try:
+    with extra("ros-bags", f"the ROS bag {path}"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError:
-        raise DatasetError(
-            f"{path} is a ROS bag, for which the package rosbags is needed; install it with pip install "
-            "'dudmap[ros-bags]'"
-        ) from None
-    if path.suffix == ".bag":
-        warm_index(path)
     try:
+        check_bag(path)
+        limit_decompression()
+        if path.suffix == ".bag":
+            warm_index(path)
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
         reader.open()
     except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base

@@ -15,6 +15,8 @@ from typing import TYPE_CHECKING, Any, BinaryIO, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.sequences.bag_limits import sqlite_uri
+
 if TYPE_CHECKING:
     from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
@@ -229,7 +231,7 @@ def read_many(path: Path, places: list[int], size: int) -> list[bytes]:
 
 
 def _sqlite_entries(part: Any, connection: "Connection") -> list[tuple[int, bytes | None]]:  # noqa: ANN401
-    with closing(sqlite3.connect(f"file:{part.path}?mode=ro&immutable=1", uri=True)) as database:
+    with closing(sqlite3.connect(sqlite_uri(part.path), uri=True)) as database:
         rows = database.execute("SELECT id, timestamp FROM messages WHERE topic_id = ?", (connection.id,)).fetchall()
         out: list[tuple[int, bytes | None]] = []
         for row, time in rows:

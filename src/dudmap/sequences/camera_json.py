@@ -1,15 +1,16 @@
 """Intrinsics of JSON files: Open3D and its recorders, NICE-SLAM, librealsense, ZED, and plain keys."""
 
-import json
+import math
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
+from dudmap.input_files import read_json
 from dudmap.sequences.intrinsics import KEYS, Intrinsics
 
 NAMES = {
@@ -63,8 +64,8 @@ def load(paths: Iterable[Path], depth_scale: float) -> Intrinsics:
 
 def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, json.JSONDecodeError) as error:
+        return read_json(path)
+    except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
 
 
@@ -89,7 +90,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     """
     values = {}
     for key, names in NAMES.items():
-        found = next((tree[name] for name in names if isinstance(tree.get(name), int | float)), None)
+        found = next((tree[name] for name in names if _is_finite(tree.get(name))), None)
         if found is not None and key != "depth_scale":
             values[key] = float(found)
     K = _numbers(tree.get("intrinsic_matrix", tree.get("K")), 9)
@@ -98,7 +99,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
         K = K.T if K[2, 0] or K[2, 1] else K
         values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
     lens = tree.get("coeffs", tree.get("disto", tree.get("distortion")))
-    if isinstance(lens, list) and all(isinstance(number, int | float) for number in lens[:5]):
+    if isinstance(lens, list) and all(map(_is_finite, lens[:5])):
         values |= dict(zip(KEYS[7:], map(float, lens[:5]), strict=False))
     return values if all(key in values for key in KEYS[:4]) else None
 
@@ -111,7 +112,7 @@ def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
         return None
     for name in NAMES["depth_scale"]:
         value = tree.get(name)
-        if isinstance(value, int | float) and value > 0:
+        if _is_finite(value) and value > 0:
             return float(value) if value >= 1 else 1.0 / value
     return next((scale for below in tree.values() if (scale := _depth_scale(below))), None)
 
@@ -125,11 +126,15 @@ def _motion(tree: Any, default: NDArray[np.float64]) -> NDArray[np.float64]:  # 
     return default
 
 
+def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON value
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
 def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
     """Numbers (count,) of a list or of a list of rows; None if it is something else."""
     if not isinstance(value, list):
         return None
     flat = [number for row in value for number in (row if isinstance(row, list) else [row])]
-    if len(flat) != count or not all(isinstance(number, int | float) for number in flat):
+    if len(flat) != count or not all(map(_is_finite, flat)):
         return None
     return np.array(flat, dtype=np.float64)

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.association import TimedFile, read_rows
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import read_text
 from dudmap.sequences import intrinsics
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
 from dudmap.sequences.poses import rigid_trajectory
@@ -79,7 +80,7 @@ class IclNuimLoopSequence(ImageFolder):
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         try:
-            distance = np.array(path.read_text(encoding="ascii").split(), dtype=np.float64)
+            distance = np.array(read_text(path).split(), dtype=np.float64)
         except (OSError, ValueError) as error:
             raise FrameError(f"cannot read {path}: {error}") from error
         width, height = CAMERA["width"], CAMERA["height"]
@@ -127,7 +128,7 @@ def _check_numbers(path: Path) -> None:
 def _pov_pose(path: Path) -> NDArray[np.float64]:
     """T_world_camera (4, 4) in the renderer's axes: columns right, up, direction (made orthogonal), position."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
     vectors = {}

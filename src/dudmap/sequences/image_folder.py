@@ -13,6 +13,7 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import damaged
 from dudmap.sequences import images, intrinsics
 
 PROBES = 30
@@ -74,7 +75,9 @@ class ImageFolder(ABC):
         Raises:
             FrameError: The frame cannot be read, or has another size than the recording.
         """
-        frame = self._read(index, self.camera.depth_scale)
+        index = range(len(self))[index]
+        with damaged(FrameError, f"frame {index} of {self.path}"):
+            frame = self._read(index, self.camera.depth_scale)
         if frame.depth.shape != self.camera.shape:
             raise FrameError(
                 f"frame {index}: {self._pairs[index][1].path} is {size(frame.depth)} pixels, but the recording's "

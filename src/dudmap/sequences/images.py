@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import FrameError
+from dudmap.input_files import damaged, load_array, read_bytes
+from dudmap.sequences.image_headers import check_size
 
 PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
@@ -30,9 +32,7 @@ def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
     """
     import cv2
 
-    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_COLOR)
-    if image is None:
-        raise FrameError(f"{name} is not an image that can be decoded")
+    image = _decoded(data, name, cv2.IMREAD_COLOR)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
 
 
@@ -53,9 +53,7 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
     """
     import cv2
 
-    image = cv2.imdecode(_checked(data, name), cv2.IMREAD_UNCHANGED)
-    if image is None:
-        raise FrameError(f"{name} is not an image that can be decoded")
+    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
     if image.ndim != 2:
         raise FrameError(f"the depth image {name} has {image.shape[2]} channels; expected one with 16 bit or float")
     return metres(image, depth_scale, name)
@@ -83,7 +81,7 @@ def read_depth_array(path: Path) -> NDArray[np.float32]:
         FrameError: The file is missing, damaged, or holds something else.
     """
     try:
-        metres = np.squeeze(np.load(path, allow_pickle=False))
+        metres = np.squeeze(load_array(path))
     except (OSError, ValueError, EOFError) as error:
         raise FrameError(f"cannot read the array {path}: {error}") from error
     if metres.ndim != 2 or metres.dtype.kind != "f":
@@ -101,30 +99,44 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     """
     import cv2
 
-    image = cv2.imdecode(_checked(_bytes(path), str(path)), cv2.IMREAD_GRAYSCALE)
-    if image is None:
-        raise FrameError(f"{path} is not an image that can be decoded")
+    image = _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
     return image > 127
 
 
 def _bytes(path: Path) -> bytes:
     try:
-        return path.read_bytes()
+        return read_bytes(path)
     except FileNotFoundError:
         raise FrameError(f"the listed file {path} does not exist") from None
     except OSError as error:
         raise FrameError(f"cannot read {path}: {error.strerror}") from error
 
 
+def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
+    """Image of the content of an image file.
+
+    Raises:
+        FrameError: It is truncated, damaged, too large or not an image.
+    """
+    import cv2
+
+    with damaged(FrameError, name):
+        image = cv2.imdecode(_checked(data, name), flags)
+    if image is None:
+        raise FrameError(f"{name} is not an image that can be decoded")
+    return np.asarray(image)
+
+
 def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
     """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
     raw = bytes(data)
+    if not raw:
+        raise FrameError(f"{name} is an empty file")
     if raw.startswith(PNG):
         _check_png(name, raw)
     elif raw.startswith(JPEG) and b"\xff\xd9" not in raw[-1024:]:
         raise FrameError(f"{name} is cut off: the JPEG end marker is missing")
-    if not raw:
-        raise FrameError(f"{name} is an empty file")
+    check_size(raw, name)
     return np.frombuffer(raw, dtype=np.uint8)
 
 

@@ -1,5 +1,6 @@
 """Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
 
+import math
 import re
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -11,6 +12,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import read_text
 
 DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
 DEPTH_SCALE = 5000.0
@@ -157,7 +159,7 @@ def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
         numbers = [float(field) for field in camera.split(",")]
     except ValueError:
         numbers = []
-    if len(numbers) not in (4, 6, 7):
+    if len(numbers) not in (4, 6, 7) or not all(map(math.isfinite, numbers)):
         raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
     return Intrinsics({"depth_scale": depth_scale} | _by_key(*numbers), f"the camera {camera!r}")
 
@@ -175,7 +177,7 @@ def from_file(path: Path) -> Intrinsics:
         DatasetError: The file has none of these forms, or a key is unknown or missing.
     """
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
     rows = [row for line in lines if (row := re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split())]
@@ -233,8 +235,8 @@ def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
 
 
 def _is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
     try:
-        float(text)
+        return math.isfinite(float(text))
     except ValueError:
         return False
-    return True

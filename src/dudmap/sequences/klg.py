@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import LARGEST_FILE, damaged, open_plain
 from dudmap.sequences import images, intrinsics
 from dudmap.sequences.sens import decode_values
 
@@ -78,6 +79,10 @@ class KlgRecording:
         """
         index = range(len(self))[index]
         name = f"frame {index} of {self.path}"
+        with damaged(FrameError, name):
+            return self._frame(index, name)
+
+    def _frame(self, index: int, name: str) -> Frame:
         depth_data, color_data = self._read(index)
         raw = len(depth_data) == 2 * self.camera.width * self.camera.height
         values = decode_values(depth_data, self.camera.shape, compressed=not raw, name=name)
@@ -92,7 +97,7 @@ class KlgRecording:
 
     def _read(self, index: int) -> tuple[bytes, bytes]:
         entry = self._entries[self._order[index]]
-        with self.path.open("rb") as file:
+        with open_plain(self.path) as file:
             file.seek(entry.offset)
             return file.read(entry.depth_bytes), file.read(entry.color_bytes)
 
@@ -116,7 +121,7 @@ def _read_index(path: Path) -> list[_Entry]:
     """Places of the frames, without reading the images."""
     entries = []
     size = path.stat().st_size
-    with path.open("rb") as file:
+    with open_plain(path) as file:
         head = file.read(4)
         count = struct.unpack("<i", head)[0] if len(head) == 4 else 0
         if count < 1:
@@ -127,6 +132,8 @@ def _read_index(path: Path) -> list[_Entry]:
                 raise DatasetError(f"{path} is cut off: it says {count} frames and holds {number}")
             time, depth_bytes, color_bytes = FRAME_HEADER.unpack(header)
             entries.append(_Entry(file.tell(), time, depth_bytes, color_bytes))
+            if max(depth_bytes, color_bytes) > LARGEST_FILE:
+                raise DatasetError(f"{path} is damaged: frame {number} says it has {depth_bytes + color_bytes} bytes")
             if min(depth_bytes, color_bytes) < 0 or file.seek(depth_bytes + color_bytes, 1) > size:
                 raise DatasetError(f"{path} is cut off: it says {count} frames and holds {number}")
     return entries

@@ -1,6 +1,5 @@
 """nerfstudio's transforms.json with depth images: what its converters and many phone apps export."""
 
-import json
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +10,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import read_json
 from dudmap.sequences import images, intrinsics
 from dudmap.sequences.camera_json import values_of
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder
@@ -40,10 +40,10 @@ class NerfstudioSequence(ImageFolder):
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         file = Path(path) / "transforms.json"
         try:
-            self._tree: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+            self._tree: dict[str, Any] = read_json(file)
             frames = self._tree["frames"]
             self._frames = sorted((frame for frame in frames if "depth_file_path" in frame), key=_order)
-        except (OSError, UnicodeDecodeError, json.JSONDecodeError, KeyError, TypeError) as error:
+        except (OSError, ValueError, KeyError, TypeError) as error:
             raise DatasetError(f"cannot read {file}: {error!r}") from error
         if not self._frames:
             raise DatasetError(f"{file} names no depth images: none of its {len(frames)} frames has a depth_file_path")

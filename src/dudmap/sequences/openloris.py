@@ -10,6 +10,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.association import TimedFile, associate, read_list
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import LARGEST_TREE, read_text
 from dudmap.sequences import intrinsics
 from dudmap.sequences.image_folder import ImageFolder
 
@@ -67,7 +68,7 @@ def _open(path: Path) -> "cv2.FileStorage":
     import cv2
 
     try:
-        text = path.read_text(encoding="utf-8")
+        text = read_text(path, LARGEST_TREE)
         storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import read_text
 
 
 def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float64]:
@@ -69,7 +70,7 @@ def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Traj
 
 def _numbers(path: Path) -> NDArray[np.float64]:
     try:
-        fields = path.read_text(encoding="utf-8").replace(",", " ").split()
+        fields = read_text(path).replace(",", " ").split()
         return np.array([float(field) for field in fields])
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error

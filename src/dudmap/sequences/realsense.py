@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import open_plain
 from dudmap.sequences.bag import MAGIC, MILLIMETRES, RosBag
 from dudmap.sequences.bag_index import MessageTimes
 from dudmap.sequences.lens import Lens
@@ -46,7 +47,7 @@ class RealSenseRecording(RosBag):
         """Whether a .bag or .db3 file has the topics of librealsense."""
         if path.suffix.lower() not in (".bag", ".db3") or not path.is_file():
             return False
-        with path.open("rb") as file:
+        with open_plain(path) as file:
             head = file.read(HEAD)
         return head.startswith(MAGIC[path.suffix.lower()]) and TOPICS in head
 

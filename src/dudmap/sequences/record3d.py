@@ -1,6 +1,6 @@
 """The ``.r3d`` files of the iPhone application Record3D: a ZIP archive of JPEG colour and LZFSE depth."""
 
-import json
+import struct
 import zipfile
 from pathlib import Path
 from typing import Any
@@ -9,10 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
+from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, damaged, open_plain, parse_json
 from dudmap.sequences import images, intrinsics
+
+LARGEST_COMMAND = 315 + 2359
+"""Bytes that one command of an LZFSE block can write."""
 
 
 class Record3DRecording:
@@ -39,6 +44,7 @@ class Record3DRecording:
         self.ground_truth = None
         self._lzfse = _lzfse(self.path)
         try:
+            open_plain(self.path).close()
             self._zip = zipfile.ZipFile(self.path)
         except zipfile.BadZipFile as error:
             raise DatasetError(f"{self.path} is not a whole .r3d file: {error}") from None
@@ -72,6 +78,10 @@ class Record3DRecording:
         """
         index = range(len(self))[index]
         number = self._numbers[index]
+        with damaged(FrameError, f"frame {index} of {self.path}"):
+            return self._frame(index, number)
+
+    def _frame(self, index: int, number: int) -> Frame:
         color = images.decode_color(self._member(f"rgbd/{number}.jpg"), f"rgbd/{number}.jpg of {self.path}")
         return Frame(float(self.timestamps[index]), self._depth(number), color)
 
@@ -81,6 +91,8 @@ class Record3DRecording:
     def _depth(self, number: int) -> NDArray[np.float32]:
         name = f"rgbd/{number}.depth of {self.path}"
         packed = self._member(f"rgbd/{number}.depth")
+        if largest_unpacked(packed) > RATIO_FREE_BYTES:
+            raise FrameError(f"{name} unpacks to too much; expected {self.camera.width}x{self.camera.height} floats")
         try:
             data = self._lzfse.decompress(packed)
         except self._lzfse.error as error:
@@ -91,31 +103,56 @@ class Record3DRecording:
 
     def _member(self, name: str) -> bytes:
         try:
+            if self._zip.getinfo(name).file_size > LARGEST_FILE:
+                raise FrameError(f"{name} in {self.path} has more than {LARGEST_FILE / 1e6:.0f} MB")
             return self._zip.read(name)
-        except (KeyError, zipfile.BadZipFile, EOFError, OSError) as error:
+        except (RuntimeError, *DAMAGE) as error:
             raise FrameError(f"cannot read {name} in {self.path}: {error}") from None
 
     def _metadata(self) -> tuple[Camera, tuple[int, int], NDArray[np.float64]]:
         """Colour camera, size of the depth images, and times (N,) in seconds of the frames."""
         try:
-            tree: dict[str, Any] = json.loads(self._zip.read("metadata"))
+            tree: dict[str, Any] = parse_json(self._member("metadata"))
             fx, _, _, _, fy, _, cx, cy, _ = (float(number) for number in tree["K"])  # column by column
             color = Camera(fx, fy, cx, cy, int(tree["w"]), int(tree["h"]))
             size = int(tree["dw"]), int(tree["dh"])
             stamps = tree.get("frameTimestamps") or [n / float(tree["fps"]) for n in range(max(self._numbers) + 1)]
             times = np.array([stamps[number] for number in self._numbers], dtype=np.float64)
-        except (KeyError, ValueError, TypeError, IndexError) as error:
+        except DAMAGE as error:
             raise DatasetError(f"cannot understand the metadata of {self.path}: {error!r}") from None
         if np.any(np.diff(times) <= 0):
             raise DatasetError(f"the frame times in the metadata of {self.path} do not increase")
         return color, size, times
 
 
+def largest_unpacked(packed: bytes) -> int:
+    """Upper bound of the bytes to which LZFSE data unpack, from the headers of their blocks alone.
+
+    A command of a block ``bvx2`` writes at most 315 literals and a match of 2359 bytes (reference implementation of
+    Apple, lzfse_internal.h, whose decoder does not stop at the size that the block declares); other blocks declare it.
+
+    Raises:
+        ValueError: A block is cut off or of another kind.
+    """
+    total, at = 0, 0
+    while packed[at : at + 4] != b"bvx$":
+        if (len(packed) < at + 32 and packed[at : at + 4] == b"bvx2") or len(packed) < at + 8:
+            raise ValueError("its LZFSE data are cut off")
+        kind, size = struct.unpack_from("<4sI", packed, at)
+        if kind == b"bvx2":
+            first, second, third = struct.unpack_from("<3Q", packed, at + 8)
+            literals, commands = first >> 20 & 0xFFFFF, first >> 40 & 0xFFFFF
+            total += max(size, commands * LARGEST_COMMAND)
+            at += max(third & 0xFFFFFFFF, 32) + literals + (second >> 40 & 0xFFFFF)
+        elif kind in (b"bvxn", b"bvx-"):
+            total += size
+            at += 12 + struct.unpack_from("<I", packed, at + 8)[0] if kind == b"bvxn" else 8 + size
+        else:
+            raise ValueError(f"its LZFSE data have no block at byte {at}")
+    return total
+
+
 def _lzfse(path: Path) -> Any:  # noqa: ANN401 - an optional package
-    try:
+    with extra("record3d", f"the recording {path}"):
         import lzfse  # pyright: ignore[reportMissingImports]
-    except ImportError:
-        raise DatasetError(
-            f"{path} needs the package lzfse for its depth images; install it with pip install 'dudmap[record3d]'"
-        ) from None
     return lzfse

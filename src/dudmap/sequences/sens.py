@@ -3,7 +3,7 @@
 import struct
 import zlib
 from pathlib import Path
-from typing import BinaryIO, NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import LARGEST_FILE, damaged, open_plain
 from dudmap.sequences import images, intrinsics
 
 VERSION = 4
@@ -55,7 +56,7 @@ class SensRecording:
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)
         self.name = self.path.stem
-        with self.path.open("rb") as file:
+        with open_plain(self.path) as file:
             try:
                 header = _read_header(file, self.path)
                 self._entries, poses = _read_index(file, header.num_frames)
@@ -92,7 +93,11 @@ class SensRecording:
         """
         index = range(len(self))[index]
         entry, name = self._entries[index], f"frame {index} of {self.path}"
-        with self.path.open("rb") as file:
+        with damaged(FrameError, name):
+            return self._frame(index, entry, name)
+
+    def _frame(self, index: int, entry: _Entry, name: str) -> Frame:
+        with open_plain(self.path) as file:
             file.seek(entry.offset)
             color = images.decode_color(file.read(entry.color_bytes), f"the colour image of {name}")
             data = file.read(entry.depth_bytes)
@@ -124,7 +129,7 @@ class _Header(NamedTuple):
         )  # fmt: skip
 
 
-def _read_header(file: BinaryIO, path: Path) -> _Header:
+def _read_header(file: IO[bytes], path: Path) -> _Header:
     (version,) = _unpack(file, "<I")
     if version != VERSION:
         raise DatasetError(f"{path} has version {version} of the .sens format; expected {VERSION}, which ScanNet uses")
@@ -148,7 +153,7 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
     )  # fmt: skip
 
 
-def _read_index(file: BinaryIO, num_frames: int) -> tuple[list[_Entry], NDArray[np.float64]]:
+def _read_index(file: IO[bytes], num_frames: int) -> tuple[list[_Entry], NDArray[np.float64]]:
     """Places of the frames and their poses (N, 4, 4), without reading the images."""
     end = file.seek(0, 1), file.seek(0, 2)
     file.seek(end[0])
@@ -157,7 +162,7 @@ def _read_index(file: BinaryIO, num_frames: int) -> tuple[list[_Entry], NDArray[
         *pose, color_time, depth_time, color_bytes, depth_bytes = _unpack(file, FRAME_HEADER.format)
         entries.append(_Entry(file.tell(), color_bytes, depth_bytes, color_time, depth_time))
         poses.append(pose)
-        if file.seek(color_bytes + depth_bytes, 1) > end[1]:
+        if color_bytes + depth_bytes > LARGEST_FILE or file.seek(color_bytes + depth_bytes, 1) > end[1]:
             raise struct.error
     return entries, np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
 
@@ -169,7 +174,7 @@ def _times(microseconds: list[int]) -> NDArray[np.float64]:
     return times.astype(np.float64)
 
 
-def _unpack(file: BinaryIO, form: str) -> tuple:
+def _unpack(file: IO[bytes], form: str) -> tuple:
     return struct.unpack(form, file.read(struct.calcsize(form)))
 
 

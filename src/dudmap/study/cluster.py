@@ -2,10 +2,10 @@
 
 from concurrent.futures import Future
 from importlib import import_module
-from importlib.util import find_spec
 from typing import Any
 
 from dudmap.errors import ConfigError
+from dudmap.extras import extra
 from dudmap.study.executor import WorkerDied, set_threads
 from dudmap.study.worker import Job, Outcome, perform
 
@@ -21,14 +21,13 @@ class RayExecutor:
         workers: Number of runs at a time; None takes the cores of the cluster.
 
     Raises:
-        ConfigError: Ray is not installed, or there is no cluster at the address.
+        MissingExtraError: Ray is not installed.
+        ConfigError: There is no cluster at the address.
     """
 
     def __init__(self, address: str, workers: int | None = None) -> None:
-        if find_spec("ray") is None:
-            raise ConfigError("a cluster needs ray; install it with: pip install 'dudmap[cluster]'")
-        ray: Any = import_module("ray")
-
+        with extra("cluster", "--cluster"):
+            ray: Any = import_module("ray")
         try:
             ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="error")
         except (ConnectionError, ValueError) as error:

@@ -102,7 +102,7 @@ class LocalExecutor:
         for pid in list(self._pids):
             try:
                 os.kill(pid, signal.SIGTERM)
-            except ProcessLookupError:
+            except OSError:  # it ended by itself: ProcessLookupError, on Windows another one
                 continue
 
 

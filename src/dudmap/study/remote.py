@@ -6,12 +6,13 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from importlib.util import find_spec
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.benchmark.entries import Entry
 from dudmap.errors import ConfigError, DatasetError
+from dudmap.extras import need
 
 if TYPE_CHECKING:
     from dudmap.geometry.mesh import Mesh
@@ -64,7 +65,8 @@ def fetched(url: str) -> Iterator[Path]:
     it, so that one that was killed while fetching holds up nobody.
 
     Raises:
-        ConfigError: fsspec, or the package that it needs for this kind of URL, is not installed.
+        MissingExtraError: fsspec is not installed.
+        ConfigError: The package that fsspec needs for this kind of URL is not installed.
         DatasetError: The URL cannot be read.
     """
     from filelock import FileLock
@@ -88,10 +90,7 @@ def fetched(url: str) -> Iterator[Path]:
 
 
 def _download(url: str, to: Path) -> None:
-    if find_spec("fsspec") is None:
-        raise ConfigError(f"{url} is a URL, which needs fsspec; install it with: pip install 'dudmap[cluster]'")
-    from importlib import import_module
-
+    need("cluster", f"the recording {url}", ("fsspec",))
     fsspec: Any = import_module("fsspec")
     try:
         system, place = fsspec.core.url_to_fs(url)

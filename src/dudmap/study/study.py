@@ -2,7 +2,6 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,27 +15,6 @@ from dudmap.study.tables import Table
 if TYPE_CHECKING:
     from dudmap.study.analysis import Prediction
     from dudmap.study.judgement import Confirmation
-
-LIBRARIES = {
-    "pyDOE3": "pyDOE3",
-    "SALib": "SALib",
-    "statsmodels": "statsmodels",
-    "sklearn": "scikit-learn",
-    "optuna": "optuna",
-    "filelock": "filelock",
-}
-"""Libraries of the extra ``study`` by the name under which they are imported."""
-
-
-def need_libraries() -> None:
-    """Check that the libraries of the extra ``study`` are installed.
-
-    Raises:
-        ConfigError: One is not.
-    """
-    missing = [name for module, name in LIBRARIES.items() if find_spec(module) is None]
-    if missing:
-        raise ConfigError(f"studies need {', '.join(missing)}; install them with: pip install 'dudmap[study]'")
 
 
 def run_study(

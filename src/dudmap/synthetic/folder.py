@@ -89,12 +89,8 @@ def _quantised(sequence: SyntheticSequence, depth: NDArray[np.float32]) -> NDArr
 
 
 def _write_image(path: Path, image: NDArray) -> None:
-    if not cv2.imwrite(
-        str(path),
-        image,
-        [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY],
-    ):
-        raise OSError(f"the image {path} could not be written")
+    options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_HUFFMAN_ONLY]
+    path.write_bytes(cv2.imencode(".png", image, options)[1].tobytes())  # OpenCV's files need an ASCII path on Windows
 
 
 def _movers_line(sequence: SyntheticSequence, index: int) -> str:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from dudmap import __version__
+from dudmap.atomic_file import write_text
 from dudmap.errors import DudmapError
 from dudmap.geometry import se3
 from dudmap.geometry.mesh_simplification import simplified
@@ -54,7 +55,7 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
     path = Path(out) if out is not None else Path(folder) / REPORT
     page = report_page(RunFiles.load(folder))
     try:
-        path.write_text(page, encoding="utf-8")
+        write_text(path, page)
     except OSError as error:
         raise DudmapError(f"cannot write the report {path}: {error.strerror or error}") from error
     return path
@@ -62,7 +63,8 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
 
 def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
-    about, mesh = (None, "") if run.mesh is None else packed(simplified(run.mesh, TRIANGLES))
+    found = run.mesh
+    about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
     parts = {
         "version": __version__,
         "title": escape(str(run.metrics.get("sequence") or run.folder.name)),

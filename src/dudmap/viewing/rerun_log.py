@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.errors import DudmapError, FrameError
+from dudmap.extras import extra
 from dudmap.geometry.mesh import Mesh
 from dudmap.pipeline.observer import RunObserver
 from dudmap.viewing.mesh_feed import MeshChanges, MeshFeed
@@ -19,21 +20,6 @@ if TYPE_CHECKING:
 
 BUDGET_MS = 10.0
 """Mean time per frame for extracting the changed parts of the map, milliseconds."""
-
-
-def load_rerun() -> Any:  # noqa: ANN401 - the module of an optional package
-    """The package rerun.
-
-    Raises:
-        DudmapError: It is not installed.
-    """
-    try:
-        import rerun  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise DudmapError(
-            f"the log for Rerun needs rerun-sdk ({error}); install it with: pip install 'dudmap[rerun]'"
-        ) from None
-    return rerun
 
 
 class RerunLog(RunObserver):
@@ -51,7 +37,9 @@ class RerunLog(RunObserver):
     """
 
     def __init__(self, path: Path) -> None:
-        self._rr = load_rerun()
+        with extra("rerun", "--rerun"):
+            import rerun  # pyright: ignore[reportMissingImports]
+        self._rr: Any = rerun
         if path.suffix != ".rrd":
             raise DudmapError(f"the log for Rerun is {path.name!r}; expected a name that ends in .rrd")
         try:

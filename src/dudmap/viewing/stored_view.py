@@ -4,8 +4,10 @@ from pathlib import Path
 
 import numpy as np
 
+from dudmap.errors import DudmapError
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh_simplification import simplified
+from dudmap.input_files import damaged
 from dudmap.viewing.mesh_feed import MeshChanges
 from dudmap.viewing.run_files import RunFiles
 from dudmap.viewing.snapshot import FrameFigures
@@ -15,14 +17,14 @@ TRIANGLES = 1_000_000
 """Triangles that are sent to the browser: 40 MB, which it loads within seconds."""
 
 
-def open_run(folder: str | Path, host: str, port: int) -> Window:
+def open_run(folder: str | Path, host: str, port: int, token: str | None = None) -> Window:
     """Window that shows a run folder; the slider stands at the first frame.
 
     Raises:
         DudmapError: The folder is no complete run folder, viser is missing, or the port is in use.
     """
     run = RunFiles.load(folder)
-    window = Window(host, port, str(run.metrics.get("sequence") or run.folder.name))
+    window = Window(host, port, str(run.metrics.get("sequence") or run.folder.name), token)
     show_run(window, run)
     return window
 
@@ -30,8 +32,9 @@ def open_run(folder: str | Path, host: str, port: int) -> Window:
 def show_run(window: Window, run: RunFiles) -> None:
     """Fill a window with the results of a run."""
     if "camera" in run.metrics:
-        values = run.metrics["camera"]
-        window.set_camera(Camera(**values | {"distortion": tuple(values.get("distortion", ()))}))
+        with damaged(DudmapError, run.folder / "metrics.json"):
+            values = run.metrics["camera"]
+            window.set_camera(Camera(**values | {"distortion": tuple(values.get("distortion", ()))}))
     if run.mesh is not None:
         window.show_mesh(MeshChanges({(0, 0, 0): simplified(run.mesh, TRIANGLES)}))
     window.stay()
@@ -44,7 +47,8 @@ def show_run(window: Window, run: RunFiles) -> None:
 def frames_of(run: RunFiles) -> list[FrameFigures]:
     """Pose, moving objects and figures of every processed frame; the residual of single frames is not stored."""
     poses = {f"{t:.6f}": T for t, T in zip(run.trajectory.timestamps, run.trajectory.Ts_world_camera, strict=True)}
-    reasons = {f"{row['timestamp']:.6f}": str(row["reason"]) for row in run.metrics.get("lost_frames", [])}
+    with damaged(DudmapError, run.folder / "metrics.json"):
+        reasons = {f"{row['timestamp']:.6f}": str(row["reason"]) for row in run.metrics.get("lost_frames", [])}
     return [
         FrameFigures(
             float(row["timestamp"]), poses.get(row["timestamp"]), reasons.get(row["timestamp"], ""),

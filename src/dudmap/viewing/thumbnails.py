@@ -3,6 +3,7 @@
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from dudmap.atomic_file import write_bytes
 from dudmap.errors import FrameError
 from dudmap.pipeline.observer import RunObserver
 from dudmap.viewing.snapshot import FrameImages, jpeg
@@ -35,6 +36,12 @@ class Thumbnails(RunObserver):
         for path in self._out.glob("*.jpg"):  # of the first pass, whose timestamps may differ in a live run
             path.unlink()
 
+    def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
+        """Keep the images of the frames before number ``first``."""
+        self._out, self._count, self._step, self._kept = out / FOLDER, count, 1, []
+        self._out.mkdir(exist_ok=True)
+        self._next = self._next_after(first - 1)
+
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Write the images of the frame if it is the first one of the next of equal parts."""
         if index < self._next or isinstance(read.frame, FrameError):
@@ -42,13 +49,18 @@ class Thumbnails(RunObserver):
         paths = []
         for kind, image in FrameImages.of(read.frame, result).pictures().items():
             paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
-            paths[-1].write_bytes(jpeg(image))
+            write_bytes(paths[-1], jpeg(image), sync=False)
         self._kept.append(paths)
         if self._count is None:
             self._thin()
             self._next = index + self._step
-        else:  # first frame of the next of NUMBER equal parts
-            self._next = -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
+        else:
+            self._next = self._next_after(index)
+
+    def _next_after(self, index: int) -> int:
+        """First frame of the next of NUMBER equal parts."""
+        assert self._count is not None
+        return -(-(index * NUMBER // self._count + 1) * self._count // NUMBER)
 
     def _thin(self) -> None:
         """Remove every second frame if there are too many, and keep half as many from now on."""

@@ -2,6 +2,7 @@
 
 import io
 import socket
+import sys
 import threading
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -11,11 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DudmapError
+from dudmap.extras import extra
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.mapping.incremental_mesh import Chunk
 from dudmap.viewing.glb import glb
 from dudmap.viewing.mesh_feed import MeshChanges
+from dudmap.viewing.page_access import PageAccess
 from dudmap.viewing.picking import first_hit
 from dudmap.viewing.snapshot import KINDS, FrameFigures, jpeg
 
@@ -30,19 +33,6 @@ MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124),
 PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
 
 
-def load_viser() -> Any:  # noqa: ANN401 - the module of an optional package
-    """The package viser.
-
-    Raises:
-        DudmapError: It is not installed.
-    """
-    try:
-        import viser  # pyright: ignore[reportMissingImports]
-    except ImportError as error:
-        raise DudmapError(f"the viewer needs viser ({error}); install it with: pip install 'dudmap[view]'") from None
-    return viser
-
-
 class Window:
     """The page; safe to use from several threads.
 
@@ -50,18 +40,26 @@ class Window:
         host: Address to serve at; 127.0.0.1 for this machine only.
         port: Port to serve at.
         title: Title of the page.
+        token: Secret part of the address; None makes one unless ``host`` is this machine only.
+
+    Attributes:
+        access: Who may see it.
 
     Raises:
-        DudmapError: viser is not installed, or the port is in use.
+        MissingExtraError: viser is not installed.
+        DudmapError: The port is in use, or the token is invalid.
     """
 
-    def __init__(self, host: str, port: int, title: str) -> None:
-        viser = load_viser()
+    def __init__(self, host: str, port: int, title: str, token: str | None = None) -> None:
+        with extra("view", "the page in the browser"):
+            import viser  # pyright: ignore[reportMissingImports]
+        self.access = PageAccess(host, port, token)
         _check_port(host, port)
         self._lock = threading.RLock()
         with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
-            self._server = viser.ViserServer(host=host, port=port, label=title, verbose=False)
-        self.url = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0') else host}:{port}"
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.access.guard(self._server)
+        self.url = self.access.url
         self._camera: Camera | None = None
         self._handles: dict[str, Any] = {}
         self._chunks: dict[Chunk, Mesh] = {}
@@ -69,6 +67,7 @@ class Window:
         self._images: dict[float, dict[str, bytes]] = {}
         self._marks: list[NDArray[np.float64]] = []
         self._shown = -1
+        self._server.gui.set_panel_label(title)
         self._make_controls(title)
         scene = self._server.scene
         scene.set_up_direction("-y")
@@ -181,7 +180,7 @@ class Window:
 
     def _make_controls(self, title: str) -> None:
         gui = self._server.gui
-        gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False)
+        gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False, show_share_button=False)
         gui.add_markdown(f"### {title}")
         self._state = gui.add_markdown("waiting for the first frame")
         self._slider = gui.add_slider("frame", min=0, max=1, step=1, initial_value=0)
@@ -197,12 +196,10 @@ class Window:
         self._point = gui.add_markdown("click on the map for a point, again for a distance")
         empty = np.zeros((48, 64, 3), dtype=np.uint8)
         self._pictures = {kind: gui.add_image(empty, label=kind, format="jpeg") for kind in KINDS}
-        nothing = (np.zeros(1), np.zeros(1))
-        self._time_plot = gui.add_uplot(
-            nothing, ({"label": "s"}, _series("ms per frame")), title="time, ms", height=150
-        )
+        nothing, seconds = (np.zeros(1), np.zeros(1)), _series("s")
+        self._time_plot = gui.add_uplot(nothing, (seconds, _series("ms per frame")), title="time, ms", height=150)
         self._residual_plot = gui.add_uplot(
-            nothing, ({"label": "s"}, _series("residual")), title="residual at 1 m, mm", height=150
+            nothing, (seconds, _series("residual")), title="residual at 1 m, mm", height=150
         )
 
     def _slide(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
@@ -306,7 +303,8 @@ def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
 def _check_port(host: str, port: int) -> None:
     """Check that the page can be served there; viser would take another port without a word."""
     with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        if sys.platform != "win32":  # where it would let two programs take one port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
             probe.bind((host, port))
         except OSError as error:

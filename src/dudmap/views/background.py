@@ -9,8 +9,9 @@ from numpy.typing import NDArray
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.geometry.lens import Lens
+from dudmap.geometry.other_view import OtherView
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.views.lens import Lens
 
 SAMPLES = 5
 """Other frames whose colours a pixel takes the median of: up to two that still show something that moves do no harm."""
@@ -30,8 +31,8 @@ class Source:
     """A frame that lends its colours.
 
     Attributes:
-        color: (H, W, 3) uint8, of the colour camera.
-        depth: (H, W) float32, metres, of the map from the same pose; 0 where something moves or the frame differs.
+        color: (h, w, 3) uint8, of the colour camera.
+        depth: (h, w) float32, metres, of the map from the same pose; 0 where something moves or the frame differs.
         T_world_color: (4, 4) pose of the colour camera.
         gain: (3,) of its colours against the map's.
     """
@@ -46,9 +47,9 @@ class Background(NamedTuple):
     """The static scene as a frame would have shown it.
 
     Attributes:
-        color: (H, W, 3) uint8; where it is not known, a smooth continuation of what is.
+        color: (h, w, 3) uint8; where it is not known, a smooth continuation of what is.
         depth: (H, W) float32, metres, 0 where it is not known.
-        known: (H, W) bool, whether the colour is known.
+        known: (h, w) bool, whether the colour is known.
     """
 
     color: NDArray[np.uint8]
@@ -62,46 +63,88 @@ class BackgroundRenderer:
     Args:
         volume: The map.
         depth_camera: Of the recorded depth images.
-        color_camera: Of the recorded colour images, which have the same size.
+        color_camera: Of the recorded colour images.
+        registered: Whether the pixels of both images correspond.
     """
 
-    def __init__(self, volume: TsdfVolume, depth_camera: Camera, color_camera: Camera) -> None:
+    def __init__(
+        self, volume: TsdfVolume, depth_camera: Camera, color_camera: Camera, *, registered: bool = True
+    ) -> None:
         self.volume = volume
         self.depth_lens, self.color_lens = Lens(depth_camera), Lens(color_camera)
+        self.other = None if registered else OtherView(self.depth_lens, self.color_lens)
         self.sources: list[Source] = []
 
-    def add(self, frame: Frame, moving: NDArray[np.bool_], T_world_color: NDArray[np.float64]) -> None:
-        """Let a frame lend its colours, but for the pixels that show something that moves (H, W)."""
-        color, depth = self._map_in_color(T_world_color)
-        static = ~moving & (np.abs(frame.depth - depth) < TOLERANCE * depth)
-        gain = exposure_gain(frame.color, color, static)
-        self.sources.append(Source(frame.color, np.where(static, depth, 0).astype(np.float32), T_world_color, gain))
+    def in_color(
+        self,
+        moving: NDArray[np.bool_],
+        frame: Frame,
+        T_world_camera: NDArray[np.float64],
+        T_world_color: NDArray[np.float64],
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) of the colour image that show what moves (H, W) in the depth image."""
+        if self.other is None:
+            return moving
+        return self.other.mask(moving, frame.depth, se3.inverse(T_world_color) @ T_world_camera)
 
-    def render(
+    def add(
         self,
         frame: Frame,
         moving: NDArray[np.bool_],
         T_world_camera: NDArray[np.float64],
         T_world_color: NDArray[np.float64],
-    ) -> Background:
-        """Background of a frame where something moves (H, W); elsewhere its images are as recorded.
+    ) -> None:
+        """Let a frame lend its colours, but for the pixels (h, w) of its colour image that show what moves."""
+        color, depth = self._map_in_color(T_world_color)
+        seen = frame.depth
+        if self.other is not None:
+            seen = self.other.depth(frame.depth, se3.inverse(T_world_color) @ T_world_camera)
+        static = ~moving & (np.abs(seen - depth) < TOLERANCE * depth)
+        gain = exposure_gain(frame.color, color, static)
+        self.sources.append(Source(frame.color, np.where(static, depth, 0).astype(np.float32), T_world_color, gain))
+
+    def colors(
+        self, frame: Frame, wanted: NDArray[np.bool_], T_world_color: NDArray[np.float64]
+    ) -> tuple[NDArray[np.uint8], NDArray[np.bool_]]:
+        """Colours (h, w, 3) of the background in the exposure of a frame, and where they are known (h, w).
 
         Args:
-            frame: The frame, whose exposure the colours get.
-            moving: Pixels to replace.
-            T_world_camera: (4, 4) pose of the depth image.
+            frame: The frame.
+            wanted: Pixels (h, w) of the colour image.
             T_world_color: (4, 4) pose of the colour image.
         """
-        depth = np.where(moving, self.map_depth(T_world_camera), frame.depth).astype(np.float32)
         of_map, distances = self._map_in_color(T_world_color)
-        gain = exposure_gain(frame.color, of_map, (distances > 0) & ~moving)
-        rows, columns = np.nonzero(moving & (distances > 0))
-        colors = of_map[rows, columns] * gain
+        gain = exposure_gain(frame.color, of_map, (distances > 0) & ~wanted)
+        rows, columns = np.nonzero(wanted & (distances > 0))
+        values = of_map[rows, columns] * gain
         found, seen = self._borrowed(rows, columns, distances[rows, columns], T_world_color)
-        colors[seen] = found[seen] * gain
-        color, known = frame.color.copy(), ~moving
-        color[rows, columns] = np.clip(np.rint(colors), 0, 255).astype(np.uint8)
+        values[seen] = found[seen] * gain
+        color, known = np.zeros_like(frame.color), np.zeros_like(wanted)
+        color[rows, columns] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
         known[rows, columns] = True
+        return color, known
+
+    def render(
+        self,
+        frame: Frame,
+        replaced: NDArray[np.bool_],
+        moving: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        colors: tuple[NDArray[np.uint8], NDArray[np.bool_]],
+    ) -> Background:
+        """Background of a frame where something moves; elsewhere its images are as recorded.
+
+        Args:
+            frame: The frame.
+            replaced: Pixels (H, W) of the depth image to replace.
+            moving: Pixels (h, w) of the colour image to replace.
+            T_world_camera: (4, 4) pose of the depth image.
+            colors: What ``colors`` gives for these pixels, or for more.
+        """
+        depth = np.where(replaced, self.map_depth(T_world_camera), frame.depth).astype(np.float32)
+        found, seen = colors
+        color = np.where((moving & seen)[..., None], found, frame.color)
+        known = seen | ~moving
         return Background(continued(color, known), depth, known)
 
     def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
@@ -110,7 +153,7 @@ class BackgroundRenderer:
         return self.depth_lens.distorted(rendered, nearest=True)
 
     def _map_in_color(self, T_world_color: NDArray[np.float64]) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
-        """Colour (H, W, 3) and depth (H, W) of the map as the colour camera sees it."""
+        """Colour (h, w, 3) and depth (h, w) of the map as the colour camera sees it."""
         result = self.volume.raycast(T_world_color, self.color_lens.straight)
         return self.color_lens.distorted(result.color), self.color_lens.distorted(result.depth, nearest=True)
 

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import write_bytes, write_text
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.exporting.gravity import up_of
 from dudmap.exporting.options import ExportOptions
@@ -124,14 +125,14 @@ def _write_folder(
         images = {"rgb": color[..., ::-1], "depth": np.where(units > 65535, 0, units).astype(np.uint16)}
         for name, image in images.items():
             path = f"{name}/{stamp:.6f}.png"
-            (out / path).write_bytes(cv2.imencode(".png", image)[1].tobytes())
+            write_bytes(out / path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
             lists[name].append(f"{stamp:.6f} {path}")
         if progress is not None:
             progress(number, len(trajectory))
     for name, lines in lists.items():
-        (out / f"{name}.txt").write_text("\n".join([f"# views of {run.folder.name}", *lines]) + "\n", encoding="utf-8")
+        write_text(out / f"{name}.txt", "\n".join([f"# views of {run.folder.name}", *lines]) + "\n")
     keys = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
-    (out / "intrinsics.txt").write_text("".join(f"{key} {getattr(camera, key)}\n" for key in keys), encoding="utf-8")
+    write_text(out / "intrinsics.txt", "".join(f"{key} {getattr(camera, key)}\n" for key in keys))
     trajectory.save(out / "groundtruth.txt")
 
 

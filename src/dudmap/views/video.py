@@ -1,11 +1,13 @@
 """Videos through OpenCV, whose headless wheel brings FFmpeg with VP9 and MPEG-4, but without H.264."""
 
+from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.atomic_file import atomic_path
 from dudmap.errors import ConfigError
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
@@ -30,8 +32,11 @@ class VideoWriter:
         codec = CODECS.get(path.suffix.lower())
         if codec is None:
             raise ConfigError(f"cannot write a video as {path.name!r}; the ending must be one of {', '.join(CODECS)}")
-        self._writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), fps, size)
+        self._place = ExitStack()
+        temporary = self._place.enter_context(atomic_path(path))
+        self._writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)
         if not self._writer.isOpened():
+            temporary.unlink(missing_ok=True)
             raise ConfigError(f"this build of OpenCV cannot write {path} (codec {codec}); name a folder for images")
 
     def write(self, color: NDArray[np.uint8]) -> None:
@@ -45,3 +50,4 @@ class VideoWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._writer.release()
+        self._place.__exit__(kind, error, trace)

@@ -1,0 +1,93 @@
+"""Memory and time of a walk through a long corridor with rooms and back to its beginning, with a memory limit.
+
+    python benchmarks/long_corridor.py --length 300 --max-memory 1GB
+
+prints, for each tenth of the walk, the time per frame, the memory of the process and the blocks in memory and on disk;
+then the error of the trajectory, when the beginning was recognised, and the share of the surfaces seen from poses along
+the walk that the map has.
+"""
+
+import argparse
+import time
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+
+from dudmap.cli.run import memory_size
+from dudmap.config import Config
+from dudmap.evaluation.trajectory import accuracy
+from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
+from dudmap.pipeline.environment import machine, peak_rss_mb
+from dudmap.slam import Slam
+from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.synthetic.ring_corridor import ring_corridor
+
+NEAR = 0.02
+"""A surface of the scene is in the map if the map has one within this distance along the ray, metres."""
+WARM_UP = 20
+
+
+def main() -> None:
+    """Process the walk and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--length", type=float, default=300.0, help="of the walk until it is where it began, metres")
+    parser.add_argument("--max-memory", default="1GB")
+    parser.add_argument("--speed", type=float, default=1.0, help="m/s")
+    parser.add_argument("--fps", type=float, default=20.0)
+    parser.add_argument("--size", default="320x240")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
+    options = parser.parse_args()
+    width, height = (int(number) for number in options.size.split("x"))
+    camera = DEFAULT_CAMERA.resized(width, height)
+    corridor = ring_corridor(options.length, options.speed, options.fps, camera=camera)
+    limit = None if options.max_memory == "none" else MemoryLimit(memory_size(options.max_memory))
+    slam = Slam(camera, Config().override(options.set), max_blocks=limit)
+    print(f"{len(corridor)} frames of {options.size}, {options.length:g} m; {machine()['cpu']}")
+    print("| walk m | ms per frame, median | memory MB | blocks in memory | on disk | lost | corrections |")
+    print("|---|---|---|---|---|---|---|")
+    times, lost, corrected, tenth = [], 0, [], max(len(corridor) // 10, 1)
+    medians = []
+    with ThreadPoolExecutor(1) as reader:
+        following = reader.submit(corridor.__getitem__, 0)
+        for number in range(len(corridor)):
+            frame = following.result()  # rendering is not timed
+            start = time.perf_counter()
+            result = slam.process(frame)
+            times.append(1000 * (time.perf_counter() - start))
+            following = reader.submit(corridor.__getitem__, min(number + 1, len(corridor) - 1))
+            following.result()
+            lost += result.T_world_camera is None
+            if result.corrected:
+                corrected.append(number)
+            if (number + 1) % tenth == 0:
+                away = 0 if slam.volume.pager is None else slam.volume.pager.num_blocks
+                medians.append(float(np.median(times[WARM_UP if len(medians) == 0 else -tenth :][-tenth:])))
+                print(
+                    f"| {number * options.speed / options.fps:.0f} | {medians[-1]:.1f} | "
+                    f"{resident_bytes() / 1e6:.0f} | "
+                    f"{slam.volume.blocks.num_voxel_blocks} | {away} | {lost} | {len(corrected)} |", flush=True,
+                )  # fmt: skip
+    found = accuracy(slam.trajectory, corridor.ground_truth)
+    print(f"\ntime per frame, last tenth over first: {medians[-1] / medians[0]:.2f}; slowest frame {max(times):.0f} ms")
+    print(f"peak memory {peak_rss_mb()} MB; ATE {100 * found['ate_rmse_m']:.1f} cm; "
+          f"corrected at frames {corrected}")  # fmt: skip
+    shares = [_covered(corridor, slam, number) for number in range(0, len(corridor), max(len(corridor) // 60, 1))]
+    print(f"surfaces in the map, 60 views: mean {np.mean(shares):.3f}, least {min(shares):.3f}")
+    pieces = [len(piece.faces) for piece in slam.volume.extract_pieces()]
+    print(f"mesh: {sum(pieces)} triangles in {len(pieces)} pieces; peak memory {peak_rss_mb()} MB")
+
+
+def _covered(corridor, slam: Slam, number: int) -> float:
+    """Share of the pixels nearer than 3 m whose surface the map has, seen from the estimated pose of a frame."""
+    stamps = slam.trajectory.timestamps
+    nearest = int(np.argmin(np.abs(stamps - corridor.timestamps[number])))
+    T = slam.trajectory.Ts_world_camera[nearest]
+    index = int(np.argmin(np.abs(corridor.timestamps - stamps[nearest])))
+    exact = corridor.exact_depth(index)
+    seen = slam.volume.raycast(T).depth
+    near = (exact > 0.3) & (exact < 3.0)
+    return float(np.mean(np.abs(seen - exact)[near] < NEAR))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,42 @@
+"""Optional libraries, which come with the extras of the package: pip install "dudmap[EXTRA]"."""
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.util import find_spec
+
+from dudmap.errors import MissingExtraError
+
+STUDY = ("pyDOE3", "SALib", "statsmodels", "sklearn", "optuna", "pandas", "filelock", "threadpoolctl")
+"""Modules of the extra ``study``."""
+
+
+@contextmanager
+def extra(name: str, purpose: str) -> Iterator[None]:
+    """Around the imports of an extra's libraries; ``purpose`` begins the sentence that says that one is missing.
+
+    Raises:
+        MissingExtraError: A library is not installed, or cannot be loaded since a system library is missing.
+    """
+    try:
+        yield
+    except ModuleNotFoundError as error:
+        raise MissingExtraError(_sentence(name, purpose, (error.name or str(error)).partition(".")[0])) from None
+    except ImportError as error:
+        raise MissingExtraError(
+            f"{purpose} needs the extra {name}, which is installed but cannot be loaded ({error}); install the system "
+            "library that it names"
+        ) from error
+
+
+def need(name: str, purpose: str, modules: tuple[str, ...]) -> None:
+    """Check that the modules of an extra are installed, without importing them.
+
+    Raises:
+        MissingExtraError: One is not.
+    """
+    if missing := [module for module in modules if find_spec(module) is None]:
+        raise MissingExtraError(_sentence(name, purpose, ", ".join(missing)))
+
+
+def _sentence(name: str, purpose: str, missing: str) -> str:
+    return f'{purpose} needs the extra {name} ({missing} is not installed); pip install "dudmap[{name}]"'

@@ -1,0 +1,108 @@
+"""The runs of a merge: what can be checked before anything is computed."""
+
+import zipfile
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.geometry.camera import Camera
+from dudmap.input_files import DAMAGE, open_arrays
+from dudmap.mapping.map_file import FORMAT
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE
+
+TRAJECTORY_FILE = "trajectory.txt"
+MAX_RUNS = 8000
+"""Largest number of runs: the sums of the fusion have 32 bits (``BlockSums``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapHeader:
+    """What a map file says without its voxels.
+
+    Attributes:
+        camera, config, sensor, depth_max: Parameters of the volume.
+        coords: (n, 3) coordinates of its blocks.
+        has_voxels: (n,) bool, blocks that own voxels; the others are known to be empty.
+    """
+
+    camera: Camera
+    config: VolumeConfig
+    sensor: SensorConfig
+    depth_max: float
+    coords: NDArray[np.int32]
+    has_voxels: NDArray[np.bool_]
+
+    @classmethod
+    def read(cls, path: Path, *, blocks: bool = True) -> "MapHeader":
+        """Read a map file, whose voxels are not decompressed.
+
+        Args:
+            path: The map file.
+            blocks: Also read which blocks there are.
+
+        Raises:
+            MapError: The file is damaged or not a map of this version.
+        """
+        try:
+            with open_arrays(path) as data:
+                if str(data["format"]) != FORMAT:
+                    raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
+                fx, fy, cx, cy = (float(value) for value in data["camera"])
+                width, height = (int(value) for value in data["image"])
+                coords = data["coords"] if blocks else np.zeros((0, 3), np.int32)
+                has_voxels = np.zeros(len(coords), bool)
+                if blocks:
+                    has_voxels[data["entries"]] = True
+                return cls(
+                    Camera(fx, fy, cx, cy, width, height), VolumeConfig.model_validate_json(str(data["config"])),
+                    SensorConfig.model_validate_json(str(data["sensor"])), float(data["depth_max"]), coords, has_voxels,
+                )  # fmt: skip
+        except DAMAGE as error:
+            raise MapError(f"{path} is not a readable map file: {error}") from error
+
+    def volume(self) -> TsdfVolume:
+        """Empty map with these parameters."""
+        return TsdfVolume(self.camera, self.config, self.sensor, self.depth_max)
+
+
+def check_runs(runs: Sequence[Path], out: Path) -> MapHeader:
+    """Check run folders that are to be merged, without reading their voxels.
+
+    Returns:
+        Parameters of the first map.
+
+    Raises:
+        ConfigError: There are too few or too many runs, one is named twice, or their voxels differ in size.
+        MapError: A run folder is incomplete or damaged.
+        DudmapError: ``out`` is one of the runs.
+    """
+    if not 2 <= len(runs) <= MAX_RUNS:
+        raise ConfigError(f"found {len(runs)} run folder(s) to merge; expected 2 to {MAX_RUNS}")
+    twice = [path for path, count in Counter(path.resolve() for path in runs).items() if count > 1]
+    if twice:
+        raise ConfigError(f"the run folder {twice[0]} is named twice; name every run once")
+    if out.resolve() in [path.resolve() for path in runs]:
+        raise DudmapError(f"{out} is one of the runs to be merged; name another folder")
+    for path in runs:
+        missing = [name for name in (MAP_FILE, KEYFRAME_FILE, TRAJECTORY_FILE) if not (path / name).is_file()]
+        if missing:
+            raise MapError(f"{path} holds no {' and no '.join(missing)}; name a complete run folder")
+        damaged = [name for name in (MAP_FILE, KEYFRAME_FILE) if not zipfile.is_zipfile(path / name)]
+        if damaged:
+            raise MapError(f"{path / damaged[0]} is cut off or damaged; repeat the run")
+    headers = [MapHeader.read(path / MAP_FILE, blocks=False) for path in runs]
+    sizes = [header.config.voxel_size for header in headers]
+    for path, size in zip(runs, sizes, strict=True):
+        if not np.isclose(size, sizes[0]):
+            raise ConfigError(
+                f"{runs[0]} has voxels of {sizes[0]:g} m and {path} of {size:g} m; repeat one with the other's "
+                "volume.voxel_size"
+            )
+    return headers[0]

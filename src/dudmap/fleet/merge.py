@@ -1,0 +1,240 @@
+"""Merging of many run folders into worlds: maps by range, tiles, trajectories, and a report."""
+
+import json
+import shutil
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.atomic_file import atomic_file
+from dudmap.errors import DudmapError, MapError
+from dudmap.extras import need
+from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, RangeJob, fuse_range, planned_ranges
+from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.registration import RegisteredPair, proposed_pairs, register_pairs
+from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
+from dudmap.fleet.workers import Workers
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.merging.block_sums import MAX_COUNT, VOXELS
+from dudmap.merging.map_fusion import FusedRange, joined
+from dudmap.merging.map_samples import sample_map
+from dudmap.merging.run_graph import Join, RunGraph, solve
+from dudmap.pipeline.merge import run_trajectories
+
+WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
+WORK_FOLDER = ".work"
+
+
+@dataclass(frozen=True, eq=False)
+class FleetReport:
+    """Result of a merge of many runs.
+
+    Attributes:
+        out: Folder of the largest world; others lie in it as part-2, part-3, ...
+        tree: Content of its world.json.
+        pairs: What was found about each pair that was compared.
+        graph: Poses of the runs.
+        sentences: What the user should know: runs that were not joined, joins that contradict others.
+    """
+
+    out: Path
+    tree: dict[str, Any]
+    pairs: list[RegisteredPair]
+    graph: RunGraph
+    sentences: list[str]
+
+
+def merge_fleet(
+    runs: Sequence[str | Path], out: str | Path, *, workers: int = 1, note: Callable[[str], None] = lambda _: None
+) -> FleetReport:
+    """Join the maps of any number of runs.
+
+    The folder receives world.json (runs with their poses, ranges, pairs), map/<code>.npz (one map file per range,
+    which ``TsdfVolume.load`` reads), tileset.json and tiles/ (3D Tiles 1.1), and trajectory.txt, trajectory-2.txt, ...
+    of all runs in the world of the first. Runs that do not overlap the largest group become worlds of their own in
+    part-2, part-3, ... if at least two of them are joined.
+
+    Args:
+        runs: Run folders, at least two.
+        out: New folder, or one that holds a world, which is replaced.
+        workers: Processes.
+        note: Told what is being done, a sentence at a time.
+
+    Raises:
+        MissingExtraError: A library is not installed.
+        ConfigError: A run is named twice, or the voxels differ in size.
+        MapError: A run folder is incomplete, or no two runs can be joined.
+        DudmapError: ``out`` cannot be used.
+    """
+    need("fleet", "the merging of more than two runs", ("faiss", "gtsam"))
+    folders, out = [Path(run) for run in runs], Path(out)
+    like = check_runs(folders, out)
+    _check_out(out)
+    _load_kernels(like)
+    started = time.perf_counter()
+    with Workers(workers) as crew:
+        proposed = proposed_pairs(folders, crew)
+        note(f"{len(proposed)} of {len(folders) * (len(folders) - 1) // 2} pairs of runs are compared")
+        pairs = register_pairs(folders, proposed, crew)
+        joins = [Join(one.a, one.b, one.pair.T_a_b) for one in pairs if one.pair.T_a_b is not None]
+        graph = solve(len(folders), joins)
+        worlds = [part for part in graph.components if len(part) > 1]
+        if not worlds:
+            raise MapError(f"no two of the {len(folders)} runs are joined, nothing is written: {_why_not(pairs)}")
+        times = {"registration_s": round(time.perf_counter() - started, 2)}
+        tree: dict[str, Any] = {}
+        for number, part in enumerate(worlds, start=1):
+            note(f"{len(part)} runs are fused")
+            folder = out if number == 1 else out / f"part-{number}"
+            world = _write_world(folder, part, folders, graph, like, crew)
+            world |= {"pairs": [_pair_entry(one, folders, graph) for one in pairs if one.a in part and one.b in part]}
+            world |= {"not_joined": [str(folders[run]) for run in range(len(folders)) if run not in part]}
+            if number == 1:
+                tree = world
+            else:
+                _write_json(folder / WORLD_FILE, world)
+        times["total_s"] = round(time.perf_counter() - started, 2)
+        tree |= {"compared_pairs": len(pairs), "workers": workers, "cpu_s": round(crew.cpu_s, 1)} | times
+        tree["peak_rss_mb"] = sorted(crew.peak_rss_mb.values(), reverse=True)
+        _write_json(out / WORLD_FILE, tree)
+    return FleetReport(out, tree, pairs, graph, _sentences(graph, folders))
+
+
+def load_part(world: str | Path, low: NDArray[np.float64], high: NDArray[np.float64]) -> FusedRange:
+    """Blocks of a world in all ranges that touch a box, in order.
+
+    ``FusedRange.volume`` makes a map of them.
+
+    Args:
+        world: Folder of a world.
+        low, high: (3,) corners, metres.
+
+    Raises:
+        MapError: The folder holds no world, or nothing of it lies in the box.
+    """
+    tree = read_world(world)
+    touching = [
+        one
+        for one in tree["ranges"]
+        if np.all(np.array(one["low_m"]) <= high) and np.all(np.array(one["high_m"]) >= low)
+    ]
+    if not touching:
+        raise MapError(f"nothing of the world {world} lies in the box from {low.tolist()} to {high.tolist()} m")
+    return joined([FusedRange.of(TsdfVolume.load(Path(world) / one["file"])) for one in touching])
+
+
+def read_world(world: str | Path) -> dict[str, Any]:
+    """Content of world.json.
+
+    Raises:
+        MapError: It is missing or of another version.
+    """
+    path = Path(world) / WORLD_FILE
+    try:
+        tree = json.loads(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        raise MapError(f"{world} holds no world of `dudmap merge`: {error}") from error
+    if tree.get("format") != FORMAT:
+        raise MapError(f"{path} has the format {tree.get('format')!r}; this version reads {FORMAT!r}")
+    return tree
+
+
+def _write_world(
+    out: Path, part: list[int], folders: Sequence[Path], graph: RunGraph, like: MapHeader, crew: Workers
+) -> dict[str, Any]:
+    """Fuse joined runs; returns the content of world.json."""
+    work = out / WORK_FOLDER
+    for folder in (out / MAP_FOLDER, out / TILE_FOLDER, work):
+        folder.mkdir(parents=True)
+    try:
+        runs = [PlacedRun(folders[run], graph.Ts[run]) for run in part]
+        ranges = planned_ranges(runs, crew)
+        jobs = [RangeJob(one, [runs[number] for number in one.runs], like, out, work) for one in ranges]
+        results = list(crew.map(fuse_range, jobs))
+        leaves = [tile for result in results for tile in result.tiles]
+        if leaves:
+            root = write_tree(leaves, like.config.voxel_size, out, work, crew)
+            write_tileset(root, like.config.voxel_size, out)
+    finally:
+        shutil.rmtree(work)
+    entries, number = [], 0
+    for run in runs:
+        names = []
+        for trajectory in run_trajectories(run.folder, run.T_world_run):
+            number += 1
+            names.append("trajectory.txt" if number == 1 else f"trajectory-{number}.txt")
+            trajectory.save(out / names[-1])
+        entries.append({"folder": str(run.folder), "T_world_run": run.T_world_run.tolist(), "trajectories": names})
+    kept = [result.entry for result in results if result.entry["blocks"]]
+    return {
+        "format": FORMAT, "voxel_size": like.config.voxel_size, "runs": entries, "ranges": kept,
+        "map_blocks": sum(entry["blocks"] for entry in kept), "tiles": len(list((out / TILE_FOLDER).glob("*.glb"))),
+        "surface_triangles": sum(tile.triangles for tile in leaves),
+    }  # fmt: skip
+
+
+def _check_out(out: Path) -> None:
+    """Remove the world that a folder holds.
+
+    Raises:
+        DudmapError: It holds anything else, or cannot be written.
+    """
+    try:
+        if out.exists() and any(out.iterdir()):
+            if not (out / WORLD_FILE).is_file():
+                raise DudmapError(f"{out} is not empty and holds no world of `dudmap merge`; name another folder")
+            for name in (MAP_FOLDER, TILE_FOLDER, WORK_FOLDER, *(path.name for path in out.glob("part-[0-9]*"))):
+                shutil.rmtree(out / name, ignore_errors=True)
+            for path in (out / WORLD_FILE, out / TILESET_FILE, *out.glob("trajectory*.txt")):
+                path.unlink(missing_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise DudmapError(f"cannot write the world to {out}: {error.strerror or error}") from error
+
+
+def _load_kernels(like: MapHeader) -> None:
+    """Compile the kernels before any worker starts: two would write the same cache at a time."""
+    words = np.full((1, VOXELS), MAX_COUNT << 8, np.int32)
+    block = FusedRange(np.zeros(1, np.int64), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
+    volume = block.volume(like.volume())
+    sample_map(volume, np.zeros((1, 3)))
+    volume.extract_mesh()
+    volume.extract_chunks(np.zeros(1, np.int32), np.zeros(1, np.int64))
+
+
+def _pair_entry(one: RegisteredPair, folders: Sequence[Path], graph: RunGraph) -> dict[str, Any]:
+    """What world.json says about a pair that was compared."""
+    rejected = any((join.a, join.b) == (one.a, one.b) for join in graph.rejected)
+    out = {"runs": [str(folders[one.a]), str(folders[one.b])]} | one.pair.tree()
+    return out | ({"reason": "other joins contradict it"} if rejected else {})
+
+
+def _why_not(pairs: Sequence[RegisteredPair]) -> str:
+    """The most frequent reason."""
+    reasons = [one.pair.reason for one in pairs] or ["no places look alike"]
+    return max(reasons, key=reasons.count)
+
+
+def _sentences(graph: RunGraph, folders: Sequence[Path]) -> list[str]:
+    out = []
+    first, *others = graph.components
+    alone = [folders[part[0]].name for part in others if len(part) == 1]
+    if alone:
+        out.append(f"{len(alone)} run(s) overlap no other and are left out: {', '.join(alone)}")
+    for number, part in enumerate((part for part in others if len(part) > 1), start=2):
+        names = ", ".join(folders[run].name for run in part)
+        out.append(f"{len(part)} runs overlap each other but not the {len(first)} others, see part-{number}: {names}")
+    if graph.rejected:
+        names = ", ".join(f"{folders[join.a].name} and {folders[join.b].name}" for join in graph.rejected)
+        out.append(f"{len(graph.rejected)} relative pose(s) contradict others and are not used: {names}")
+    return out
+
+
+def _write_json(path: Path, tree: dict[str, Any]) -> None:
+    with atomic_file(path) as file:
+        file.write((json.dumps(tree, indent=1) + "\n").encode())

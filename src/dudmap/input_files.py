@@ -1,0 +1,278 @@
+"""Files from elsewhere: plain files of a bounded size only, without objects, and nothing nested without end.
+
+Whoever hands over a recording, a map or a configuration decides what is in these files. All readers of them go through
+this module, so that a pipe does not block, a device does not fill the memory, and a declared size is compared with what
+is there before memory is taken for it.
+"""
+
+import errno
+import json
+import lzma
+import math
+import os
+import stat
+import struct
+import tokenize
+import tomllib
+import zipfile
+import zlib
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DudmapError
+
+LARGEST_TEXT = 2**28
+"""Largest text file, bytes: poses of 100 hours at 30 frames a second have 1 GB, an hour has 10 MB."""
+LARGEST_TREE = 2**26
+"""Largest JSON or TOML file, bytes; transforms.json with 10 000 frames has 5 MB. A tree takes 20 times the memory."""
+LARGEST_FILE = 2**28
+"""Largest file that is read as a whole, bytes: an uncompressed image of ``LARGEST_PIXELS``."""
+LARGEST_ARCHIVE = 2**36
+"""Largest content of a NumPy archive, bytes. A map of 16 million voxel blocks has 64 GiB."""
+LARGEST_RATIO = 100
+"""Largest unpacked over packed size of an archive. Images hardly shrink, maps and depth as text shrink to a tenth;
+deflate reaches 1000."""
+RATIO_FREE_BYTES = 2**26
+"""Unpacked size below which the ratio does not matter."""
+SAFE_KINDS = "biufUS"
+"""Kinds of NumPy types that are no objects and hold none: numbers and text."""
+DAMAGE = (
+    ValueError, TypeError, LookupError, ArithmeticError, AttributeError, EOFError, RecursionError, struct.error,
+    zlib.error, lzma.LZMAError, zipfile.BadZipFile, zipfile.LargeZipFile, NotImplementedError, OSError,
+)  # fmt: skip
+"""What the standard library and NumPy raise where content is not as its format says. ``MemoryError`` is not among them:
+sizes are limited before memory is taken."""
+
+
+def open_plain(path: str | Path) -> IO[bytes]:
+    """Open a plain file for reading; links are followed.
+
+    Raises:
+        OSError: There is no such file, or it is a folder, pipe, socket or device.
+    """
+    try:
+        _check_plain(os.stat(path).st_mode, path)
+        flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_CLOEXEC", 0) | getattr(os, "O_BINARY", 0)
+        number = os.open(path, flags)
+    except ValueError as error:  # a zero byte or half a surrogate pair in the name
+        raise OSError(errno.ENOENT, f"there can be no file of this name ({error})", str(path)) from None
+    try:
+        _check_plain(os.fstat(number).st_mode, path)  # not that it was replaced in the meantime
+    except OSError:
+        os.close(number)
+        raise
+    return open(path, "rb", opener=lambda *_: number)  # so that its name is the path
+
+
+def _check_plain(mode: int, path: str | Path) -> None:
+    if not stat.S_ISREG(mode):
+        kind = "a folder" if stat.S_ISDIR(mode) else "a pipe, socket or device"
+        raise OSError(errno.EINVAL, f"it is {kind}; expected a plain file", str(path))
+
+
+def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
+    """Content of a plain file of at most ``largest`` bytes.
+
+    Raises:
+        OSError: The file cannot be read, is no plain file, or is larger.
+    """
+    with open_plain(path) as file:
+        data = file.read(min(os.fstat(file.fileno()).st_size, largest) + 1)
+    if len(data) > largest:
+        raise OSError(errno.EFBIG, f"it has more than {largest / 1e6:.0f} MB, the largest size of its kind", str(path))
+    return data
+
+
+def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
+    """Content of a UTF-8 text file of at most ``largest`` bytes, with line ends as ``\\n``.
+
+    Raises:
+        OSError: The file cannot be read, is no plain file, or is larger.
+        UnicodeDecodeError: It is not UTF-8.
+    """
+    return read_bytes(path, largest).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
+
+
+def read_json(path: str | Path) -> Any:  # noqa: ANN401 - any JSON value
+    """Value of a JSON file; whole numbers beyond 64 bit become floats.
+
+    Raises:
+        OSError: The file cannot be read, is no plain file, or is too large.
+        ValueError: It is not UTF-8 or not JSON, or nested too deeply.
+    """
+    return parse_json(read_text(path, LARGEST_TREE))
+
+
+def parse_json(text: str | bytes) -> Any:  # noqa: ANN401 - any JSON value
+    """Value of a JSON text; whole numbers beyond 64 bit become floats.
+
+    Raises:
+        ValueError: It is not UTF-8 or not JSON, or nested too deeply.
+    """
+    try:
+        return json.loads(text, parse_int=_number)
+    except RecursionError:
+        raise ValueError("it is nested too deeply") from None
+
+
+def _number(text: str) -> int | float:
+    return int(text) if len(text) <= 18 else float(text)
+
+
+def read_toml(path: str | Path) -> dict[str, Any]:
+    """Content of a TOML file.
+
+    Raises:
+        OSError: The file cannot be read, is no plain file, or is too large.
+        ValueError: It is not UTF-8 or not TOML (``tomllib.TOMLDecodeError``), or nested too deeply.
+    """
+    return parse_toml(read_text(path, LARGEST_TREE))
+
+
+def parse_toml(text: str) -> dict[str, Any]:
+    """Content of a TOML text.
+
+    Raises:
+        tomllib.TOMLDecodeError: It is not TOML, or nested too deeply.
+    """
+    try:
+        return tomllib.loads(text)
+    except RecursionError:
+        raise tomllib.TOMLDecodeError("it is nested too deeply") from None
+    except (ValueError, OverflowError) as error:  # a date or number that Python cannot hold
+        raise tomllib.TOMLDecodeError(str(error)) from None
+
+
+@contextmanager
+def damaged(kind: type[DudmapError], what: object) -> Iterator[None]:
+    """Turn what a parser raises for damaged content into one sentence of class ``kind`` about ``what``.
+
+    It stands around readers, behind their own checks, for the defects that these do not name.
+
+    Raises:
+        DudmapError: Of that class; our own errors pass unchanged.
+    """
+    import cv2
+
+    try:
+        yield
+    except DudmapError:
+        raise
+    except (*DAMAGE, cv2.error) as error:
+        if isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            raise
+        raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
+
+
+@contextmanager
+def foreign(kind: type[DudmapError], what: object) -> Iterator[None]:
+    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh.
+
+    Raises:
+        DudmapError: Of class ``kind``; our own errors pass unchanged.
+    """
+    try:
+        yield
+    except DudmapError:
+        raise
+    except Exception as error:
+        raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
+
+
+def describe(error: BaseException) -> str:
+    """An exception of a library in words."""
+    if isinstance(error, OSError) and error.strerror:
+        return error.strerror
+    if isinstance(error, KeyError):
+        return f"it lacks {error}"
+    return str(error) or type(error).__name__
+
+
+@contextmanager
+def open_arrays(path: str | Path) -> "Iterator[Mapping[str, NDArray[Any]]]":
+    """Open a NumPy archive (``.npz``) as mapping of names to arrays of numbers or text, read when asked for.
+
+    Raises:
+        OSError: The file cannot be read or is no plain file.
+        ValueError, KeyError, zipfile.BadZipFile, zlib.error: It is damaged, holds objects, or declares larger arrays
+            than are in it; also inside of the block.
+    """
+    with open_plain(path) as file, zipfile.ZipFile(file) as archive:
+        check_unpacked(archive, os.fstat(file.fileno()).st_size)
+        yield _Arrays(archive)
+
+
+def check_unpacked(archive: zipfile.ZipFile, packed: int) -> None:
+    """Check what a ZIP file of ``packed`` bytes says it unpacks to; more than it says is never read.
+
+    Raises:
+        ValueError: It is too much for a file of its size.
+    """
+    limit = min(LARGEST_ARCHIVE, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed))
+    total = sum(info.file_size for info in archive.infolist())
+    if total > limit:
+        raise ValueError(f"its {packed} bytes unpack to {total}; expected {limit} or less")
+
+
+class _Arrays(Mapping[str, NDArray[Any]]):
+    """Arrays of a NumPy archive."""
+
+    def __init__(self, archive: zipfile.ZipFile) -> None:
+        self._archive = archive
+
+    def __getitem__(self, name: str) -> NDArray[Any]:
+        info = self._archive.getinfo(f"{name}.npy")
+        try:
+            with self._archive.open(info) as member:
+                return read_array(member, info.file_size, name)
+        except (RuntimeError, NotImplementedError) as error:  # encrypted, or an unknown compression
+            raise ValueError(f"{name} cannot be unpacked: {error}") from None
+
+    def __iter__(self) -> Iterator[str]:
+        return (name.removesuffix(".npy") for name in self._archive.namelist())
+
+    def __len__(self) -> int:
+        return len(self._archive.namelist())
+
+
+def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
+    """Array of a stream of ``size`` bytes in NumPy's format; ``name`` is used in messages.
+
+    Raises:
+        ValueError: It is damaged, holds objects, or its header declares another size than the stream has.
+    """
+    version = np.lib.format.read_magic(file)
+    read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
+    if read is None:
+        raise ValueError(f"{name} has version {version} of NumPy's format; expected 1.0 or 2.0")
+    try:
+        shape, by_columns, kind = read(file)
+    except (SyntaxError, TypeError, RecursionError, tokenize.TokenError) as error:  # the header is a literal
+        raise ValueError(f"the header of {name} is damaged: {error}") from None
+    if kind.kind not in SAFE_KINDS or kind.hasobject or not kind.itemsize:
+        raise ValueError(f"{name} holds {kind}; expected numbers or text")
+    if any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
+        raise ValueError(f"{name} has the shape {shape}; expected up to 8 whole numbers")
+    expected = math.prod(shape) * kind.itemsize
+    if expected > size:
+        raise ValueError(f"{name} declares {expected} bytes and holds {size}")
+    data = file.read(expected)
+    if len(data) != expected:
+        raise ValueError(f"{name} is cut off: it holds {len(data)} of {expected} bytes")
+    return np.frombuffer(bytearray(data), kind).reshape(shape, order="F" if by_columns else "C")
+
+
+def load_array(path: str | Path) -> NDArray[Any]:
+    """Array of a ``.npy`` file.
+
+    Raises:
+        OSError: The file cannot be read or is no plain file.
+        ValueError: It is damaged, holds objects, or its header declares another size than the file has.
+    """
+    with open_plain(path) as file:
+        return read_array(file, os.fstat(file.fileno()).st_size, str(path))

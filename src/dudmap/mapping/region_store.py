@@ -1,0 +1,99 @@
+"""Temporary file that holds blocks which have left the memory."""
+
+import sqlite3
+import tempfile
+import threading
+import weakref
+from collections.abc import Sequence
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+
+from dudmap.errors import MapError
+from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords
+
+COLUMNS = tuple(field.name for field in fields(BlockRecords))
+_TYPES = {
+    "coords": (np.int16, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
+    "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),
+}  # fmt: skip
+
+
+class RegionStore:
+    """Regions of blocks in a temporary SQLite database, which is removed with the last reference to it.
+
+    Methods may be called by any thread.
+    """
+
+    def __init__(self) -> None:
+        folder = tempfile.TemporaryDirectory(prefix="dudmap-map-")
+        self._lock = threading.Lock()
+        self._connection = connection = sqlite3.connect(Path(folder.name) / "regions.db", check_same_thread=False)
+        connection.execute("PRAGMA journal_mode = MEMORY")  # a scratch file: nothing is read from it after a crash
+        connection.execute("PRAGMA synchronous = OFF")
+        columns = ", ".join(f"{name} BLOB" for name in COLUMNS)
+        connection.execute(f"CREATE TABLE regions (x INTEGER, y INTEGER, z INTEGER, {columns}, PRIMARY KEY (x, y, z))")
+        self.close = weakref.finalize(self, _remove, connection, folder)
+
+    def write(self, region: tuple[int, int, int], records: BlockRecords) -> None:
+        """Store a region, in place of what was stored of it.
+
+        Raises:
+            MapError: The file cannot be written.
+        """
+        blobs = blobs_of(records)
+        marks = ", ".join("?" * (3 + len(blobs)))
+        try:
+            with self._lock, self._connection:
+                self._connection.execute(f"INSERT OR REPLACE INTO regions VALUES ({marks})", (*region, *blobs))
+        except sqlite3.Error as error:
+            raise MapError(
+                f"blocks of the map cannot be stored in {tempfile.gettempdir()}: {error}; make room there, or name "
+                "another folder in the environment variable TMPDIR"
+            ) from error
+
+    def read(self, region: tuple[int, int, int]) -> BlockRecords:
+        """A region that was stored.
+
+        Raises:
+            MapError: The file cannot be read, or does not hold the region.
+        """
+        query = f"SELECT {', '.join(COLUMNS)} FROM regions WHERE x = ? AND y = ? AND z = ?"
+        try:
+            with self._lock:
+                row = self._connection.execute(query, region).fetchone()
+        except sqlite3.Error as error:
+            raise MapError(f"blocks of the map cannot be read from {tempfile.gettempdir()}: {error}") from error
+        if row is None:
+            raise MapError(f"region {region} of the map is missing in {tempfile.gettempdir()}")
+        return records_of(row)
+
+
+def blobs_of(records: BlockRecords) -> list[memoryview]:
+    """The arrays of records as they are stored, in the order of ``COLUMNS``."""
+    return [np.ascontiguousarray(getattr(records, name)).data for name in COLUMNS]
+
+
+def records_of(blobs: Sequence[bytes]) -> BlockRecords:
+    """The records of stored arrays.
+
+    Raises:
+        ValueError: They do not fit each other.
+    """
+    arrays = {}
+    for name, blob in zip(COLUMNS, blobs, strict=True):
+        kind, width = _TYPES[name]
+        array = np.frombuffer(blob, kind)
+        arrays[name] = array.reshape(-1, width) if width > 1 else array
+    records = BlockRecords(**arrays)
+    n, m = len(records.coords), len(records.owners)
+    sizes = {len(records.geometry), len(records.colors), len(records.fused)}
+    if len(records.free_count) != n or sizes != {m} or np.any(records.owners < 0) or np.any(records.owners >= n):
+        raise ValueError("the blocks of a region do not fit each other")
+    return records
+
+
+def _remove(connection: sqlite3.Connection, folder: tempfile.TemporaryDirectory) -> None:
+    connection.close()
+    folder.cleanup()

@@ -1,0 +1,93 @@
+"""Continuation of an interrupted run from the state in its folder."""
+
+import sqlite3
+from contextlib import closing
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dudmap.config import Config
+from dudmap.errors import StateError
+from dudmap.pipeline.progress import RunProgress
+from dudmap.pipeline.run import Job
+from dudmap.pipeline.run_folder import RunReport, locked
+from dudmap.pipeline.storing import RunStore, check_recording, restored, stored_options
+
+if TYPE_CHECKING:
+    from dudmap.pipeline.observer import RunObserver
+    from dudmap.sequences import Sequence
+    from dudmap.sequences.masks import MaskFolder
+
+
+def resume(
+    out: str | Path,
+    sequence: "Sequence | None" = None,
+    *,
+    progress: bool = True,
+    observers: "tuple[RunObserver, ...]" = (),
+) -> RunReport:
+    """Go on with a run that was killed or interrupted, from its last checkpoint to the end.
+
+    Recording, configuration and options are those the run began with. Results are those of a run that was not
+    interrupted: the same poses, masks, map and mesh, bit for bit.
+
+    Args:
+        out: The run folder.
+        sequence: The recording; None opens the one that the run began with.
+        progress: Show a progress bar on a terminal.
+        observers: As for ``run``.
+
+    Raises:
+        StateError: There is no state in the folder, the run is finished, its recording has changed, another version of
+            dudmap wrote it, or it is damaged.
+        DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
+    """
+    from dudmap.mapping.memory_limit import MemoryLimit
+    from dudmap.slam import Slam
+
+    out = Path(out)
+    if not out.is_dir():
+        raise StateError(f"there is no run folder {out}")
+    with locked(out):
+        reader, meta = stored_options(out)
+        with closing(reader):
+            options = meta["options"]
+            if sequence is None:
+                sequence = open_recording(options["recording"])
+            check_recording(sequence, meta, out)
+            config = Config.model_validate_json(options["config"])
+            display = RunProgress(options["count"] * options["passes"], bar=progress)
+            try:
+                store = RunStore(out, options["every"], display.note)
+                limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
+                state = restored(reader, store, *(Slam(sequence.camera, config, max_blocks=limit) for _ in range(2)))
+            except sqlite3.Error as error:
+                raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
+            job = Job(
+                sequence, config, out, options["count"], display, _masks(options["masks"], sequence),
+                options["save_masks"], options["save_map"], options["ahead"], False, options["passes"], None, observers,
+            )  # fmt: skip
+            return job.carry_out(state, store)
+
+
+def open_recording(arguments: dict[str, Any]) -> "Sequence":
+    """The recording that a stored run is of."""
+    from dudmap.sequences import open_sequence
+
+    return open_sequence(**arguments)
+
+
+def wants_report(out: Path) -> bool:
+    """Whether the run in a folder was ordered with a report.
+
+    Raises:
+        StateError: The folder holds no run that can be continued.
+    """
+    reader, meta = stored_options(out)
+    reader.close()
+    return bool(meta["options"]["report"])
+
+
+def _masks(folder: str | None, sequence: "Sequence") -> "MaskFolder | None":
+    from dudmap.sequences.masks import MaskFolder
+
+    return None if folder is None else MaskFolder(folder, sequence.timestamps, sequence.camera)

@@ -1,0 +1,345 @@
+"""The database of a run: one SQLite file, one transaction per checkpoint.
+
+Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
+frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
+write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
+"""
+
+import hashlib
+import json
+import sqlite3
+import weakref
+import zlib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import StateError
+from dudmap.mapping.block_pager import Region
+from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
+from dudmap.mapping.voxel_blocks import BlockRecords
+from dudmap.places.frame_store import EncodedFrame
+from dudmap.state.block_keys import MAP_SHIFT
+from dudmap.state.blocks import VOXELS, MapSnapshot, StoredMaps
+from dudmap.state.frames import FrameSnapshot, StoredFrames
+from dudmap.state.tree import Snapshot, lines
+
+APPLICATION = 0x44554453
+"""Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
+SCHEMA = 1
+CHUNK = 1 << 16
+"""Bytes of an array that are stored together; a part that did not change is not written again."""
+ROWS = 4096
+"""Blocks that are read at once."""
+TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
+CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
+CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
+CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, crc INTEGER NOT NULL, coords BLOB, free_count BLOB,
+                      owners BLOB, geometry BLOB, colors BLOB, fused BLOB, PRIMARY KEY (map, x, y, z));
+CREATE TABLE frames (store INTEGER, number INTEGER, depth BLOB NOT NULL, color BLOB NOT NULL, mask BLOB NOT NULL,
+                     PRIMARY KEY (store, number));
+"""
+
+
+class StateDatabase:
+    """Writes checkpoints. For one thread at a time.
+
+    Args:
+        path: The file; created with its tables if it does not exist.
+
+    Attributes:
+        maps, frames: Know what is in the database.
+
+    Raises:
+        sqlite3.Error: The file cannot be created or opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.maps, self.frames = StoredMaps(), StoredFrames()
+        self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
+        self._chunks: set[str] = set()
+        self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
+        weakref.finalize(self, self._connection.close)
+        self._execute("PRAGMA journal_mode = WAL")
+        self._execute("PRAGMA synchronous = FULL")  # a commit is on the disk when it returns
+        if not self._execute("SELECT 1 FROM sqlite_master").fetchone():
+            self._connection.executescript(
+                f"BEGIN; PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {SCHEMA}; {TABLES} COMMIT;"
+            )
+        self._chunks = {row[0].hex() for row in self._execute("SELECT key FROM chunks")}
+
+    def write_meta(self, values: dict[str, Any]) -> None:
+        """Set values that describe the run, in a transaction of its own.
+
+        Raises:
+            sqlite3.Error: They cannot be written.
+        """
+        rows = [(key, json.dumps(value)) for key, value in values.items()]
+        self._connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows)
+
+    def write(self, snapshot: Snapshot, meta: dict[str, Any]) -> None:
+        """Store a snapshot that was taken with ``maps`` and ``frames``, as one transaction.
+
+        Raises:
+            sqlite3.Error: It cannot be written; the database holds the checkpoint before.
+        """
+        arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
+        described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays], "records": []}
+        parts = {key: part for _, found in arrays for key, part in found.items()}
+        for records in snapshot.records:
+            one, found = self._described(np.frombuffer(lines(records).encode(), np.uint8), constant=False)
+            described["records"].append(one)
+            parts |= found
+        used = {key for one in described["arrays"] + described["records"] for key in one["chunks"]}
+        tree = zlib.compress(json.dumps(described).encode(), 1)
+        self._execute("BEGIN IMMEDIATE")
+        try:
+            self._write_maps(snapshot.maps)
+            self._write_frames(snapshot.frames)
+            new = ((bytes.fromhex(key), parts[key]) for key in used - self._chunks)
+            self._connection.executemany("INSERT OR IGNORE INTO chunks VALUES (?, ?)", new)
+            old = ((bytes.fromhex(key),) for key in self._chunks - used)
+            self._connection.executemany("DELETE FROM chunks WHERE key = ?", old)
+            self._execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", zlib.crc32(tree), tree)
+            self.write_meta(meta)
+            self._execute("COMMIT")
+        except BaseException:
+            if self._connection.in_transaction:
+                self._execute("ROLLBACK")
+            raise
+        self.maps.commit(snapshot.maps)
+        self.frames.commit(snapshot.frames)
+        self._chunks = used
+        alive = {id(snapshot.arrays[n]) for n in snapshot.constant}
+        self._constants = {key: value for key, value in self._constants.items() if key in alive}
+        self._execute("PRAGMA wal_checkpoint(TRUNCATE)")  # without effect while another process reads
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def _execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        return self._connection.execute(statement, values)
+
+    def _write_maps(self, maps: list[MapSnapshot]) -> None:
+        run, known = self._connection.executemany, {stored.number: stored for stored in self.maps.by_id.values()}
+        current = {changed.map_id for changed in maps}
+        gone = {stored.number for map_id, stored in self.maps.by_id.items() if map_id not in current}
+        for number in gone:
+            self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
+            self._execute("DELETE FROM regions WHERE map = ?", number)
+        for changed in maps:
+            stored = known.get(changed.number)
+            if stored is not None:
+                run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
+                back = ((changed.number, *region) for region in stored.regions.keys() - changed.away.keys())
+                run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
+            rows = ((changed.number, *region, *_region_row(records)) for region, records in changed.regions)
+            run(f"INSERT OR REPLACE INTO regions VALUES ({', '.join('?' * 11)})", rows)
+            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
+
+    def _write_frames(self, frames: list[FrameSnapshot]) -> None:
+        for changed in frames:
+            self._execute("DELETE FROM frames WHERE store = ? AND number >= ?", changed.number, changed.first)
+            rows = ((changed.number, changed.first + n, *parts) for n, parts in enumerate(changed.frames))
+            self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
+
+    def _described(self, array: NDArray, constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Type, shape and chunks of an array, and the content of the chunks that may be new."""
+        transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
+        about = {"dtype": array.dtype.str, "shape": array.shape, "transposed": transposed}
+        known = self._constants.get(id(array))
+        if constant and known is not None and known[0] is array:
+            return about | {"chunks": known[1]}, {}
+        data = np.ascontiguousarray(array.T if transposed else array).reshape(-1).view(np.uint8).data
+        pieces = [data[start : start + CHUNK] for start in range(0, len(data), CHUNK)]
+        keys = [hashlib.blake2b(piece, digest_size=16).hexdigest() for piece in pieces]
+        if constant:
+            self._constants[id(array)] = array, keys
+        return about | {"chunks": keys}, {key: bytes(piece) for key, piece in zip(keys, pieces, strict=True)
+                                          if key not in self._chunks}  # fmt: skip
+
+
+class StateReader:
+    """Reads the database of a run, also of one that goes on: what is read is the state of one checkpoint.
+
+    Args:
+        path: The file.
+
+    Raises:
+        StateError: There is none, or it is no database of this version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise StateError(f"there is no state of a run at {path}")
+        try:
+            self._connection = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True, timeout=5,
+                                               isolation_level=None, check_same_thread=False)  # fmt: skip
+            weakref.finalize(self, self._connection.close)
+            self._connection.execute("BEGIN")  # one state for all that is read
+            found = [self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in _HEADER]
+        except sqlite3.Error as error:
+            raise StateError(f"{path} is not a readable state of a run: {error}") from error
+        if found[0] != APPLICATION:
+            raise StateError(f"{path} is not the state of a run")
+        if found[1] != SCHEMA:
+            raise StateError(f"{path} was written in version {found[1]} of the format; this version reads {SCHEMA}")
+
+    def meta(self) -> dict[str, Any]:
+        """What describes the run, by name.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        return {key: _parsed(value, self.path) for key, value in self._rows("SELECT key, value FROM meta")}
+
+    def state(self) -> tuple[Any, list[NDArray], list[list[Any]]] | None:
+        """Tree, arrays and records of the checkpoint; None if there is none yet.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        rows = list(self._rows("SELECT crc, tree FROM state"))
+        if not rows:
+            return None
+        crc, packed = rows[0]
+        try:
+            if zlib.crc32(packed) != crc:
+                raise ValueError("its checksum is wrong")
+            described = json.loads(zlib.decompress(packed))
+            chunks = {key.hex(): content for key, content in self._rows("SELECT key, content FROM chunks")}
+            arrays = [_array(about, chunks) for about in described["arrays"]]
+            texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
+            return described["tree"], arrays, [[json.loads(line) for line in text.splitlines()] for text in texts]
+        except (ValueError, KeyError, TypeError, zlib.error, RecursionError) as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+
+    def blocks(
+        self, map_number: int, first: int = 0, last: int = (1 << MAP_SHIFT) - 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+        """Keys (n,), slots (n,) and voxels (n, VOXELS) of the blocks of a map with Morton codes in a range.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        start = map_number << MAP_SHIFT
+        select = "SELECT key, slot, crc, voxels FROM blocks WHERE key BETWEEN ? AND ? ORDER BY key"
+        rows = list(self._rows(select, start | first, start | last))
+        for key, _, crc, content in rows:
+            if len(content) != 4 * VOXELS or zlib.crc32(content) != crc:
+                raise StateError(
+                    f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
+                )
+        voxels = np.empty((len(rows), VOXELS), np.int32)
+        for n in range(0, len(rows), ROWS):
+            part = b"".join(row[3] for row in rows[n : n + ROWS])
+            voxels[n : n + ROWS] = np.frombuffer(part, np.int32).reshape(-1, VOXELS)
+        return np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64), voxels
+
+    def region(self, map_number: int, region: Region) -> BlockRecords:
+        """Blocks of a region of a map that had left the memory.
+
+        Raises:
+            StateError: They are missing, or the database is damaged.
+        """
+        select = f"SELECT crc, {', '.join(COLUMNS)} FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?"
+        rows = list(self._rows(select, map_number, *region))
+        try:
+            if not rows or _checksum(rows[0][1:]) != rows[0][0]:
+                raise ValueError("it is missing or not as it was written")
+            return records_of(rows[0][1:])
+        except ValueError as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
+
+    def frame(self, store: int, number: int) -> EncodedFrame:
+        """A stored frame: depth, colour and mask as files.
+
+        Raises:
+            StateError: It is missing, or the database is damaged.
+        """
+        select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
+        rows = list(self._rows(select, store, number))
+        if not rows:
+            raise StateError(f"the state of the run in {self.path} is damaged: stored frame {number} is missing")
+        depth, color, mask = rows[0]
+        return depth, color, mask
+
+    def num_frames(self, store: int) -> int:
+        """Number of stored frames of a store."""
+        return next(iter(self._rows("SELECT count(*) FROM frames WHERE store = ?", store)))[0]
+
+    def release(self) -> None:
+        """Let go of the state that was current when the file was opened; later reads see the newest."""
+        self._connection.execute("COMMIT")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def _rows(self, statement: str, *values: object) -> Iterable[Sequence[Any]]:
+        try:
+            yield from self._connection.execute(statement, values)
+        except sqlite3.Error as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+
+
+_HEADER = "application_id", "user_version"
+
+
+def _region_row(records: BlockRecords) -> list[Any]:
+    """Checksum and arrays of a region."""
+    blobs = blobs_of(records)
+    return [_checksum(blobs), *blobs]
+
+
+def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
+    crc = 0
+    for blob in blobs:
+        crc = zlib.crc32(blob, crc)
+    return crc
+
+
+def _key_range(number: int) -> tuple[int, int]:
+    return number << MAP_SHIFT, (number + 1) << MAP_SHIFT
+
+
+def _block_rows(changed: MapSnapshot) -> Iterable[tuple[int, int, int, bytes]]:
+    for slot, key, voxels in zip(changed.slots.tolist(), changed.keys.tolist(), changed.voxels, strict=True):
+        if key >= 0:
+            content = voxels.tobytes()
+            yield key, slot, zlib.crc32(content), content
+
+
+def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
+    """An array from its chunks; it may be written."""
+    dtype = np.dtype(about["dtype"])
+    if dtype.hasobject:
+        raise ValueError("an array holds objects")
+    shape = tuple(int(length) for length in about["shape"])
+    data = b"".join(_checked(key, chunks[key]) for key in about["chunks"])
+    stored = np.frombuffer(data, np.uint8).view(dtype) if data else np.empty(0, dtype)
+    if about["transposed"]:
+        return stored.reshape(shape[::-1]).T.copy(order="K")
+    return stored.reshape(shape).copy()
+
+
+def _checked(key: str, content: bytes) -> bytes:
+    if hashlib.blake2b(content, digest_size=16).hexdigest() != key:
+        raise ValueError("an array is not as it was written")
+    return content
+
+
+def _parsed(text: str, path: Path) -> Any:  # noqa: ANN401
+    try:
+        return json.loads(text)
+    except ValueError as error:
+        raise StateError(f"the state of the run in {path} is damaged: {error}") from error

@@ -1,0 +1,362 @@
+"""The state of a system as a tree of plain values and arrays, and a system with the state of such a tree.
+
+The tree is found by walking through all attributes of all objects, so that no class needs to list what it remembers,
+and an attribute that is added later is stored without further work. What cannot be stored (a thread, an open file, a
+function) is an error unless ``wiring.py`` says how it is made again. Nothing is executed when a tree is read: objects
+are made of the classes of a few packages only, without calling them, and receive their attributes.
+
+A node is a number, a text, None, or an object with one key that names its kind.
+"""
+
+import json
+import sys
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from dudmap.errors import StateError
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.frame_store import FrameStore
+from dudmap.state import wiring
+
+if TYPE_CHECKING:
+    from dudmap.state.blocks import MapSnapshot, StoredMaps
+    from dudmap.state.frames import FrameSnapshot, StoredFrames
+
+Node = Any
+"""A tree of plain values, as JSON has them."""
+LONG = 32
+"""Length from which on a list of equal things is stored as one array."""
+
+
+@dataclass(eq=False)
+class Snapshot:
+    """The state of a system at one moment, which no later change reaches.
+
+    Attributes:
+        tree: The tree; ``arrays`` and ``records`` are referred to by number.
+        arrays: Copies, except of what never changes.
+        records: Lists of plain values.
+        constant: Numbers of the arrays that never change.
+        maps, frames: What changed in the maps and stored frames since the last checkpoint.
+    """
+
+    tree: Node = None
+    arrays: list[NDArray] = field(default_factory=list)
+    records: list[list[Any]] = field(default_factory=list)
+    constant: set[int] = field(default_factory=set)
+    maps: "list[MapSnapshot]" = field(default_factory=list)
+    frames: "list[FrameSnapshot]" = field(default_factory=list)
+
+
+class NotSettledError(Exception):
+    """Something is being computed in the background; the state can be stored at a later frame."""
+
+
+class TreeWriter:
+    """Takes a snapshot.
+
+    Args:
+        maps, frames: Know what of the maps and of the stored frames is in the database already.
+        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
+    """
+
+    def __init__(self, maps: "StoredMaps", frames: "StoredFrames", *, wait: bool) -> None:
+        self.snapshot = Snapshot()
+        self._maps, self._frames, self._wait = maps, frames, wait
+        self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
+
+    def take(self, value: object) -> Snapshot:
+        """The snapshot of a value and everything that it refers to.
+
+        Raises:
+            StateError: There is something that cannot be stored.
+            NotSettledError: See ``wait``.
+        """
+        self.snapshot.tree = self._node(value, "state")
+        return self.snapshot
+
+    def _node(self, value: Any, place: str, *, constant: bool = False) -> Node:  # noqa: ANN401
+        if value is None or type(value) in (bool, int, float, str):
+            return value
+        if isinstance(value, np.generic):
+            return {"scalar": value.dtype.str, "value": value.item()}
+        if id(value) in self._seen:
+            return {"same": self._seen[id(value)][0]}
+        number = len(self._seen)
+        self._seen[id(value)] = number, value
+        if isinstance(value, np.ndarray):
+            return {"array": self._array(value, place, constant=constant), "id": number}
+        if isinstance(value, BaseModel):
+            return {"model": _class_name(value, place), "json": value.model_dump_json(), "id": number}
+        if isinstance(value, np.random.Generator):
+            return {"random": value.bit_generator.state, "id": number}
+        if isinstance(value, Future):
+            return {"result": self._node(self._result(value), place), "id": number}
+        if isinstance(value, tuple | list | deque | dict | set | frozenset):
+            return self._container(value, place, number, constant=constant)
+        return self._object(value, place, number)
+
+    def _container(self, value: Any, place: str, number: int, *, constant: bool) -> Node:  # noqa: ANN401
+        if isinstance(value, tuple):
+            items = [self._node(item, f"{place}[{n}]", constant=constant) for n, item in enumerate(value)]
+            node = {"tuple": items, "id": number}
+            return node | {"class": _class_name(value, place)} if type(value) is not tuple else node
+        if isinstance(value, list):
+            return {"list": self._items(value, place), "id": number}
+        if isinstance(value, deque):
+            return {"deque": self._items(list(value), place), "limit": value.maxlen, "id": number}
+        if isinstance(value, dict):
+            keys, content = list(value), list(value.values())
+            return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
+        return {"frozenset" if isinstance(value, frozenset) else "set": self._items(sorted(value), place), "id": number}
+
+    def _items(self, items: list[Any], place: str) -> Node:
+        """Items of a list: one by one, or as an array where they are many of one kind."""
+        kinds = {type(item) for item in items} if len(items) >= LONG else set()
+        if len(kinds) == 1:
+            kind = kinds.pop()
+            if kind in (int, float) and not (kind is int and any(abs(item) >= 1 << 63 for item in items)):
+                return {"numbers": self._add(np.array(items, np.int64 if kind is int else np.float64))}
+            if kind is np.ndarray and items[0].size <= 64 and len({(a.shape, a.dtype) for a in items}) == 1:
+                return {"stack": self._add(np.stack(items))}
+            if kind.__name__ in wiring.COLUMNS and wiring.is_state_class(kind):
+                names = list(wiring.attributes(items[0]))
+                columns = [self._items([getattr(item, name) for item in items], f"{place}.{name}") for name in names]
+                return {"columns": _name(kind), "names": names, "values": columns, "count": len(items)}
+        return [self._node(item, f"{place}[{n}]") for n, item in enumerate(items)]
+
+    def _object(self, value: object, place: str, number: int) -> Node:
+        cls = type(value)
+        if not wiring.is_state_class(cls) or not hasattr(value, "__dict__"):
+            raise StateError(f"{place} is a {cls.__module__}.{cls.__qualname__}, which cannot be stored")
+        evaluated, records = wiring.EVALUATED.get(cls.__name__, ()), wiring.RECORDS.get(cls.__name__, ())
+        node: dict[str, Node] = {"object": _name(cls), "id": number}
+        if isinstance(value, TsdfVolume):
+            state, changed = self._maps.snapshot(value)
+            self.snapshot.maps.append(changed)
+            node |= {"map": changed.number, "blocks": self._node(state, place)}
+        if isinstance(value, FrameStore):
+            changed = self._frames.snapshot(value)
+            self.snapshot.frames.append(changed)
+            node |= {"store": changed.number}
+        content = {}
+        for name, attribute in wiring.attributes(value).items():
+            where = f"{place}.{name}"
+            if name in records:
+                self.snapshot.records.append(list(attribute))
+                content[name] = {"records": len(self.snapshot.records) - 1}
+            elif name in evaluated:
+                content[name] = {"call": self._node(attribute(), where)}
+            else:
+                content[name] = self._node(attribute, where, constant=cls.__name__ in wiring.CONSTANT)
+        return node | {"attributes": content}
+
+    def _array(self, array: NDArray, place: str, *, constant: bool) -> int:
+        if array.dtype.hasobject:
+            raise StateError(f"{place} is an array of objects, which cannot be stored")
+        number = self._add(array if constant else array.copy(order="K"))
+        if constant:
+            self.snapshot.constant.add(number)
+        return number
+
+    def _add(self, array: NDArray) -> int:
+        self.snapshot.arrays.append(array)
+        return len(self.snapshot.arrays) - 1
+
+    def _result(self, future: "Future[Any]") -> Any:  # noqa: ANN401
+        if not (future.done() or self._wait):
+            raise NotSettledError
+        return future.result()
+
+
+class TreeReader:
+    """Gives a system the state of a tree.
+
+    Args:
+        arrays: Arrays by number, which become part of the system.
+        records: Lists of plain values by number.
+        load_map: Fills a map, given its number in the database and what the tree says of its blocks.
+        load_frames: Connects a frame store with the stored frames of a number.
+    """
+
+    def __init__(
+        self,
+        arrays: Sequence[NDArray],
+        records: Sequence[list[Any]],
+        load_map: Callable[[TsdfVolume, int, dict[str, Any]], None],
+        load_frames: Callable[[FrameStore, int], None],
+    ) -> None:
+        self._arrays, self._records = arrays, records
+        self._load_map, self._load_frames = load_map, load_frames
+        self._made: dict[int, Any] = {}
+        self._taken: set[int] = set()  # identities of the objects of the given system that are in use
+
+    def restore(self, node: Node, current: object) -> Any:  # noqa: ANN401
+        """The value of a tree.
+
+        Args:
+            node: The tree.
+            current: A new value of the same kind, whose objects are used, so that they stay connected.
+
+        Raises:
+            StateError: The tree is damaged or of another version.
+        """
+        try:
+            return self._value(node, current)
+        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
+            raise StateError(f"the stored state is damaged: {type(error).__name__} {error}") from error
+
+    def _value(self, node: Node, current: Any = None) -> Any:  # noqa: ANN401
+        if not isinstance(node, dict):
+            return node
+        if "same" in node:
+            return self._made[node["same"]]
+        if "scalar" in node:
+            return np.dtype(node["scalar"]).type(node["value"])
+        if "object" in node:
+            return self._object(node, current)
+        value = self._leaf(node) if "list" not in node and "dict" not in node and "deque" not in node else None
+        if value is None:
+            return self._mutable(node, current)
+        self._made[node["id"]] = value
+        return value
+
+    def _leaf(self, node: dict[str, Node]) -> Any:  # noqa: ANN401
+        """A value that holds no reference to itself."""
+        if "array" in node:
+            return self._arrays[node["array"]]
+        if "model" in node:
+            cls = _class(node["model"])
+            if not issubclass(cls, BaseModel):
+                raise StateError(f"the stored state is damaged: {cls.__name__} is no configuration")
+            return cls.model_validate_json(node["json"])
+        if "random" in node:
+            generator = np.random.default_rng(0)
+            generator.bit_generator.state = node["random"]
+            return generator
+        if "result" in node:
+            future: Future[Any] = Future()
+            future.set_result(self._value(node["result"]))
+            return future
+        if "tuple" in node:
+            items = [self._value(item) for item in node["tuple"]]
+            return _class(node["class"])(*items) if "class" in node else tuple(items)
+        items = self._items(node["frozenset"] if "frozenset" in node else node["set"])
+        return frozenset(items) if "frozenset" in node else set(items)
+
+    def _mutable(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
+        """A list, deque or dictionary, which may be part of its own content."""
+        if "list" in node:
+            value: Any = []
+            self._made[node["id"]] = value
+            value += self._items(node["list"], current)
+        elif "deque" in node:
+            value = deque(maxlen=node["limit"])
+            self._made[node["id"]] = value
+            value.extend(self._items(node["deque"]))
+        else:
+            value = {}
+            self._made[node["id"]] = value
+            keys = self._items(node["dict"])
+            known = [current.get(key) for key in keys] if isinstance(current, dict) else []
+            value.update(zip(keys, self._items(node["values"], known), strict=True))
+        return value
+
+    def _items(self, node: Node, current: Any = None) -> list[Any]:  # noqa: ANN401
+        if isinstance(node, list):
+            known = current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
+            return [self._value(item, one) for item, one in zip(node, known, strict=True)]
+        if "numbers" in node:
+            return self._arrays[node["numbers"]].tolist()
+        if "stack" in node:
+            return [row.copy() for row in self._arrays[node["stack"]]]
+        cls = _class(node["columns"])
+        columns = [self._items(column) for column in node["values"]]
+        out = []
+        for values in zip(*columns, strict=True):
+            one = object.__new__(cls)
+            for name, value in zip(node["names"], values, strict=True):
+                object.__setattr__(one, name, value)
+            out.append(one)
+        return out
+
+    def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
+        cls = _class(node["object"])
+        usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
+        value = current if usable else object.__new__(cls)
+        self._made[node["id"]] = value
+        self._taken.add(id(value))
+        rebuilt = wiring.rebuilt(cls)
+        content = node["attributes"]
+        if usable:
+            for name in [name for name in vars(value) if name not in content and name not in rebuilt]:
+                object.__delattr__(value, name)
+        else:
+            for name, default in _defaults(cls).items():
+                object.__setattr__(value, name, default)
+        for name, attribute in content.items():
+            object.__setattr__(value, name, self._attribute(attribute, getattr(current, name, None)))
+        if "map" in node:
+            self._load_map(value, node["map"], self._value(node["blocks"]))
+        if "store" in node:
+            self._load_frames(value, node["store"])
+        return value
+
+    def _attribute(self, node: Node, current: Any) -> Any:  # noqa: ANN401
+        if isinstance(node, dict) and "records" in node:
+            return self._records[node["records"]]
+        if isinstance(node, dict) and "call" in node:
+            result = self._value(node["call"])
+            return lambda: result
+        return self._value(node, current)
+
+
+def _defaults(cls: type) -> dict[str, Any]:
+    """Values of the attributes that are not stored, of an object that is made without its constructor."""
+    made: dict[str, dict[str, Any]] = {
+        "BlockPager": {"_store": None, "_executor": None},
+        "CpuBackend": {"_padded": np.empty((0, 0), np.float32), "_limited": np.empty((0, 0), np.float32),
+                       "_pixels": np.empty((0, 2), np.int32)},
+        "FrameStore": {"registered": None, "_file": None, "_encoder": None, "_pending": deque()},
+        "LoopCloser": {"_executor": None},
+        "Observation": {"_halvings": [], "_recorded_halvings": []},
+    }  # fmt: skip
+    return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
+
+
+def _is_frozen(cls: type) -> bool:
+    parameters = getattr(cls, "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
+
+
+def _name(cls: type) -> str:
+    return f"{cls.__module__}:{cls.__qualname__}"
+
+
+def _class_name(value: object, place: str) -> str:
+    if not wiring.is_state_class(type(value)):
+        raise StateError(f"{place} is a {_name(type(value))}, which cannot be stored")
+    return _name(type(value))
+
+
+def _class(name: str) -> type:
+    """The class of a name, if it is one whose objects may be made from a database."""
+    module, _, path = name.partition(":")
+    found: Any = sys.modules.get(module)
+    for part in path.split("."):
+        found = getattr(found, part, None)
+    if not isinstance(found, type) or not wiring.is_state_class(found):
+        raise StateError(f"the stored state holds a {name!r}, which this version does not know")
+    return found
+
+
+def lines(records: list[Any]) -> str:
+    """Plain values as lines of JSON."""
+    return "".join(json.dumps(record) + "\n" for record in records)

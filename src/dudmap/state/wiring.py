@@ -1,0 +1,65 @@
+"""What of the objects of a run is not stored as it is: connections, threads, files and buffers that are made anew."""
+
+from typing import Any
+
+PACKAGES = (
+    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapping",
+    "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
+)  # fmt: skip
+"""Parts of this package whose classes hold state; no other class is ever made from a database."""
+REBUILT = {
+    "Atlas": ("make_volume",),  # a method of Slam
+    "BlockPager": (  # the regions have a table
+        "_store",
+        "_executor",
+        "_away",
+        "_writing",
+        "_reading",
+        "_unchanged_since",
+        "_serial",
+        "_archived",
+        "_archive",
+    ),
+    "CpuBackend": ("_padded", "_limited", "_pixels"),  # buffers that every call fills anew
+    "FrameStore": ("registered", "_offsets", "_file", "_encoder", "_pending", "archived"),  # the frames have a table
+    "KeyframeDatabase": ("_sift",),
+    "LoopCloser": ("_executor",),
+    "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
+    "TsdfVolume": ("blocks", "window", "map_id"),  # the blocks have a table; the number is one of this process
+}
+"""Attributes by class that a new object makes itself, so that they are not part of the state."""
+EVALUATED = {"FrameView": ("segmentation",)}
+"""Attributes that are functions without arguments, of which the result is stored."""
+CONSTANT = frozenset({"PlacedFeatures", "Preprocessor"})
+"""Classes whose arrays never change once they are made: they need not be copied for a snapshot."""
+RECORDS = {"RunRecord": ("rows", "lost", "movers", "unreadable")}
+"""Attributes that are lists of plain values which only grow; they are stored as lines of JSON."""
+COLUMNS = frozenset({"TimedPose", "TermBalance"})
+"""Classes of which many objects stand in one list and nowhere else; they are stored attribute by attribute."""
+
+
+def is_state_class(cls: type) -> bool:
+    """Whether objects of a class may be stored and made from what is stored."""
+    package, _, rest = cls.__module__.partition(".")
+    return package == "dudmap" and any(rest == part or rest.startswith(part + ".") for part in PACKAGES)
+
+
+def rebuilt(cls: type) -> set[str]:
+    """Attributes that objects of a class make themselves."""
+    return {name for base in cls.__mro__ for name in REBUILT.get(base.__name__, ())}
+
+
+def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The attributes of an object that are its state, in the order in which they were set.
+
+    Values that ``functools.cached_property`` keeps are left out: they follow from the others.
+    """
+    from functools import cached_property
+
+    cls = type(value)
+    left_out = rebuilt(cls)
+    return {
+        name: content
+        for name, content in vars(value).items()
+        if name not in left_out and not isinstance(getattr(cls, name, None), cached_property)
+    }

@@ -1,0 +1,101 @@
+"""Who may see a page that is served: this machine, or whoever has its secret address."""
+
+import ipaddress
+import re
+import secrets
+import socket
+from collections.abc import Mapping
+from typing import Any
+from urllib.parse import urlsplit
+
+from dudmap.errors import ConfigError
+
+TOKEN_BYTES = 16
+"""Random bytes of a token that is made here: 128 bit, more than can be guessed."""
+POLICY_VIOLATION = 1008
+"""Code with which a connection is closed (RFC 6455, section 7.4.1)."""
+
+
+class PageAccess:
+    """Decides which connections get what the page shows.
+
+    Without a token the page is for this machine: a connection must be made to a name of the loopback, which keeps off
+    web pages that point their own name at it (DNS rebinding). With a token its path must be the token. In both cases
+    connections that a page from elsewhere opens in the user's browser are refused by their ``Origin``.
+
+    Args:
+        host: Address to serve at.
+        port: Port to serve at.
+        token: Secret part of the address; None makes one where ``host`` lets other machines in.
+
+    Attributes:
+        token: The secret, empty where none is needed.
+
+    Raises:
+        ConfigError: The token has too few or other characters than an address may hold.
+    """
+
+    def __init__(self, host: str, port: int, token: str | None = None) -> None:
+        if token is not None and not re.fullmatch(r"[A-Za-z0-9_-]{8,200}", token):
+            raise ConfigError(
+                f"the token has {len(token)} characters; expected 8 or more of letters, digits, - and _, or none to "
+                "have one made"
+            )
+        self.host, self.port = host, port
+        self.local = is_loopback(host)
+        self.token = token or ("" if self.local else secrets.token_urlsafe(TOKEN_BYTES))
+
+    @property
+    def url(self) -> str:
+        """Address to open in a browser; with a token, viser's page is told by its query where to connect."""
+        name = "localhost" if self.local else self.host
+        if name in ("0.0.0.0", "::", ""):
+            name = socket.gethostname()
+        place = f"[{name}]:{self.port}" if ":" in name else f"{name}:{self.port}"
+        return f"http://{place}" + (f"/?websocket=ws://{place}/{self.token}" if self.token else "")
+
+    @property
+    def notice(self) -> str:
+        """Sentence on who can see the page."""
+        if self.local:
+            return "for this machine only"
+        return f"on {self.host} for every machine that reaches it, with this address only; it is not encrypted"
+
+    def allows(self, path: str, headers: Mapping[str, str]) -> bool:
+        """Whether a connection with this path and these headers may see the page."""
+        host, origin = headers.get("Host", ""), headers.get("Origin")
+        if origin is not None and urlsplit(origin).netloc != host:
+            return False
+        if self.token:
+            given = urlsplit(path).path.strip("/")
+            return secrets.compare_digest(given.encode(), self.token.encode())
+        return is_loopback(urlsplit(f"//{host}").hostname or "")
+
+    def guard(self, server: Any) -> None:  # noqa: ANN401 - viser.ViserServer, of an optional package
+        """Close every connection to a server of viser that is not allowed before anything is sent to it.
+
+        Nothing is shown before this is called; connections from before are closed, too. A page cannot publish the
+        server through viser's relay on the internet.
+        """
+        connections = server._websock_server
+
+        async def check(client: Any) -> None:  # noqa: ANN401 - viser.infra.WebsockClientConnection
+            # viser runs this before it sends; whatever fails here ends the connection without a message
+            connection = connections._live_connections[client.client_id]
+            if not self.allows(connection.request.path, connection.request.headers):
+                await connection.close(POLICY_VIOLATION, "the address of this page has a secret part, which is wrong")
+
+        connections.on_client_connect(check)
+        connections.disconnect_all_clients()
+        for message in [kind for kind in connections._incoming_handlers if kind.__name__.startswith("ShareUrl")]:
+            connections.unregister_handler(message)
+
+
+def is_loopback(host: str) -> bool:
+    """Whether a name or address is one of this machine alone."""
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False

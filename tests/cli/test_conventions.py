@@ -1,0 +1,319 @@
+"""What all commands have in common: --json, exit codes, quiet off a terminal, NO_COLOR, shell completion."""
+
+import json
+import os
+import re
+import subprocess
+import sys
+from importlib import import_module
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import typer
+from typer.testing import CliRunner
+
+from dudmap.cli import COMMANDS, app
+from dudmap.cli.output import answer, plain
+from exported_runs import make_run
+from run_folders import write_run
+
+SILENT = {"view"}
+"""Commands that report nothing: a server until ctrl-C."""
+
+
+def leaves(name, command):
+    """Every command below one, with its words."""
+    nested = getattr(command, "commands", None)
+    if not nested:
+        return {name: command}
+    return {words: leaf for key, part in nested.items() for words, leaf in leaves(f"{name} {key}", part).items()}
+
+
+ALL = {
+    words: command
+    for name in COMMANDS
+    for words, command in leaves(name, typer.main.get_command(import_module(f"dudmap.cli.{name}").app)).items()
+}
+
+
+def call(*arguments):
+    return CliRunner().invoke(app, [str(argument) for argument in arguments])
+
+
+@pytest.fixture(scope="module")
+def where(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("conventions")
+    make_run(folder, frames=4)
+    write_run(folder / "seen")
+    return folder
+
+
+# -- --json ------------------------------------------------------------------------------------------------------------
+
+
+def test_every_reporting_command_has_json():
+    lacking = {
+        words
+        for words, command in ALL.items()
+        if not any("--json" in parameter.opts for parameter in command.params)
+    }  # fmt: skip
+    assert lacking == SILENT
+
+
+CALLS = {
+    "run": ["run", "recording", "--out", "a"],
+    "demo": ["demo", "--frames", 2, "--out", "b"],
+    "live": ["live", "--camera", "replay:recording", "--out", "c"],
+    "report": ["report", "seen"],
+    "export": ["export", "run", "--to", "map.glb"],
+    "render": ["render", "run", "--orbit", "--frames", 2, "--size", "32x24", "--out", "orbit.avi"],
+    "clean": ["clean", "recording", "cleaned", "--run", "run"],
+    "info": ["info", "recording"],
+    "synth": ["synth", "made", "--scene", "plane", "--frames", 1, "--size", "32x24"],
+    "evaluate trajectory": ["evaluate", "run", "--reference", "recording"],
+    "evaluate mesh": ["evaluate", "mesh", "run/mesh.ply", "run/mesh.ply", "--samples", 100, "--no-error-mesh"],
+    "evaluate masks": ["evaluate", "masks", "run", "recording"],
+    "config": ["config", "--preset", "thesis"],
+    "study thesis": ["study", "thesis", "--published", "--out", "published"],
+}
+"""Quick calls; the answers of the other commands have their own test below, or go through the same function."""
+
+
+@pytest.mark.parametrize("words", CALLS)
+def test_json_is_one_object_on_stdout(slam, where, monkeypatch, words):
+    monkeypatch.chdir(where)
+    monkeypatch.setattr("dudmap.cli.demo.MostDynamicFrame.save_picture", lambda *_: None)  # of a map that is faked
+    done = call(*CALLS[words], "--json")
+    assert done.exit_code == 0, done.output
+    assert len(done.stdout.strip().splitlines()) == 1
+    assert isinstance(json.loads(done.stdout, parse_constant=pytest.fail), dict)
+
+
+FAKED = {
+    "warmup": (["warmup"], {"dudmap.cli.warmup.steps": lambda: [("part", lambda: None)]}),
+    "merge": (["merge", "a", "b"], {"dudmap.pipeline.merge.merge_runs": lambda *_: merged()}),
+    "calibrate": None,  # tests/calibration/test_self_calibration.py
+    "benchmark gate": (
+        ["benchmark", "gate"],
+        {
+            "dudmap.benchmark.gate.load_figures": lambda _: {},
+            "dudmap.benchmark.gate.gate_entries": lambda _: [],
+            "dudmap.benchmark.gate.measure_gate": lambda *_: [],
+            "dudmap.benchmark.gate.compare": lambda *_: [],
+        },
+    ),
+    "benchmark sensors": (
+        ["benchmark", "sensors", "--only", "kinect_v1", "--out", "sensors"],
+        {
+            "dudmap.benchmark.color_columns.measure_columns": lambda *_: [],
+            "dudmap.benchmark.color_columns.color_table": lambda *_: "",
+        },
+    ),
+    "benchmark random": (
+        ["benchmark", "random", "--out", "."],
+        {
+            "dudmap.benchmark.random_worlds.measure_worlds": lambda *_: [],
+            "dudmap.benchmark.random_worlds.report": lambda *_: "",
+        },
+    ),
+    "benchmark limits": (
+        ["benchmark", "limits", "--out", "limits"],
+        {
+            "dudmap.benchmark.limits.measure_cells": lambda *_: [],
+            "dudmap.benchmark.heatmaps.save_heat_maps": lambda *_: None,
+            "dudmap.benchmark.heatmaps.limits_table": lambda *_: "",
+            "dudmap.benchmark.heatmaps.cells_table": lambda *_: "",
+        },
+    ),
+    "benchmark speed": (
+        ["benchmark", "speed", "--out", "speed"],
+        {"dudmap.benchmark.speed.speed_figures": lambda *_: []},
+    ),
+    "benchmark bias": (
+        ["benchmark", "bias", "--seeds", 1],
+        {"dudmap.benchmark.bias.measure_pulls": lambda *_: [], "dudmap.synthetic.sequence": lambda *_, **__: None},
+    ),
+    "benchmark first-second": (
+        ["benchmark", "first-second", "--seeds", 1],
+        {
+            "dudmap.benchmark.first_second.measure_first_second": lambda *_: [],
+            "dudmap.benchmark.first_second.first_second_table": lambda _: "",
+            "dudmap.synthetic.sequence": lambda *_, **__: None,
+        },
+    ),
+    "study run": (
+        ["study", "design.toml"],
+        {
+            "dudmap.study.plan.load_plan": lambda _: None,
+            "dudmap.study.study.run_study": lambda *_, **__: "an outcome",
+        },
+    ),
+    "study tune": (
+        ["study", "tune", "design.toml"],
+        {"dudmap.study.plan.load_plan": lambda _: None, "dudmap.study.tune.run_tune": lambda *_, **__: "an outcome"},
+    ),
+}
+"""Long commands, with their measurements replaced."""
+
+
+def merged(*_):
+    tree = {"features": 9, "keyframes": 2, "area": 1.0, "denied": 0.0, "color_correlation": float("nan")}
+    return SimpleNamespace(tree=tree, out=Path("a-b"))
+
+
+@pytest.mark.parametrize("words", [words for words, faked in FAKED.items() if faked])
+def test_json_of_long_commands(tmp_path, monkeypatch, words):
+    arguments, replaced = FAKED[words]
+    monkeypatch.chdir(tmp_path)
+    for target, function in replaced.items():
+        monkeypatch.setattr(target, function)
+    done = call(*arguments, "--json")
+    assert done.exit_code == 0, done.output
+    assert isinstance(json.loads(done.stdout, parse_constant=pytest.fail), dict)
+
+
+def test_every_reporting_command_was_called():
+    suites = {words for words, command in ALL.items() if getattr(command.callback, "__name__", "") == "suite_command"}
+    assert len(suites) >= 3
+    assert set(CALLS) | set(FAKED) == set(ALL) - SILENT - suites
+
+
+def test_json_of_suites(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dudmap.benchmark.report.measure_all", lambda *_: [])
+    done = call("benchmark", "synthetic", "--quick", "--json", "--out", "out")
+    assert done.exit_code == 0, done.output
+    assert json.loads(done.stdout)["rows"] == []
+
+
+def test_what_json_cannot_hold_is_null(capsys):
+    tree = {"a": float("nan"), "b": np.array([1.0, np.inf]), "c": Path("x") / "y", "d": (np.float32(1), np.int64(2))}
+    assert plain(tree) == {"a": None, "b": [1.0, None], "c": str(Path("x/y")), "d": [1.0, 2]}
+    answer(tree, "text", as_json=False)
+    assert capsys.readouterr().out == "text\n"
+
+
+# -- exit codes --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", [words for words in ALL if words != "demo"])
+def test_wrong_usage_of_every_command_is_exit_code_2(words):
+    done = call(*words.split(), "--no-such-option")
+    assert done.exit_code == 2
+    assert done.stdout == ""
+
+
+MISSING = {
+    "run": ["run", "nowhere"], "view": ["view", "nowhere"], "report": ["report", "nowhere"],
+    "merge": ["merge", "nowhere", "there"], "export": ["export", "nowhere", "--to", "a.ply"],
+    "render": ["render", "nowhere", "--orbit", "--out", "a.mp4"], "clean": ["clean", "nowhere", "out"],
+    "live": ["live", "--camera", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
+    "demo": ["demo", "--set", "no.such=1"], "synth": ["synth", "out", "--scene", "moon"],
+    "evaluate": ["evaluate", "nowhere"], "evaluate mesh": ["evaluate", "mesh", "nowhere", "there"],
+    "evaluate masks": ["evaluate", "masks", "nowhere", "there"], "config": ["config", "--preset", "none"],
+    "benchmark": ["benchmark", "synthetic", "--systems", "none-such"], "study": ["study", "nowhere.toml"],
+    "gate": ["benchmark", "gate", "--figures", "nowhere.toml"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments", MISSING.values(), ids=MISSING)
+def test_an_error_is_exit_code_1_and_one_sentence_on_stderr(tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    done = call(*arguments)
+    assert done.exit_code == 1, done.output
+    assert done.stdout == ""
+    assert done.stderr.startswith("dudmap: ")
+    assert len(done.stderr.strip().splitlines()) == 1
+
+
+def test_ctrl_c_is_exit_code_130(monkeypatch):
+    def interrupt(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dudmap.config.Config.from_tree", interrupt)
+    done = call("config")
+    assert done.exit_code == 130
+    assert done.stderr == "dudmap: interrupted\n"
+
+
+def test_exit_codes_are_documented():
+    page = (Path(__file__).parents[2] / "docs" / "command-line.md").read_text(encoding="utf-8")
+    assert re.findall(r"^\| (\d+) \|", page, flags=re.MULTILINE) == ["0", "1", "2", "130"]
+    for name in ("NO_COLOR", "--install-completion", "--json", "DUDMAP_THREADS"):
+        assert name in page
+
+
+# -- terminals and pipes -----------------------------------------------------------------------------------------------
+
+PROGRAM = [sys.executable, "-c", "from dudmap.cli import main; main()"]
+
+
+@pytest.mark.parametrize("words", ["synth", "clean", "evaluate trajectory"])
+def test_pipes_get_no_progress_bar_and_no_codes(where, tmp_path, words):
+    arguments = [str(argument) for argument in CALLS[words]]
+    renamed = {"made": tmp_path / "made", "cleaned": tmp_path / "cleaned", "orbit.avi": tmp_path / "orbit.avi"}
+    done = subprocess.run(
+        [*PROGRAM, *(str(renamed.get(argument, argument)) for argument in arguments)],
+        cwd=where, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert done.stderr == ""
+    assert not re.search(r"[\r\x1b]", done.stdout)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="Windows has no pseudo-terminals of this kind")
+@pytest.mark.parametrize("no_color", [True, False])
+def test_no_color_is_honoured_on_a_terminal(where, no_color):
+    import pty
+
+    master, slave = pty.openpty()
+    environment = {key: value for key, value in os.environ.items() if key not in ("NO_COLOR", "FORCE_COLOR")}
+    environment |= {"TERM": "xterm-256color"} | ({"NO_COLOR": "1"} if no_color else {})
+    with subprocess.Popen([*PROGRAM, "run", "--help"], stdout=slave, stderr=slave, cwd=where, env=environment) as done:
+        os.close(slave)
+        text = b""
+        while True:
+            try:
+                part = os.read(master, 65536)
+            except OSError:  # Linux says so at the end
+                break
+            if not part:
+                break
+            text += part
+        done.wait()
+    os.close(master)
+    assert b"--max-frames" in re.sub(rb"\x1b\[[0-9;]*m", b"", text)
+    colored = re.search(rb"\x1b\[(?:\d+;)*(?:3[0-7]|9[0-7]|38;[0-9;]+)m", text)
+    assert bool(colored) != no_color
+
+
+# -- completion --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "expected"),
+    [
+        ("dudmap ca", {"calibrate"}),
+        ("dudmap evaluate ma", {"masks"}),
+        ("dudmap run --prese", {"--preset"}),
+        ("dudmap run --preset th", {"thesis"}),
+        ("dudmap run --set tracker.hub", {"tracker.huber="}),
+        ("dudmap config --preset ", {"default", "thesis"}),
+        ("dudmap live --camera real", {"realsense"}),
+    ],
+)
+def test_the_shell_completes(line, expected):
+    words = line.split(" ")
+    environment = os.environ | {
+        "_DUDMAP_COMPLETE": "complete_bash", "COMP_WORDS": line, "COMP_CWORD": str(len(words) - 1)
+    }  # fmt: skip
+    program = "import sys; sys.argv = ['dudmap']; from dudmap.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, env=environment, check=False)
+    assert set(done.stdout.split()) == expected, done.stderr
+
+
+def test_completion_can_be_installed():
+    script = "import sys; sys.argv = ['dudmap', '--show-completion', 'bash']; from dudmap.cli import main; main()"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    assert "complete -o default" in done.stdout, done.stderr

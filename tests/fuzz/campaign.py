@@ -1,0 +1,142 @@
+"""``make fuzz``: many hostile inputs for all loaders, each loader in a child of limited memory.
+
+Usage: python tests/fuzz/campaign.py [--seconds 60] [--loaders "bag,map"] [--seed 0] [--memory 2.0] [--out fuzz.json]
+
+Input number n of a loader is the same on every machine; ``--only LOADER:n`` repeats one, and ``--keep LOADER:n FOLDER``
+writes it, to be added to tests/fuzz/corpus.
+"""
+
+import argparse
+import json
+import mmap
+import os
+import platform
+import resource
+import shutil
+import struct
+import sys
+import tempfile
+import time
+import traceback
+from pathlib import Path
+
+sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
+
+from loaders import LOADERS
+from trial import Finding, Subject
+
+COUNT = struct.Struct("<QQ")
+"""In memory shared with the child: number of inputs that were read, and number of the present one."""
+
+
+def child(name, first, seconds, share, memory, report):
+    """Read inputs from number ``first`` on for some seconds; findings go to the file ``report``."""
+    sys.stderr = open(os.devnull, "w")
+    os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+    folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
+    try:
+        subject = Subject(name, folder)
+        (folder / "cwd").mkdir()
+        os.chdir(folder / "cwd")
+        subject.warm_up()  # before memory is limited
+        status = Path("/proc/self/status").read_text()
+        used = int(status.partition("VmSize:")[2].split()[0]) * 1024
+        resource.setrlimit(resource.RLIMIT_AS, (used + int(memory * 2**30),) * 2)
+        number, end = first, time.time() + seconds
+        while time.time() < end:
+            share[: COUNT.size] = COUNT.pack(number - first, number)
+            try:
+                subject.trial(number)
+            except Finding as finding:
+                cause = finding.__cause__ or finding
+                trace = traceback.format_exception(cause)
+                with report.open("a") as file:
+                    file.write(
+                        json.dumps(
+                            {"loader": name, "number": number, "what": str(finding), "trace": trace[-1:] + trace[-6:]}
+                        )
+                        + "\n"
+                    )
+            number += 1
+        share[: COUNT.size] = COUNT.pack(number - first, number)
+    finally:
+        os.chdir("/")
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def fuzz(name, seconds, seed, memory, report):
+    """Inputs that were read, and deaths of the process."""
+    share, number, count, deaths, left = mmap.mmap(-1, COUNT.size), seed, 0, 0, seconds
+    while left > 0:
+        begin = time.time()
+        share[: COUNT.size] = COUNT.pack(0, number)
+        pid = os.fork()
+        if pid == 0:
+            code = 1
+            try:
+                child(name, number, left, share, memory, report)
+                code = 0
+            except BaseException:
+                with report.open("a") as file:
+                    file.write(json.dumps({"loader": name, "number": -1, "what": traceback.format_exc()}) + "\n")
+            finally:
+                os._exit(code)
+        _, status = os.waitpid(pid, 0)
+        done, at = COUNT.unpack(share[: COUNT.size])
+        count += done
+        if os.WIFSIGNALED(status):
+            deaths += 1
+            with report.open("a") as file:
+                what = f"killed by signal {os.WTERMSIG(status)}"
+                file.write(json.dumps({"loader": name, "number": at, "what": what}) + "\n")
+        elif status:
+            return count, deaths
+        number, left = at + 1, left - (time.time() - begin)
+    return count, deaths
+
+
+def chosen(text):
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    return [name for name in LOADERS if not parts or any(part in name for part in parts)]
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=60, help="for each loader")
+    parser.add_argument("--loaders", default="", help="parts of names, commas between them; default: all")
+    parser.add_argument("--seed", type=int, default=0, help="number of the first input")
+    parser.add_argument("--memory", type=float, default=2.0, help="GiB that a loader may take")
+    parser.add_argument("--only", help="LOADER:NUMBER, repeat one input and show what happens")
+    parser.add_argument("--keep", nargs=2, help="LOADER:NUMBER and a folder, write the input")
+    parser.add_argument("--out", type=Path, default=Path("fuzz.jsonl"), help="findings")
+    arguments = parser.parse_args()
+    if arguments.only or arguments.keep:
+        name, _, number = (arguments.only or arguments.keep[0]).rpartition(":")
+        with tempfile.TemporaryDirectory() as folder:
+            subject = Subject(name, Path(folder) / "a")
+            if arguments.keep:
+                for file in subject.change(int(number)):
+                    target = Path(arguments.keep[1]) / file.relative_to(subject.home)
+                    target.parent.mkdir(parents=True, exist_ok=True)
+                    shutil.copy(file, target)
+            else:
+                subject.change(int(number))
+                subject.loader.load(subject.path)
+        return
+    arguments.out.write_text("")
+    print(
+        f"{time.strftime('%Y-%m-%d')}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores"
+    )
+    print("| loader | inputs | deaths | findings |\n|---|---|---|---|")
+    total = 0
+    for name in chosen(arguments.loaders):
+        before = len(arguments.out.read_text().splitlines())
+        count, deaths = fuzz(name, arguments.seconds, arguments.seed, arguments.memory, arguments.out.resolve())
+        found = len(arguments.out.read_text().splitlines()) - before
+        total += found
+        print(f"| {name} | {count} | {deaths} | {found} |", flush=True)
+    sys.exit(1 if total else 0)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,154 @@
+"""A map whose far blocks wait on disk is the map that is in memory as a whole."""
+
+import sqlite3
+
+import numpy as np
+import pytest
+
+from dudmap.errors import MapError
+from dudmap.geometry import se3
+from dudmap.mapping.incremental_mesh import IncrementalMesh
+from dudmap.mapping.region_store import RegionStore
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.state.database import StateDatabase, StateReader
+from dudmap.state.system import restore, take_snapshot
+from triangles import triangles
+from wavy_wall import CAMERA, CONSTANT, wall
+
+CONFIG = CONSTANT.model_copy(update={"min_weight": 1, "voxel_size": 0.02, "carving": True})
+DEPTH = 3.0
+MAX_BLOCKS = 400
+PATH = [*np.arange(0.0, 21.0, 1.5), *np.arange(21.0, -1.0, -3.0)]
+"""Positions along a wall and back: other voxels on the way back, and many windows apart at the far end."""
+
+
+def frame(number):
+    return wall(1.5 + 0.05 * (number % 3), number), se3.exp(np.array([PATH[number], 0, 0, 0, 0.1 * (number % 4), 0]))
+
+
+@pytest.fixture(scope="module")
+def maps():
+    whole, paged = TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH), TsdfVolume(
+        CAMERA, CONFIG, depth_max=DEPTH, max_blocks=MAX_BLOCKS
+    )  # fmt: skip
+    most = 0
+    for number in range(len(PATH)):
+        for volume in (whole, paged):
+            volume.integrate(*frame(number))
+        most = max(most, paged.blocks.num_voxel_blocks)
+    return whole, paged, most
+
+
+def content(volume):
+    """Everything that is known of each block, by its coordinates."""
+    out = {}
+    for part in volume.records():
+        voxels = {int(row): n for n, row in enumerate(part.owners)}
+        for n, coords in enumerate(part.coords):
+            m = voxels.get(n)
+            words = None if m is None else (part.geometry[m].tobytes(), part.colors[m].tobytes(), int(part.fused[m]))
+            assert tuple(coords) not in out
+            out[tuple(coords)] = int(part.free_count[n]), words
+    return out
+
+
+def test_memory_is_bounded_while_the_map_grows(maps):
+    whole, paged, most = maps
+    assert whole.num_blocks > 8 * MAX_BLOCKS
+    assert most < 0.6 * whole.num_blocks  # the regions that the window meets are never sent away
+    assert paged.num_blocks == whole.num_blocks
+    assert paged.num_bytes < 0.7 * whole.num_bytes
+
+
+def test_the_content_is_bit_for_bit_that_of_a_map_in_memory(maps):
+    whole, paged, _ = maps
+    assert content(paged) == content(whole)
+    assert paged.blocks.num_voxel_blocks < 0.6 * whole.num_blocks
+
+
+def test_mesh_and_views_are_those_of_a_map_in_memory(maps):
+    whole, paged, _ = maps
+    assert np.array_equal(triangles(paged.extract_mesh()), triangles(whole.extract_mesh()))
+    for position in (0.0, 10.0, 20.0):
+        T = se3.exp(np.array([position, 0, 0, 0, 0.05, 0]))
+        a, b = paged.raycast(T), whole.raycast(T)
+        assert np.any(b.depth > 0)
+        assert all(np.array_equal(*pair) for pair in zip(a, b, strict=True))
+
+
+def test_a_paged_map_is_saved_whole(maps, tmp_path):
+    whole, paged, _ = maps
+    paged.save(tmp_path / "map.npz")
+    assert content(TsdfVolume.load(tmp_path / "map.npz")) == {
+        coords: (free, words and (*words[:2], 0)) for coords, (free, words) in content(whole).items()
+    }
+
+
+def test_colors_are_taken_over_by_blocks_on_disk_too():
+    volumes = [TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS)]
+    others = [TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS)]
+    for volume, other in zip(volumes, others, strict=True):
+        for number in range(12):
+            volume.integrate(*frame(number))
+            image, T = frame(number)
+            other.integrate(type(image)(image.timestamp, image.depth, image.color[:, ::-1].copy()), T)
+        volume.take_colors(other)
+        volume.integrate(*frame(0))
+    assert content(volumes[0]) == content(volumes[1])
+
+
+def test_a_live_mesh_keeps_what_waits_on_disk():
+    whole, paged = (TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS))
+    live = IncrementalMesh(paged)
+    for number in range(len(PATH)):
+        whole.integrate(*frame(number))
+        paged.integrate(*frame(number))
+        live.update()
+    np.testing.assert_array_equal(triangles(live.mesh()), triangles(whole.extract_mesh()))
+
+
+def test_blocks_stay_in_memory_while_the_disk_is_full(monkeypatch):
+    def full(self, region, records):
+        raise MapError("the disk is full")
+
+    whole, paged = (TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS))
+    with monkeypatch.context() as patch:
+        patch.setattr(RegionStore, "write", full)
+        for number in range(12):
+            whole.integrate(*frame(number))
+            paged.integrate(*frame(number))
+        paged.pager._executor.submit(int).result()  # everything asked for before has been tried
+        paged.look_at(se3.exp(np.array([0.0, 0, 0, 0, 0, 0])))
+        assert "disk is full" in paged.pager.failure
+        assert content(paged) == content(whole)
+
+
+def test_an_unreadable_store_is_reported(maps, monkeypatch):
+    class Broken:
+        def execute(self, *arguments):
+            raise sqlite3.OperationalError("disk I/O error")
+
+    store = RegionStore()
+    monkeypatch.setattr(store, "_connection", Broken())
+    with pytest.raises(MapError, match=r"cannot be read from .*disk I/O error"):
+        store.read((0, 0, 0))
+
+
+def test_a_paged_map_is_stored_and_goes_on(tmp_path):
+    """The map, its regions on disk included, is in a database after each checkpoint, whatever came and went between."""
+    whole, paged = (TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS))
+    database = StateDatabase(tmp_path / "state.db")
+    for number in range(len(PATH)):
+        whole.integrate(*frame(number))
+        paged.integrate(*frame(number))
+        if number % 3 == 0:
+            database.write(take_snapshot({"map": paged}, database), {})
+        if number in (12, 18):
+            database.close()
+            reader, database = StateReader(tmp_path / "state.db"), StateDatabase(tmp_path / "state.db")
+            empty = TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=MAX_BLOCKS)
+            paged = restore(reader, {"map": empty}, database)["map"]
+            assert paged.pager.num_blocks > 0
+            assert content(paged) == content(whole)
+    assert content(paged) == content(whole)
+    database.close()

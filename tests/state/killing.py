@@ -1,0 +1,155 @@
+"""Runs in processes that are killed at chosen moments, and what remains of them."""
+
+import contextlib
+import hashlib
+import json
+import os
+import signal
+import threading
+import time
+import traceback
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from dudmap import synthetic
+from dudmap.config import Config
+from dudmap.errors import StateError
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.trajectory import Trajectory
+from dudmap.kernels import threads
+from dudmap.pipeline.resume import resume
+from dudmap.pipeline.run import run
+from dudmap.pipeline.storing import Storing
+from dudmap.places.atlas import Atlas
+from dudmap.places.frame_store import FrameStore
+from dudmap.state.database import StateDatabase
+from dudmap.synthetic.recording import SyntheticSequence
+
+SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
+CONFIG = Config().override(
+    [
+        "volume.voxel_size=0.02",
+        "submaps.patience=0.3",
+        "loops.min_age=1.0",
+        "loops.gap=3",
+        "sensor.self_calibration=false",
+    ]
+)
+TIMES = "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb"
+
+
+class Rendered:
+    """A synthetic sequence whose frames are rendered once."""
+
+    def __init__(self, sequence):
+        self.name, self.camera, self.calibration = sequence.name, sequence.camera, None
+        self.timestamps, self.ground_truth = sequence.timestamps, sequence.ground_truth
+        self._frames = [sequence[index] for index in range(len(sequence))]
+
+    def __len__(self):
+        return len(self._frames)
+
+    def __getitem__(self, index):
+        return self._frames[index]
+
+    def mask(self, index):
+        return None
+
+
+def lost_and_found():
+    """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps."""
+    yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 26)), np.zeros(18)])
+    base = synthetic.sequence(movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=15.0,
+                              noise="realsense")  # fmt: skip
+    Ts, up = base.ground_truth.Ts_world_camera.copy(), base.scene.home[:3, 1]
+    for T, angle in zip(Ts, np.radians(yaw), strict=True):
+        T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), angle * up]))[:3, :3] @ T[:3, :3]
+    moved = Trajectory(base.timestamps, Ts)
+    return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0))
+
+
+def begin(sequence, out, every=0.3, **options):
+    """The run whose processes are killed."""
+    return run(sequence, CONFIG, out, save_masks=True, progress=False, storing=Storing({}, every), **options)
+
+
+def proceed(sequence, out):
+    """What ``dudmap run --resume`` does; a run that was killed before it had a folder is begun."""
+    try:
+        return resume(out, sequence, progress=False)
+    except StateError as error:
+        if "holds no state" in str(error) or "ended before its first frame" in str(error):
+            return begin(sequence, out)
+        raise
+
+
+def results(out):
+    """Checksums of all files of a run but for times, and its metrics without them."""
+    files = {str(path.relative_to(out)): path for path in sorted(out.rglob("*")) if path.is_file()}
+    sums = {name: hashlib.sha256(path.read_bytes()).hexdigest() for name, path in files.items()
+            if name not in ("metrics.json", "timings.csv")}  # fmt: skip
+    metrics = json.loads((out / "metrics.json").read_text())
+    return sums | {key: value for key, value in metrics.items() if key not in TIMES}
+
+
+def in_child(function, *arguments):
+    """Exit status of a function in a process of its own: -9 if it was killed, 0 if it came to its end."""
+    process = os.fork()
+    if process == 0:
+        code = 1
+        try:
+            threads._pool.cache_clear()  # its threads exist in the parent only
+            cv2.setNumThreads(1)
+            with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
+                function(*arguments)
+            code = 0
+        except BaseException:
+            traceback.print_exc()
+        finally:
+            os._exit(code)
+    _, status = os.waitpid(process, 0)
+    return os.waitstatus_to_exitcode(status)
+
+
+def die():
+    """End this process as a power cut or the kernel's memory killer would."""
+    os.kill(os.getpid(), signal.SIGKILL)
+    time.sleep(60)
+
+
+def after(calls, function):
+    """The function, which ends the process after so many calls."""
+    left = iter(range(calls))
+
+    def counted(*arguments, **options):
+        value = function(*arguments, **options)
+        if next(left, None) is None:
+            die()
+        return value
+
+    return counted
+
+
+def killed(sequence, out, moment, rng, duration, go=begin):
+    """Run and be killed at a random moment of a kind."""
+    if moment == "anywhere":
+        timer = threading.Timer(rng.uniform(0, duration), die)
+        timer.daemon = True
+        timer.start()
+    elif moment == "checkpoint":  # between two statements of a transaction
+        StateDatabase._execute = after(int(rng.integers(8, 60)), StateDatabase._execute)
+    elif moment == "join":  # a map is half rebuilt from stored frames
+        Atlas.join = after(0, Atlas.join)
+        FrameStore.__getitem__ = after(int(rng.integers(0, 3)), FrameStore.__getitem__)
+    elif moment == "export":  # between two result files
+        keep, count = Path.replace, int(rng.integers(0, 7))
+        counted = after(count, keep)
+
+        def replace(path, target):
+            return keep(path, target) if path.suffix == ".png" else counted(path, target)
+
+        Path.replace = replace
+    go(sequence, out)

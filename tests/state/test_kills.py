@@ -1,0 +1,62 @@
+"""A run that is killed at any moment and continued gives what a run that was not interrupted gives."""
+
+import shutil
+import sys
+import time
+
+import cv2
+import numpy as np
+import pytest
+from killing import begin, in_child, killed, lost_and_found, proceed, results
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """The recording, the results of a run that was not interrupted, and its duration in seconds."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)  # threads do not survive the fork
+    sequence, out = lost_and_found(), tmp_path_factory.mktemp("whole")
+    start = time.perf_counter()
+    begin(sequence, out)
+    duration = time.perf_counter() - start
+    found = results(out)
+    assert found["corrected"] >= 1
+    assert found["lost"] >= 3
+    assert found["complete"]
+    yield sequence, found, duration
+    cv2.setNumThreads(before)
+
+
+def trial(whole, out, moment, seed):
+    """Kill, sometimes kill what continues it too, and continue; whether the first was killed at all."""
+    sequence, expected, duration = whole
+    rng = np.random.default_rng(seed)
+    out.mkdir()
+    status = in_child(killed, sequence, out, moment, rng, duration)
+    assert status in (0, -9)
+    if status == -9 and rng.uniform() < 0.3:
+        in_child(killed, sequence, out, "anywhere", rng, duration, proceed)
+    if (status == -9 and not (out / "metrics.json").exists()) or (out / "state.db").exists():
+        assert in_child(proceed, sequence, out) == 0
+    found = results(out)
+    assert {key for key in found.keys() | expected.keys() if found.get(key) != expected.get(key)} == set()
+    return status == -9
+
+
+@pytest.mark.parametrize("moment", ["anywhere", "checkpoint", "join", "export"])
+def test_a_killed_run_is_continued(whole, tmp_path, moment):
+    assert trial(whole, tmp_path / "run", moment, seed=3)
+
+
+@pytest.mark.slow
+def test_fifty_killed_runs_are_continued(whole, tmp_path):
+    kinds = ["anywhere"] * 26 + ["checkpoint"] * 10 + ["join"] * 6 + ["export"] * 8
+    count = 0
+    for seed, moment in enumerate(np.random.default_rng(0).permutation(kinds)):
+        count += trial(whole, tmp_path / str(seed), moment, seed)
+        shutil.rmtree(tmp_path / str(seed))
+        print(f"{seed + 1} of {len(kinds)}: {moment}, {count} killed", flush=True)
+    print(f"{count} of {len(kinds)} runs were killed; all were continued with equal results")
+    assert count >= 45

@@ -1,0 +1,87 @@
+"""One process at a time writes into a run folder; who holds it is said, and a dead one does not."""
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+
+import pytest
+
+from dudmap.config import Config
+from dudmap.errors import DudmapError, StateError
+from dudmap.pipeline.resume import resume
+from dudmap.pipeline.run import run
+from dudmap.pipeline.storing import Storing
+from dudmap.sequences import open_sequence
+from dudmap.state.database import StateDatabase
+from dudmap.state.identity import code_fingerprint, recording_fingerprint
+from dudmap.state.run_lock import NAME, RunLock
+from recordings import write_recording
+
+HOLD = """
+import sys, time
+from pathlib import Path
+from dudmap.state.run_lock import RunLock
+with RunLock(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_the_holder_is_named_and_a_killed_one_holds_nothing(tmp_path):
+    other = subprocess.Popen([sys.executable, "-c", HOLD, str(tmp_path)], stdout=subprocess.PIPE, text=True)
+    try:
+        assert other.stdout.readline() == "held\n"
+        with pytest.raises(DudmapError, match=f"in use by process {other.pid} on {socket.gethostname()} since 20"):
+            RunLock(tmp_path)
+    finally:
+        other.send_signal(signal.SIGKILL)
+        other.communicate()
+    with RunLock(tmp_path):
+        assert json.loads((tmp_path / NAME).read_text())["pid"] == os.getpid()
+        with pytest.raises(DudmapError, match=f"in use by process {os.getpid()} "):
+            RunLock(tmp_path)
+    assert not (tmp_path / NAME).exists()
+    RunLock(tmp_path).close()
+
+
+def test_neither_a_second_run_nor_a_resume_enters_a_folder_in_use(slam, tmp_path):
+    sequence = open_sequence(write_recording(tmp_path / "desk", 4))
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "trajectory.txt").write_text("of the other")
+    with RunLock(out):
+        with pytest.raises(DudmapError, match="in use by process"):
+            run(sequence, Config(), out, progress=False)
+        with pytest.raises(DudmapError, match="in use by process"):
+            resume(out)
+        assert (out / "trajectory.txt").read_text() == "of the other"
+    assert run(sequence, Config(), out, progress=False).metrics["complete"]
+
+
+def test_why_a_folder_cannot_be_continued(slam, tmp_path):
+    recording, out = write_recording(tmp_path / "desk", 4), tmp_path / "out"
+    sequence = open_sequence(recording)
+    with pytest.raises(StateError, match="there is no run folder"):
+        resume(out)
+    out.mkdir()
+    with pytest.raises(StateError, match="holds no state of a run"):
+        resume(out)
+    run(sequence, Config(), out, progress=False, storing=Storing({"path": str(recording)}))
+    assert not (out / "state.db").exists()
+    with pytest.raises(StateError, match=r"is finished \(4 frames\); there is nothing to resume"):
+        resume(out)
+    about = {"options": {"recording": {"path": str(recording)}}, "recording": recording_fingerprint(sequence),
+             "code": "of yesterday", "versions": {"dudmap": "0.0"}, "pass": 0, "next": 0, "frame": ""}  # fmt: skip
+    database = StateDatabase(out / "state.db")
+    database.write_meta(about)
+    with pytest.raises(StateError, match="was written by another version of dudmap"):
+        resume(out)
+    database.write_meta({"code": code_fingerprint(), "recording": "of another room"})
+    with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
+        resume(out)
+    database.write_meta({"recording": recording_fingerprint(sequence), "next": 3, "frame": "of another frame"})
+    with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
+        resume(out)

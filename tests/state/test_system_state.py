@@ -1,0 +1,69 @@
+"""A system that was stored and read again is the same, attribute by attribute, and goes on with the same results."""
+
+import numpy as np
+import pytest
+
+from dudmap import synthetic
+from dudmap.config import Config
+from dudmap.frames.frame import Frame
+from dudmap.geometry.camera import Camera
+from dudmap.slam import Slam
+from dudmap.state.database import StateDatabase
+from dudmap.state.system import differences, take_snapshot
+
+SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+
+
+def scene(movers=("person",), frames=34, **options):
+    sequence = synthetic.sequence("room", movers=movers, frames=frames, camera=SMALL, noise="kinect", **options)
+    return sequence, [sequence[index] for index in range(frames)]
+
+
+def whole(slam, tmp_path, name):
+    """Snapshot of everything, as into a new database."""
+    return take_snapshot(slam, StateDatabase(tmp_path / name))
+
+
+def assert_same_results(a, b):
+    for field in ("timestamp", "state", "lost_reason", "fused", "corrected", "relocalized", "submap", "uncertain"):
+        assert getattr(a, field) == getattr(b, field), field
+    for field in ("T_world_camera", "dynamic_mask", "residuals"):
+        np.testing.assert_array_equal(getattr(a, field), getattr(b, field), err_msg=field)
+    assert [(m.id, m.centroid.tolist(), m.velocity.tolist()) for m in a.movers] == [
+        (m.id, m.centroid.tolist(), m.velocity.tolist()) for m in b.movers
+    ]
+
+
+def dark(frame):
+    return Frame(frame.timestamp, np.zeros_like(frame.depth), np.zeros_like(frame.color))
+
+
+CASES = {
+    "a person": ([], 20, ()),
+    "the first moments": ([], 4, ()),
+    "objects with meshes": (["movers.meshes=true", "movers.enabled=true"], 20, ()),
+    "thesis": (["preset=thesis"], 12, ()),
+    "every frame kept": (["loops.keep_gap=1", "relocalization.keyframe_gap=1", "loops.min_age=0.2"], 22, ()),
+    "lost": (["submaps.patience=0.3"], 24, range(18, 26)),
+    "a second submap": (["submaps.patience=0.3"], 30, range(12, 24)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_a_stored_system_is_the_same_and_goes_on_the_same(tmp_path, case):
+    settings, stop, unlit = CASES[case]
+    movers = ("person", "ball") if "objects" in case else ("person",)
+    sequence, frames = scene(movers)
+    frames = [dark(frame) if number in unlit else frame for number, frame in enumerate(frames)]
+    config = Config().override(settings)
+    slam = Slam(sequence.camera, config)
+    for frame in frames[:stop]:
+        slam.process(frame)
+    slam.save(tmp_path / "state.db")
+    again = Slam.resume(tmp_path / "state.db")
+    assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
+    for frame in frames[stop:]:
+        assert_same_results(slam.process(frame), again.process(frame))
+    mesh, other = slam.volume.extract_mesh(), again.volume.extract_mesh()
+    for name in ("vertices", "faces", "colors", "normals"):
+        np.testing.assert_array_equal(getattr(mesh, name), getattr(other, name))

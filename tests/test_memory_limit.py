@@ -1,0 +1,82 @@
+"""A run with a memory limit has the result of a run without one."""
+
+import numpy as np
+import pytest
+
+from dudmap.config import Config
+from dudmap.errors import ConfigError
+from dudmap.geometry.mesh import Mesh, joined
+from dudmap.geometry.mesh_pieces import load_simplified, save_pieces
+from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
+from dudmap.mapping.voxel_blocks import VoxelBlocks
+from dudmap.slam import Slam
+from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.synthetic.ring_corridor import ring_corridor
+from triangles import triangles
+
+FRAMES = 100
+
+
+@pytest.fixture(scope="module")
+def corridor():
+    return ring_corridor(40, speed=1.2, camera=DEFAULT_CAMERA.resized(160, 120))
+
+
+def processed(corridor, max_blocks=None):
+    config = Config().override(["volume.voxel_size=0.01", "preprocess.depth_max=3", "loops.keep_distance=0.3"])
+    slam, most = Slam(corridor.camera, config, max_blocks=max_blocks), 0
+    for index in range(FRAMES):
+        slam.process(corridor[index])
+        most = max(most, slam.volume.blocks.num_voxel_blocks)
+    return slam, most
+
+
+def test_the_result_is_that_of_a_run_in_memory(corridor):
+    (whole, all_blocks), (paged, most) = processed(corridor), processed(corridor, max_blocks=6000)
+    assert most < 0.8 * all_blocks
+    assert len(whole.trajectory) > FRAMES // 2
+    assert np.array_equal(paged.trajectory.Ts_world_camera, whole.trajectory.Ts_world_camera)
+    assert np.array_equal(triangles(paged.volume.extract_mesh()), triangles(whole.volume.extract_mesh()))
+
+
+def test_a_limit_is_met_by_what_is_left_for_the_map():
+    limit = MemoryLimit(resident_bytes() + 1_000_000_000)
+    blocks = VoxelBlocks()
+    expected = (0.9 * limit.limit - resident_bytes()) / 4.1e3
+    assert 0.9 * expected < limit(blocks) < 1.1 * expected
+    blocks.num_slots += 1000  # slots that were provided are resident, used or not
+    assert limit(blocks) >= 1000
+    with pytest.raises(ConfigError, match="found a memory limit of 1 MB; the program takes"):
+        MemoryLimit(1_000_000)
+
+
+def grid(step, offset):
+    """Square of two triangles per cell."""
+    u, v = np.meshgrid(np.arange(40.0), np.arange(40.0), indexing="ij")
+    vertices = np.stack([step * u + offset, step * v, 0 * u], axis=-1).reshape(-1, 3).astype(np.float32)
+    first = (np.arange(39)[:, None] * 40 + np.arange(39)).reshape(-1)
+    faces = np.concatenate([first[:, None] + (0, 40, 41), first[:, None] + (0, 41, 1)]).astype(np.int32)
+    up = np.tile(np.float32([0, 0, 1]), (len(vertices), 1))
+    return Mesh(vertices, faces, np.full((len(vertices), 3), 90, np.uint8), up)
+
+
+def test_a_mesh_written_in_pieces_is_their_union(tmp_path):
+    pieces = [grid(0.01, 0.0), grid(0.01, 0.39), grid(0.01, 2.0)]
+    counts = save_pieces(iter(pieces), tmp_path / "mesh.ply")
+    whole = joined(pieces)
+    loaded = Mesh.load(tmp_path / "mesh.ply")
+    assert counts == (len(whole.vertices), len(whole.faces))
+    for name in ("vertices", "faces", "colors", "normals"):
+        np.testing.assert_array_equal(getattr(loaded, name), getattr(whole, name))
+
+
+def test_a_large_mesh_is_simplified_as_it_is_read(tmp_path, monkeypatch):
+    monkeypatch.setattr("dudmap.geometry.mesh_pieces.FACES_AT_ONCE", 2000)
+    pieces = [grid(0.01, 0.0), grid(0.01, 0.39), grid(0.01, 2.0)]
+    save_pieces(iter(pieces), tmp_path / "mesh.ply")
+    small = load_simplified(tmp_path / "mesh.ply", 1000)
+    assert 100 < len(small.faces) <= 1000
+    assert small.area() == pytest.approx(joined(pieces).area(), rel=0.15)
+    assert np.all(small.colors == 90)
+    every = load_simplified(tmp_path / "mesh.ply", 100_000)
+    assert every.area() == pytest.approx(joined(pieces).area(), rel=1e-4)

@@ -1,0 +1,110 @@
+"""What differs between Linux, macOS and Windows. Only Linux runs these tests: the others are imitated, or read for."""
+
+import ast
+import os
+import socket
+import subprocess
+import sys
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dudmap.errors import DudmapError
+from dudmap.kernels.threads import num_threads
+from dudmap.pipeline import environment
+from dudmap.study.executor import LocalExecutor, usable_cores
+from dudmap.viewing.window import _check_port
+
+SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py"))
+POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
+
+
+def calls(name):
+    """All calls of a method or function of this name in the package, with their file."""
+    for path in SOURCES:
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call):
+                function = node.func
+                if name == (function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")):
+                    yield path, node
+
+
+@pytest.mark.parametrize("name", ["read_text", "write_text"])
+def test_text_files_are_utf8_everywhere(name):
+    assert [path for path, call in calls(name) if "encoding" not in {word.arg for word in call.keywords}] == []
+
+
+def test_no_image_is_opened_by_a_name_that_opencv_cannot_read_on_windows():
+    assert [path for name in ("imread", "imwrite") for path, _ in calls(name)] == []
+
+
+def test_no_module_needs_posix_when_it_is_imported():
+    for path in SOURCES:
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            assert not POSIX_ONLY & set(names), path
+
+
+def test_no_process_is_forked():
+    assert list(calls("fork")) == []
+    for path, call in calls("get_context"):
+        assert [argument.value for argument in call.args if isinstance(argument, ast.Constant)] == ["spawn"], path
+    for path, call in calls("ProcessPoolExecutor"):
+        assert "mp_context" in {word.arg for word in call.keywords} or len(call.args) > 1, path
+
+
+@pytest.mark.parametrize(("platform", "expected"), [("darwin", 50.0), ("freebsd", 50000.0), ("win32", None)])
+def test_peak_memory_has_one_unit(monkeypatch, platform, expected):
+    import resource
+
+    monkeypatch.setattr(Path, "is_file", lambda _: False)  # no /proc
+    monkeypatch.setattr(sys, "platform", platform)
+    monkeypatch.setattr(resource, "getrusage", lambda _: SimpleNamespace(ru_maxrss=50_000_000))  # macOS: bytes
+    assert environment.peak_rss_mb() == expected
+
+
+def test_cores_are_counted_without_affinity(monkeypatch):
+    monkeypatch.delattr(os, "sched_getaffinity", raising=False)
+    monkeypatch.delenv("DUDMAP_THREADS", raising=False)
+    assert num_threads() == usable_cores() == environment.machine()["cores_usable"] == os.cpu_count()
+
+
+def test_closing_workers_that_are_gone_is_no_error(monkeypatch):
+    def kill(pid, number):
+        raise OSError(22, "The parameter is incorrect")  # Windows
+
+    monkeypatch.setattr(os, "kill", kill)
+    executor = LocalExecutor(1)
+    executor._pids.add(1)
+    executor.close()
+
+
+@pytest.mark.parametrize("platform", ["linux", "win32"])
+def test_a_port_in_use_is_refused(monkeypatch, platform):
+    monkeypatch.setattr(sys, "platform", platform)
+    with socket.socket() as other:
+        other.bind(("127.0.0.1", 0))
+        other.listen()
+        with pytest.raises(DudmapError, match="another --port"):
+            _check_port("127.0.0.1", other.getsockname()[1])
+
+
+def test_output_that_the_terminal_cannot_show_is_no_error(tmp_path):
+    environment_ = os.environ | {"PYTHONIOENCODING": "ascii", "PYTHONUTF8": "0"}
+    program = "import sys; sys.argv[1:] = ['--help']; from dudmap import cli; cli.app.info.help = 'größer'; cli.main()"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, env=environment_, check=False)
+    assert done.returncode == 0, done.stderr
+    assert b"?" in done.stdout
+
+
+def test_a_recording_in_a_folder_with_any_name(tmp_path):
+    from dudmap import synthetic
+    from dudmap.synthetic.folder import write_folder
+
+    folder = write_folder(synthetic.sequence("room", movers=(), frames=1), tmp_path / "größe ✓", surface=False)
+    from dudmap import open_sequence
+
+    assert np.any(open_sequence(folder)[0].depth > 0)

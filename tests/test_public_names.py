@@ -1,0 +1,92 @@
+"""The public names: documented, importable, cheap; and ``Slam.process`` with plain arrays."""
+
+import inspect
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dudmap
+from dudmap import ConfigError, DatasetError, Frame, Slam
+from wavy_wall import CAMERA, wall
+
+PAGE = (Path(__file__).parents[1] / "docs" / "python.md").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("name", dudmap.__all__)
+def test_every_public_name_is_importable_and_documented(name):
+    value = getattr(dudmap, name)
+    table = PAGE.partition("## Public names")[2]
+    assert name in re.findall(r"`(\w+)`", table)
+    if name != "__version__":
+        assert inspect.getdoc(value)
+        public = [
+            member
+            for key, member in vars(value).items()
+            if not key.startswith("_") and inspect.isfunction(member)
+        ] if inspect.isclass(value) else []  # fmt: skip
+        assert [member.__qualname__ for member in public if not inspect.getdoc(member)] == []
+
+
+def test_other_names_are_refused():
+    with pytest.raises(AttributeError, match="module 'dudmap' has no attribute 'nonsense'"):
+        _ = dudmap.nonsense
+
+
+def test_errors_load_nothing_heavy():
+    script = "import sys; from dudmap import DudmapError, CameraError; print('numpy' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
+def test_arrays_give_the_same_result_as_frames():
+    one, other, scaled = Slam(CAMERA), Slam(CAMERA), Slam(CAMERA)
+    for number in range(3):
+        frame = wall(1.5 + 0.01 * number, seed=number)
+        frame = Frame(frame.timestamp / 30, np.rint(1000 * frame.depth).astype(np.float32) / 1000, frame.color)
+        expected = one.process(frame)
+        arrays = {"rgb": frame.color, "timestamp": frame.timestamp}
+        found = other.process(depth=frame.depth, **arrays)
+        millimetres = scaled.process(depth=np.rint(1000 * frame.depth).astype(np.uint16), **arrays)
+        for result in (found, millimetres):
+            assert result.state == expected.state
+            if expected.T_world_camera is not None:
+                np.testing.assert_array_equal(result.T_world_camera, expected.T_world_camera)
+
+
+def test_units_and_readings_of_arrays():
+    rgb = np.zeros((2, 3, 3), np.uint8)
+    depth = np.array([[0, 1000, 65535], [500, 0, 1]], np.uint16)
+    np.testing.assert_allclose(Frame.from_arrays(depth, rgb, 1).depth, depth / 1000)
+    np.testing.assert_allclose(Frame.from_arrays(depth, rgb, 1, depth_scale=5000).depth, depth / 5000)
+    found = Frame.from_arrays(np.array([[np.nan, 1.5, np.inf], [0, -np.inf, 2]]), rgb, 1).depth
+    np.testing.assert_array_equal(found, np.array([[0, 1.5, 0], [0, 0, 2]], np.float32))
+    assert found.dtype == np.float32
+
+
+GOOD = {"depth": np.ones(CAMERA.shape, np.float32), "rgb": np.zeros((*CAMERA.shape, 3), np.uint8), "timestamp": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("changed", "sentence"),
+    [
+        ({"depth": np.ones(CAMERA.shape, np.int32)}, r"depth has the shape \(48, 64\) and the type int32; expected"),
+        ({"depth": np.ones((*CAMERA.shape, 1), np.float32)}, r"depth has the shape \(48, 64, 1\) .* expected \(H, W\)"),
+        ({"depth": np.ones((10, 20), np.float32)}, "the camera is 64x48, but the depth image has the shape"),
+        ({"rgb": np.zeros(CAMERA.shape, np.uint8)}, r"rgb has the shape \(48, 64\) and the type uint8; expected"),
+        ({"rgb": np.zeros((*CAMERA.shape, 3), np.float32)}, "the type float32; expected .* uint8, red green blue"),
+        ({"timestamp": float("nan")}, "the timestamp is nan; expected a finite number of seconds"),
+    ],
+)
+def test_bad_arrays_are_one_sentence(changed, sentence):
+    with pytest.raises(DatasetError, match=sentence):
+        Slam(CAMERA).process(**(GOOD | changed))
+
+
+def test_frames_and_arrays_are_not_mixed():
+    for arguments in ({}, GOOD | {"frame": wall(1.0)}, {"depth": GOOD["depth"], "rgb": GOOD["rgb"]}):
+        with pytest.raises(ConfigError, match="either a frame, or all three of depth=, rgb= and timestamp="):
+            Slam(CAMERA).process(**arguments)
