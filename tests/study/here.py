@@ -9,7 +9,7 @@ from dudmap.study.worker import perform
 class Here:
     """Executor that does jobs in this process with a given function, or with the system."""
 
-    workers = 1
+    workers, cores = 1, 1
 
     def __init__(self, do=None):
         self.do, self.runs = do, []

@@ -69,6 +69,7 @@ def test_the_studies_of_the_thesis_have_its_runs(table, runs):
         ({"factors": {"volume.max_weight": {"range": [1.5, 9]}}}, "whole numbers"),
         ({"factors": {}}, "no factors"),
         ({"factors": {"tracker.huber": {"range": [0.01, 0.02]}}}, "needs levels, but tracker.huber has a range"),
+        ({"each": 3}, "each is 3; expected true or false"),
         ({"design": "hexagonal"}, "unknown design 'hexagonal'"),
         ({"design": {"kind": "sobol", "samples": 5}}, "power of two"),
         ({"design": "box-behnken"}, "three factors"),
@@ -147,3 +148,12 @@ def test_the_command_refuses_in_one_sentence(tmp_path, monkeypatch):
         assert len(result.stderr.strip().splitlines()) == 1
         assert result.stderr.startswith("dudmap: ")
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_url_without_fsspec_is_refused_before_anything_is_run(tmp_path, monkeypatch):
+    monkeypatch.setenv("DUDMAP_CACHE", str(tmp_path))
+    monkeypatch.setattr("dudmap.extras.find_spec", lambda name: None)
+    plan = make_plan({**GOOD, "sequences": [{"path": "s3://bucket/desk.zip"}]})
+    assert plan.entries[0][0] == "desk"
+    with pytest.raises(DudmapError, match=r"needs the extra cluster \(fsspec is not installed\)"):
+        plan.check()

@@ -27,8 +27,7 @@ def start(folder, runs, kind):
 def kill_in_the_middle(folder, runs, kind, rng):
     """Kill the study, not its workers, at a random moment after the first run was begun."""
     process = start(folder, runs, kind)
-    journal = folder / "journal.jsonl"
-    while not journal.is_file() and process.poll() is None:
+    while not StudyFolder(folder).journal() and process.poll() is None:
         time.sleep(0.01)
     done = rng.uniform(0, 0.9) * runs
     while process.poll() is None:

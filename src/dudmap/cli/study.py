@@ -10,6 +10,8 @@ from dudmap.cli.output import JsonOption, answer
 from dudmap.extras import STUDY, need
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from dudmap.study.conduct import Progress
     from dudmap.study.executor import Executor
 
@@ -40,6 +42,11 @@ ClusterOption = Annotated[
     typer.Option("--cluster", metavar="ADDRESS", help="Ray cluster: auto or ray://HOST:PORT; default: this machine."),
 ]
 
+PriceOption = Annotated[
+    float,
+    typer.Option("--cost-per-core-hour", min=0, help="Price of a core for one hour; the progress shows the cost."),
+]
+
 
 @app.command()
 def run(
@@ -49,6 +56,7 @@ def run(
     max_runs: MaxRunsOption = 1000,
     keep: KeepOption = False,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
@@ -58,7 +66,8 @@ def run(
     need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / design.stem
-    outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show)
+    report = _shown_with(cost_per_core_hour)
+    outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
     _answer(outcome, out, as_json=as_json)
 
 
@@ -77,6 +86,7 @@ def thesis(
     max_runs: MaxRunsOption = 1000,
     keep: KeepOption = False,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
@@ -90,7 +100,8 @@ def thesis(
     else:
         plan = thesis_plan(table, recordings or (), frames)
         out = out or Path("runs/study") / f"thesis-{table}"
-        outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=_show)
+        report = _shown_with(cost_per_core_hour)
+        outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
     _answer(outcome, out, as_json=as_json)
 
 
@@ -101,6 +112,7 @@ def tune(
     jobs: JobsOption = 0,
     max_runs: MaxRunsOption = 1000,
     cluster: ClusterOption = "",
+    cost_per_core_hour: PriceOption = 0.0,
     as_json: JsonOption = False,
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
@@ -110,7 +122,8 @@ def tune(
     need("study", "dudmap study", STUDY)
     plan = load_plan(design)
     out = out or Path("runs/study") / f"{design.stem}-tune"
-    outcome = run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=_show)
+    report = _shown_with(cost_per_core_hour)
+    outcome = run_tune(plan, out, _executor(jobs, cluster), max_runs=max_runs, report=report)
     _answer(outcome, out, as_json=as_json)
 
 
@@ -128,5 +141,6 @@ def _executor(jobs: int, cluster: str) -> "Executor":
     return LocalExecutor(jobs or usable_cores())
 
 
-def _show(progress: "Progress") -> None:
-    typer.echo(str(progress), err=True)
+def _shown_with(price: float) -> "Callable[[Progress], None]":
+    """Function that shows the progress with its cost at a price per core-hour."""
+    return lambda progress: typer.echo(progress.describe(price), err=True)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from dudmap.errors import ConfigError
-from dudmap.study import figures, indices, judgement, response_surface
+from dudmap.study import figures, indices, judgement, response_surface, screening
 from dudmap.study.designs import DesignOptions, Point
 from dudmap.study.effects import anova, interactions, main_effects
 from dudmap.study.factors import Factor, coded_points
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 
 MOST_FAILURES = 10
 """Failed runs that a report lists one by one."""
+ENOUGH_TRACKED = 0.9
+"""Share of the frames below which a run is named among those that lost frames."""
 MOST_POINTS = 100
 """Points of a design whose means a report lists; runs.csv holds those of larger ones."""
 MOST_INTERACTION_FACTORS = 6
@@ -103,6 +105,9 @@ def describe_response(
     """Add everything that is known about one response but the confirmation of its optimum."""
     data, heading = usable(table, name, log), heading_of(name, log)
     report.heading(heading)
+    if options.kind == "plackett-burman":
+        screening.describe_screening(report, screening.screen(data, factors, name), heading)
+        return
     effects = main_effects(data, factors, name)
     report.figure(figures.main_effects_figure(effects, heading), "Main effects, with 95 % intervals of the means.")
     if 2 <= len(factors) <= MOST_INTERACTION_FACTORS:
@@ -120,6 +125,30 @@ def describe_response(
         report.text(predicted)
     else:
         describe_surface(report, predicted, heading)
+
+
+def describe_keys(
+    report: Report, table: Table, factors: Sequence[Factor], names: Sequence[str], log: Sequence[str]
+) -> Table:
+    """Add the keys that matter for any response and the keys that do not; return all effects of all responses."""
+    import pandas as pd
+
+    effects = {}
+    for name in names:
+        try:
+            effects[name] = screening.screen(usable(table, name, name in log), factors, name)
+        except ConfigError:  # said under the heading of the response
+            continue
+    if not effects:
+        return pd.DataFrame()
+    found = screening.which_matter(effects).set_index("key")
+    matter, rest = found.dropna(how="all"), found.index[found.isna().all(axis=1)]
+    report.heading("Which keys matter")
+    if len(matter):
+        report.text("Largest significant effect in standard deviations of the residual:")
+        report.table(matter.loc[matter.abs().max(axis=1).sort_values(ascending=False).index].reset_index())
+    report.text(f"Without a significant effect on any response ({len(rest)}): {', '.join(rest)}.")
+    return pd.concat(effects, names=["response"]).reset_index("response")
 
 
 def describe_indices(
@@ -238,6 +267,21 @@ def describe_points(report: Report, table: Table, factors: Sequence[Factor], nam
     if 0 < len(points) <= MOST_POINTS:
         report.heading("Means of all points over the recordings")
         report.table(points)
+
+
+def describe_losses(report: Report, table: Table) -> None:
+    """Add the runs that lost many frames: errors are those of the tracked frames only, and may be small for that."""
+    if "tracked_share" not in table:
+        return
+    partial = table[table["tracked_share"] < ENOUGH_TRACKED]
+    if partial.empty:
+        return
+    report.heading("Runs that lost frames")
+    report.text(f"{len(partial)} of {len(table)} runs tracked less than {ENOUGH_TRACKED:.0%} of the frames. Trajectory "
+                "errors are those of the tracked frames, so that such a run may look better than one that tracks all: "
+                "read them together with the response lost.")  # fmt: skip
+    counts = partial.groupby("sequence", sort=False).size()
+    report.items(f"{name}: {count} of {(table['sequence'] == name).sum()}" for name, count in counts.items())
 
 
 def describe_failures(report: Report, table: Table) -> None:

@@ -14,7 +14,7 @@ CPUS_PER_RUN = 1
 
 
 class RayExecutor:
-    """Tasks of a Ray cluster. All nodes must see the study folder and the recordings under the same paths.
+    """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
 
     Args:
         address: ``auto``, or ``ray://HOST:PORT``.
@@ -32,21 +32,24 @@ class RayExecutor:
             ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="error")
         except (ConnectionError, ValueError) as error:
             raise ConfigError(f"there is no Ray cluster at {address}: {error}") from None
+        except ImportError as error:  # ray:// needs the client of Ray
+            raise ConfigError(f"ray lacks its client ({error}); pip install 'dudmap[cluster]'") from None
         self._ray = ray
         self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(_perform)  # retries: dudmap.study.conduct
         self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
-        self._running: list[Any] = []
+        self.cores = CPUS_PER_RUN
+        self._running: set[Any] = set()
 
     def submit(self, job: Job) -> "Future[Outcome]":
         """See ``Executor``."""
         reference = self._perform.remote(job)
-        self._running.append(reference)
+        self._running.add(reference)
         out: Future[Outcome] = Future()
         reference.future().add_done_callback(lambda future: self._pass_on(reference, future, out))
         return out
 
     def _pass_on(self, reference: Any, future: "Future[Outcome]", out: "Future[Outcome]") -> None:  # noqa: ANN401
-        self._running.remove(reference)
+        self._running.discard(reference)
         errors = self._ray.exceptions
         lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
         error = future.exception()

@@ -1,8 +1,8 @@
 """Experimental designs: which combinations of levels are run.
 
-Every design comes from a library: factorial, central composite (Box and Wilson 1951) and Box-Behnken (1960) designs
-from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs of Saltelli (2010) and
-Morris (1991), from which their indices are computed without a model, from SALib.
+Every design comes from a library: factorial, Plackett-Burman (1946), central composite (Box and Wilson 1951) and
+Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs
+of Saltelli (2010) and Morris (1991), from which their indices are computed without a model, from SALib.
 """
 
 from collections.abc import Callable, Sequence
@@ -34,6 +34,8 @@ class DesignOptions:
         resolution: Resolution of a fractional factorial design.
         generators: Generators of a fractional factorial design such as ``a b c abc``, instead of a resolution.
         seed: Seed of a sampled design.
+        foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
+            interactions of two factors.
     """
 
     kind: str = "full-factorial"
@@ -41,6 +43,7 @@ class DesignOptions:
     resolution: int = 4
     generators: str = ""
     seed: int = 0
+    foldover: bool = True
 
 
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
@@ -56,6 +59,8 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
         found = _full_factorial(factors)
     elif options.kind == "fractional-factorial":
         found = [_two_level(factors, row) for row in _fractional(factors, options)]
+    elif options.kind == "plackett-burman":
+        found = [_two_level(factors, row) for row in _plackett_burman(factors, options)]
     else:
         words = [factor.key for factor in factors if not factor.numeric]
         if words:
@@ -111,6 +116,24 @@ def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
             f"the generators {options.generators!r} make {rows.shape[1]} columns for {len(factors)} factors"
         )
     return rows
+
+
+def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import pbdesign
+
+    for factor in factors:
+        if len(factor.levels) > 2:
+            raise ConfigError(
+                f"a plackett-burman design has two levels, but {factor.key} has {len(factor.levels)}; give it a range"
+            )
+    runs = 4 * (len(factors) // 4 + 1)
+    while True:  # pyDOE3 knows the sizes 2^n, 12 2^n and 20 2^n
+        try:
+            rows = np.asarray(pbdesign(runs - 1))[:, : len(factors)]
+            break
+        except AssertionError:
+            runs += 4
+    return np.vstack([rows, -rows]) if options.foldover else rows
 
 
 def _central_composite(factors: Sequence[Factor], options: DesignOptions) -> Coded:
@@ -173,6 +196,7 @@ def problem(factors: Sequence[Factor]) -> dict[str, Any]:
 DESIGNS: dict[str, Callable[[Sequence[Factor], DesignOptions], Coded]] = {
     "full-factorial": lambda factors, options: np.empty((0, len(factors))),
     "fractional-factorial": _fractional,
+    "plackett-burman": _plackett_burman,
     "central-composite": _central_composite,
     "box-behnken": _box_behnken,
     "latin-hypercube": _latin_hypercube,

@@ -33,6 +33,28 @@ def main_effects(table: Table, factors: Sequence[Factor], response: str) -> Tabl
     return pd.DataFrame(rows, columns=["factor", "level", "runs", "mean", "low", "high"])
 
 
+def effects_by_recording(table: Table, factors: Sequence[Factor], response: str) -> Table:
+    """Main effects on every recording on its own.
+
+    Returns:
+        One row per recording, factor and level: mean of the response, and partial eta squared and p of the factor in
+        the analysis of variance of that recording.
+    """
+    import pandas as pd
+
+    parts = []
+    for recording, part in table.groupby("sequence", sort=False):
+        part = part.reset_index(drop=True)
+        means, variance = main_effects(part, factors, response), anova(part, factors, response)
+        terms = variance.table if variance is not None else pd.DataFrame(columns=["partial eta2", "p"])
+        names = {factor.key: factor.name for factor in factors}
+        for column in ("partial eta2", "p"):
+            means[column] = means["factor"].map(lambda key: terms[column].get(names[key], np.nan))  # noqa: B023
+        parts.append(means.assign(recording=recording))
+    columns = ["recording", "factor", "level", "mean", "partial eta2", "p"]
+    return pd.concat(parts)[columns].reset_index(drop=True)
+
+
 def level_groups(values: Table) -> Table:
     """Level of each run; of a factor with many values, the mean of its group."""
     import pandas as pd

@@ -24,6 +24,11 @@ class Executor(Protocol):
         """Number of jobs that are done at a time."""
         ...
 
+    @property
+    def cores(self) -> int:
+        """Cores that a job uses."""
+        ...
+
     def submit(self, job: Job) -> "Future[Outcome]":
         """Start a job as soon as a worker is free; the future raises ``WorkerDied`` if its worker ends before it."""
         ...
@@ -46,7 +51,7 @@ class LocalExecutor:
 
     def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:
         self.workers = workers
-        self._threads = threads or max(1, usable_cores() // workers)
+        self.cores = threads or max(1, usable_cores() // workers)
         self._feeders = ThreadPoolExecutor(workers, thread_name_prefix="study")
         self._own = threading.local()
         self._pids: set[int] = set()
@@ -70,7 +75,7 @@ class LocalExecutor:
         """Process of the calling thread."""
         if getattr(self._own, "pool", None) is None:
             context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(1, context, initializer=start_worker, initargs=(self._threads,))
+            pool = ProcessPoolExecutor(1, context, initializer=start_worker, initargs=(self.cores,))
             try:
                 pid = pool.submit(os.getpid).result()
                 with self._lock:

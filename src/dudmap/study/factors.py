@@ -128,26 +128,41 @@ def _factor(key: str, values: list[Any], is_range: bool, scale: Any, base: Confi
     return Factor(key, () if is_range else tuple(values), low, high, scale, whole)
 
 
-def _is_whole(key: str, base: Config) -> bool:
-    value: Any = base
+def value_of(config: Config, key: str) -> Any:  # noqa: ANN401 - values have many types
+    """Value of a dotted key."""
+    value: Any = config
     for part in key.split("."):
         value = getattr(value, part)
+    return value
+
+
+def _is_whole(key: str, base: Config) -> bool:
+    value = value_of(base, key)
     return isinstance(value, int) and not isinstance(value, bool)
 
 
 def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...]:
     """Factors of the table ``factors`` of a design file, whose keys are quoted or nested.
 
+    ``all_numeric`` adds every numeric key (``numeric_factors``).
+
     Raises:
         ConfigError: There is none, or one is invalid.
     """
+    from dudmap.study.screening import numeric_factors
+
     flat: dict[str, object] = {}
     for key, given in table.items():
+        if key == "all_numeric":
+            continue
         nested = isinstance(given, dict) and not {"levels", "range"} & set(given)
         flat |= {f"{key}.{name}": inner for name, inner in given.items()} if nested else {key: given}  # type: ignore[union-attr]
-    if not flat:
+    chosen = tuple(make_factor(key, given, base) for key, given in flat.items())
+    if "all_numeric" in table:
+        chosen += numeric_factors(table["all_numeric"], base, flat)
+    if not chosen:
         raise ConfigError('the design has no factors; expected, for example, [factors] "tracker.huber" = [0.005, 0.01]')
-    return tuple(make_factor(key, given, base) for key, given in flat.items())
+    return chosen
 
 
 def coded_points(factors: Sequence[Factor], points: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:

@@ -14,19 +14,27 @@ if TYPE_CHECKING:
 
     from dudmap.study.response_surface import Optimum, Surface
 
+COLORS = 64
+"""Colours of the palette of a figure."""
+
 
 def png(figure: "Figure") -> bytes:
-    """PNG file of a figure."""
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", dpi=110)
-    return buffer.getvalue()
+    """PNG file of a figure, with a palette: lines and text on white need no more, and it is a quarter of the size."""
+    from PIL import Image
+
+    drawn, out = io.BytesIO(), io.BytesIO()
+    figure.savefig(drawn, format="png", dpi=110)
+    Image.open(drawn).convert("RGB").quantize(COLORS).save(out, format="PNG", optimize=True)
+    return out.getvalue()
 
 
-def _axes(rows: int, columns: int, width: float = 3.0, height: float = 2.6) -> "tuple[Figure, Any]":
+def _axes(
+    rows: int, columns: int, width: float = 3.0, height: float = 2.6, same_y: bool = False
+) -> "tuple[Figure, Any]":
     from matplotlib.figure import Figure
 
     figure = Figure((max(width * columns, 4.0), max(height * rows, 3.0)), layout="constrained")
-    return figure, figure.subplots(rows, columns, squeeze=False)
+    return figure, figure.subplots(rows, columns, squeeze=False, sharey=same_y)
 
 
 def _label(level: object) -> str:
@@ -36,7 +44,7 @@ def _label(level: object) -> str:
 def main_effects_figure(effects: Table, heading: str) -> bytes:
     """Mean response at every level of every factor with its confidence interval."""
     keys = list(dict.fromkeys(effects["factor"]))
-    figure, axes = _axes(1, len(keys))
+    figure, axes = _axes(1, len(keys), same_y=True)
     for ax, key in zip(axes[0], keys, strict=True):
         part = effects[effects["factor"] == key]
         x = np.arange(len(part))
@@ -45,7 +53,6 @@ def main_effects_figure(effects: Table, heading: str) -> bytes:
         ax.set_xticks(x, [_label(level) for level in part["level"]])
         ax.axhline(np.average(part["mean"], weights=part["runs"]), color="0.7", lw=0.8, zorder=0)
         ax.set_xlabel(key.rpartition(".")[2])
-        ax.sharey(axes[0][0])
     axes[0][0].set_ylabel(heading)
     return png(figure)
 
@@ -95,7 +102,7 @@ def residuals_figure(surface: "Surface") -> bytes:
 def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
     """Prediction along every factor through the optimum, with the interval of the mean."""
     count = len(surface.factors)
-    figure, axes = _axes(1, count)
+    figure, axes = _axes(1, count, same_y=True)
     for n, (ax, factor) in enumerate(zip(axes[0], surface.factors, strict=True)):
         coded = np.tile(best.coded, (41, 1))
         coded[:, n] = np.linspace(-1, 1, 41)
@@ -106,7 +113,6 @@ def surface_figure(surface: "Surface", best: "Optimum", heading: str) -> bytes:
         ax.axvline(best.values[factor.key], color="0.6", lw=0.8, ls="--")
         ax.set_xscale(factor.scale)
         ax.set_xlabel(factor.name)
-        ax.sharey(axes[0][0])
     axes[0][0].set_ylabel(f"predicted {heading}")
     return png(figure)
 
@@ -133,4 +139,21 @@ def indices_figure(indices: Table) -> bytes:
         axes[0][0].set_xticks(np.arange(len(part)), list(part["term"]), rotation=20, ha="right", fontsize=8)
     axes[0][0].set_ylabel("Sobol index")
     axes[0][0].legend()
+    return png(figure)
+
+
+def screening_figure(effects: Table, keys: Sequence[str], heading: str) -> bytes:
+    """Effects of the keys on every recording with their intervals; the first key is on top."""
+    recordings = list(dict.fromkeys(effects["recording"]))
+    figure, axes = _axes(1, len(recordings), 3.2, 0.24 * len(keys) + 1.0)
+    y = np.arange(len(keys))[::-1]
+    for ax, recording in zip(axes[0], recordings, strict=True):
+        part = effects[effects["recording"] == recording].set_index("key").loc[list(keys)]
+        bars = np.array([part["effect"] - part["low"], part["high"] - part["effect"]])
+        ax.errorbar(part["effect"], y, xerr=bars, fmt="o", ms=3, capsize=2, lw=1)
+        ax.axvline(0, color="0.7", lw=0.8, zorder=0)
+        ax.set_yticks(y, keys if ax is axes[0][0] else [""] * len(keys), fontsize=7)
+        ax.tick_params(axis="x", labelsize=7)
+        ax.set_title(recording, fontsize=8)
+    figure.supxlabel(f"effect on {heading}", fontsize=8)
     return png(figure)

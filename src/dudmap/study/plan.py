@@ -14,10 +14,12 @@ from dudmap.config import Config
 from dudmap.errors import ConfigError
 from dudmap.study.designs import DesignOptions, Point, count_of, points_of
 from dudmap.study.factors import Factor, configured, make_factors
+from dudmap.study.remote import RemoteEntry, is_url, name_of
 from dudmap.study.responses import RESPONSES, check_truth, known_responses
 
 SECTIONS = (
-    "name", "base", "factors", "design", "sequences", "judge", "responses", "log", "calibrate", "confirm", "tune",
+    "name", "base", "factors", "design", "sequences", "judge", "responses", "log", "calibrate", "confirm", "each",
+    "tune",
 )  # fmt: skip
 """Sections of a design file."""
 MAX_RUNS = 1000
@@ -53,9 +55,8 @@ class Run:
     @property
     def key(self) -> str:
         """Hash of everything that the result depends on: the same run has the same folder."""
-        path = None if self.entry.path is None else str(self.entry.path.resolve())
         content = [
-            self.config.model_dump(), path, dict(self.entry.parameters), self.entry.max_frames,
+            self.config.model_dump(), place_of(self.entry), dict(self.entry.parameters), self.entry.max_frames,
             self.calibrate, self.surfaces, self.code,
         ]  # fmt: skip
         return hashlib.sha256(json.dumps(content, sort_keys=True, default=str).encode()).hexdigest()[:20]
@@ -75,6 +76,7 @@ class Plan:
         log: Names of the responses that are analysed as logarithms.
         calibrate: Whether every run calibrates the colour camera first, as ``dudmap run`` does.
         confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
+        each: Whether every recording also has a model and a confirmation of its own.
         code: Hash of the code.
         tune: Options of ``dudmap study tune``.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
@@ -89,6 +91,7 @@ class Plan:
     log: tuple[str, ...] = ()
     calibrate: bool = False
     confirm: int = 1
+    each: bool = False
     code: str = ""
     tune: Mapping[str, Any] = field(default_factory=dict)
     judges: tuple[tuple[str, int, Entry], ...] = ()
@@ -179,13 +182,13 @@ def make_plan(tree: Mapping[str, Any], folder: Path = Path(), name: str = "study
     confirm = tree.get("confirm", 1)
     if not isinstance(confirm, int) or confirm < 0:
         raise ConfigError(f"confirm is {confirm!r}; expected the number of confirmation runs, 0 or more")
-    for key, expected in (("calibrate", bool), ("tune", dict)):
+    for key, expected in (("calibrate", bool), ("each", bool), ("tune", dict)):
         if key in tree and not isinstance(tree[key], expected):
             raise ConfigError(f"{key} is {tree[key]!r}; expected {'true or false' if expected is bool else 'a table'}")
     return Plan(
         str(tree.get("name", name)), base, factors, options,
         make_entries(tree.get("sequences", []), folder), responses, log,
-        tree.get("calibrate", False), confirm, method_hash(), tree.get("tune", {}),
+        tree.get("calibrate", False), confirm, tree.get("each", False), method_hash(), tree.get("tune", {}),
         make_entries(tree["judge"], folder) if tree.get("judge") else (),
     )  # fmt: skip
 
@@ -232,13 +235,24 @@ def make_entries(tables: object, folder: Path) -> tuple[tuple[str, int, Entry], 
     return tuple(out)
 
 
+def place_of(entry: Entry) -> str | None:
+    """Where a recording is: its URL, its absolute path, or None of a synthetic one."""
+    if isinstance(entry, RemoteEntry):
+        return entry.url
+    return None if entry.path is None else str(entry.path.resolve())
+
+
 def _real(table: dict[str, Any], folder: Path) -> list[tuple[str, int, Entry]]:
     for key in table:
         if key not in ("name", "path", "frames"):
             raise ConfigError(f"a recording has no {key!r}; known are name, path and frames")
-    path = folder / Path(str(table["path"])).expanduser()
+    text, frames = str(table["path"]), _count(table, "frames", None)
+    if is_url(text):
+        name = str(table.get("name", name_of(text).partition(".")[0]))
+        return [(name, 0, RemoteEntry(name, Path(text), max_frames=frames, url=text))]
+    path = folder / Path(text).expanduser()
     name = str(table.get("name", path.resolve().name))
-    return [(name, 0, Entry(name, path, max_frames=_count(table, "frames", None)))]
+    return [(name, 0, Entry(name, path, max_frames=frames))]
 
 
 def _synthetic(table: dict[str, Any]) -> list[tuple[str, int, Entry]]:

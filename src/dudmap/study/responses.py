@@ -71,7 +71,7 @@ def check_truth(entry: "Entry", sequence: "Sequence", names: tuple[str, ...]) ->
             raise DatasetError(
                 f"{entry.name} has no true masks of anything that moves, which the response {name} needs"
             )
-        if needs == "surface" and entry.path is not None and not (entry.path / "surface.ply").is_file():
+        if needs == "surface" and entry.path is not None and entry.surfaces(sequence) is None:
             raise DatasetError(f"{entry.name} has no true surface (surface.ply), which the response {name} needs")
 
 

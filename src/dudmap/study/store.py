@@ -21,8 +21,8 @@ from dudmap.errors import DudmapError
 class StudyFolder:
     """Results of a study on disk, shared by all processes that work on it.
 
-    ``runs/<key>/result.json`` holds the result of a run, ``journal.jsonl`` one line for each begun and finished run
-    with process, host and time, ``locks/`` the claims.
+    ``runs/<key>/result.json`` holds the result of a run, ``journal-<host>.jsonl`` one line for each run that a process
+    of the host began or finished, with process and time, ``locks/`` the claims.
 
     Attributes:
         root: The folder.
@@ -69,9 +69,9 @@ class StudyFolder:
     @contextmanager
     def unfinished(self, key: str) -> Iterator[Path]:
         """Empty folder for a claimed run, which becomes its result at the end of the block, unless that raises."""
-        for left in (self.root / "runs").glob(f".{key}-*"):  # of a process that died
-            shutil.rmtree(left)
-        folder = self.root / "runs" / f".{key}-{os.getpid()}"
+        folder = self.root / "runs" / f".{key}"  # the claim makes it ours
+        if folder.exists():  # of a process that died
+            shutil.rmtree(folder)
         folder.mkdir()
         self.note("begun", key)
         try:
@@ -83,13 +83,18 @@ class StudyFolder:
         self.note("finished", key)
 
     def note(self, event: str, key: str) -> None:
-        """Append a line to the journal; lines of several processes do not mix, as each is one write."""
-        line = {"event": event, "run": key, "pid": os.getpid(), "host": socket.gethostname(), "time": time.time()}
-        with (self.root / "journal.jsonl").open("ab", buffering=0) as file:
+        """Append a line to the journal of this host.
+
+        Lines of several processes of a host do not mix, as each is one write. Those of several hosts would, on a
+        network file system, whose clients find the end of a file each for itself.
+        """
+        host = socket.gethostname()
+        line = {"event": event, "run": key, "pid": os.getpid(), "host": host, "time": time.time()}
+        with (self.root / f"journal-{host}.jsonl").open("ab", buffering=0) as file:
             file.write((json.dumps(line) + "\n").encode())
 
     def journal(self) -> list[dict[str, Any]]:
-        """All lines of the journal; a line cut off by a full disk is left out."""
-        path = self.root / "journal.jsonl"
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        return [json.loads(line) for line in lines if line.endswith("}")]
+        """All lines of the journals in the order of time; a line cut off by a full disk is left out."""
+        lines = [line for path in self.root.glob("journal*.jsonl")
+                 for line in path.read_text(encoding="utf-8").splitlines()]  # fmt: skip
+        return sorted((json.loads(line) for line in lines if line.endswith("}")), key=lambda line: line["time"])

@@ -1,11 +1,13 @@
 """A whole study: its runs, its confirmation, its tables and its report."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dudmap.errors import ConfigError
 from dudmap.study.conduct import Progress, conduct, table_of
+from dudmap.study.effects import effects_by_recording
 from dudmap.study.executor import Executor
 from dudmap.study.plan import MAX_RUNS, Plan, sequence_names
 from dudmap.study.tables import Table
@@ -52,9 +54,51 @@ def run_study(
         confirmation: Confirmation | str = "There is nothing to confirm."
         if not isinstance(predicted, str) and plan.confirm:
             confirmation = _confirm(plan, predicted, out, executor, keep=keep, report=report)
+        each = confirm_each(plan, table, out, executor, keep=keep, report=report) if plan.each else None
     finally:
         executor.close()
-    return write_report(plan, table, predicted, confirmation, out, executor.workers, state)
+    return write_report(plan, table, predicted, confirmation, out, executor.workers, state, each)
+
+
+def confirm_each(
+    plan: Plan, table: Table, out: Path, executor: Executor, *, keep: bool, report: Callable[[Progress], None]
+) -> Table:
+    """Model, optimum and confirmation of every recording on its own; also written to each.csv.
+
+    One row per recording: values of the factors at the optimum, R2 of the model, R2 when each run is left out in turn,
+    prediction, mean of the confirmation runs, best point of the design on the same recordings, frames lost in the
+    confirmation runs, whether the model held, and whether anything spoke against it before.
+    """
+    import numpy as np
+    import pandas as pd
+
+    from dudmap.study.analysis import predict_optimum
+
+    name, rows = plan.responses[0], []
+    plain = np.exp if name in plan.log else np.asarray
+    for recording in sequence_names(plan):
+        alone = replace(plan, entries=tuple(entry for entry in plan.entries if entry[0] == recording))
+        predicted = predict_optimum(table[table["sequence"] == recording], plan.factors, name, name in plan.log)
+        if isinstance(predicted, str):
+            rows.append({"recording": recording, "held": predicted})
+            continue
+        point = {key.rpartition(".")[2]: value for key, value in predicted.point.items()}
+        surface = predicted.surface
+        row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
+        row |= {"best run": float(plain(surface.best_seen)), "predicted": float(plain(predicted.best.predicted))}
+        file = f"confirmation-{recording}.csv"
+        found = _confirm(alone, predicted, out, executor, keep=keep, report=report, file=file)
+        if isinstance(found, str):
+            rows.append(row | {"held": found})
+            continue
+        row |= {"measured": float(plain(found.measured)), "best point": float(plain(found.best_point))}
+        runs = pd.read_csv(out / file)
+        row["lost at the optimum"] = float(runs.loc[runs["at"] == "optimum", "lost"].mean())
+        warned = "no" if predicted.judgement.credible else "yes"
+        rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
+    each = pd.DataFrame(rows)
+    each.to_csv(out / "each.csv", index=False)
+    return each
 
 
 def _confirm(
@@ -65,6 +109,7 @@ def _confirm(
     *,
     keep: bool,
     report: Callable[[Progress], None],
+    file: str = "confirmation.csv",
 ) -> "Confirmation | str":
     """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
@@ -77,7 +122,7 @@ def _confirm(
     conduct([*at_optimum, *at_best], out, executor, keep=keep, report=report)
     tables = [table_of(at_optimum, out), table_of(at_best, out)]
     pd.concat(tables, keys=["optimum", "best point of the design"], names=["at"]).reset_index("at").to_csv(
-        out / "confirmation.csv", index=False
+        out / file, index=False
     )
     try:
         measured, best = (usable(table, name, name in plan.log) for table in tables)
@@ -98,10 +143,11 @@ def write_report(
     out: Path,
     workers: int,
     state: Progress | None = None,
+    each: Table | None = None,
 ) -> str:
     """Write report.md and report.html; return the outcome in words."""
     from dudmap.pipeline.environment import machine, versions
-    from dudmap.study import analysis
+    from dudmap.study import analysis, screening
     from dudmap.study.report import Report
 
     report = Report(f"Study {plan.name}")
@@ -123,11 +169,24 @@ def write_report(
             report.text(f"{error}.")
         if name == plan.responses[0]:
             analysis.describe_confirmation(report, confirmation)
-    analysis.describe_pareto(report, table, plan.factors, plan.responses)
-    analysis.describe_points(report, table, plan.factors, plan.responses)
+            if each is not None:
+                report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
+                report.table(each)
+                levels = effects_by_recording(analysis.usable(table, name, name in plan.log), plan.factors, name)
+                levels.to_csv(out / "levels.csv", index=False)
+                report.text(f"Mean {analysis.heading_of(name, name in plan.log)} at every level:")
+                report.table(levels)
+    effects = None
+    if plan.options.kind == "plackett-burman":
+        effects = analysis.describe_keys(report, table, plan.factors, plan.responses, plan.log)
+        effects.to_csv(out / "effects.csv", index=False)
+    else:
+        analysis.describe_pareto(report, table, plan.factors, plan.responses)
+        analysis.describe_points(report, table, plan.factors, plan.responses)
+    analysis.describe_losses(report, table)
     analysis.describe_failures(report, table)
     report.save(out)
-    return outcome(predicted, confirmation)
+    return outcome(predicted, confirmation) if effects is None else screening.summary(effects)
 
 
 def outcome(predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:

@@ -20,7 +20,7 @@ from dudmap.study.conduct import Progress, conduct
 from dudmap.study.designs import Point
 from dudmap.study.executor import Executor
 from dudmap.study.factors import Factor, configured
-from dudmap.study.plan import MAX_RUNS, Plan
+from dudmap.study.plan import MAX_RUNS, Plan, place_of
 from dudmap.study.responses import RESPONSES, check_truth
 from dudmap.study.store import StudyFolder
 from dudmap.study.tables import Table
@@ -125,7 +125,7 @@ def check_tune(plan: Plan, options: TuneOptions, max_runs: int = MAX_RUNS) -> No
 
 
 def _identity(entry: Entry) -> str:
-    return str(entry.path.resolve()) if entry.path is not None else repr(sorted(dict(entry.parameters).items()))
+    return place_of(entry) or repr(sorted(dict(entry.parameters).items()))
 
 
 class Search:

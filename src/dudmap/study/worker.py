@@ -7,22 +7,25 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, cast
 
 from dudmap.errors import DudmapError
 from dudmap.study.plan import Run
 from dudmap.study.store import StudyFolder
 
 if TYPE_CHECKING:
-    from dudmap.benchmark.conditions import CachedRecording
+    import numpy as np
+    from numpy.typing import NDArray
+
     from dudmap.evaluation.surface import Surface
+    from dudmap.frames.frame import Frame
     from dudmap.sequences import Sequence
 
 Outcome = Literal["finished", "known", "claimed"]
 """What came of a job: its run was done now, or before, or another process is doing it."""
 
 CACHED_BYTES = 300e6
-"""Frames of a synthetic recording that a worker keeps rendered between runs, bytes at most."""
+"""Frames of a recording that a worker keeps read or rendered between runs, bytes at most."""
 PIXEL_BYTES = 8
 """Bytes per pixel of a kept frame: depth, colour and mask."""
 SAMPLES = 40_000
@@ -105,18 +108,39 @@ class _Hashed:
         return hash(self.content)
 
 
-@lru_cache(maxsize=1)
-def _recording(of: _Hashed) -> "Sequence | CachedRecording":
-    """Recording of a run; a short synthetic one is rendered once for all runs that follow each other."""
-    from dudmap.benchmark.conditions import CachedRecording
-    from dudmap.synthetic.recording import SyntheticSequence
+class KeptRecording:
+    """Recording whose frames stay in memory once they were read or rendered, for the runs that follow."""
 
+    def __init__(self, recording: "Sequence") -> None:
+        self._recording = recording
+        self._frames: dict[int, Frame] = {}
+        self._masks: dict[int, NDArray[np.bool_] | None] = {}
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - camera, ground truth, ... of the recording
+        return getattr(self._recording, name)
+
+    def __len__(self) -> int:
+        return len(self._recording)
+
+    def __getitem__(self, index: int) -> "Frame":
+        if index not in self._frames:
+            self._frames[index] = self._recording[index]
+        return self._frames[index]
+
+    def mask(self, index: int) -> "NDArray[np.bool_] | None":
+        """See ``Sequence``."""
+        if index not in self._masks:
+            self._masks[index] = self._recording.mask(index)
+        return self._masks[index]
+
+
+@lru_cache(maxsize=1)
+def _recording(of: _Hashed) -> "Sequence":
+    """Recording of a run; a short one is read or rendered once for all runs that follow each other."""
     sequence = of.run.entry.open()
-    camera = sequence.camera
-    size = len(sequence) * camera.width * camera.height * PIXEL_BYTES
-    if isinstance(sequence, SyntheticSequence) and size <= CACHED_BYTES:
-        return CachedRecording(sequence)
-    return sequence
+    frames = min(len(sequence), of.run.entry.max_frames or len(sequence))
+    size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES
+    return cast("Sequence", KeptRecording(sequence)) if size <= CACHED_BYTES else sequence
 
 
 @lru_cache(maxsize=4)
