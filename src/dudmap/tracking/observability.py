@@ -162,7 +162,7 @@ def gradient_noise(
     v, u = (stride * index + stride // 2 for index in np.nonzero(on_map))
     z, camera = level.depth[v, u].astype(np.float64), level.camera
     p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
-    distance, difference = np.abs(residuals[:, v, u]).astype(np.float64)
+    distance, difference = (np.abs(residuals[n][v, u]).astype(np.float64) for n in range(2))
     sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
     if float(pixel.mean()) * camera.width / map_width > voxel_size:
         return None
