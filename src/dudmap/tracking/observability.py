@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.observation import Level
+from dudmap.kernels.parameters import ImageStack
 
 FILTER_PX = 4.0
 """Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
@@ -121,7 +122,7 @@ def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[ND
 
 def gradient_noise(
     level: Level,
-    residuals: NDArray[np.float32],
+    residuals: ImageStack,
     weights: NDArray[np.float32],
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
