@@ -47,7 +47,7 @@ class FakeResult:
 
 
 class FakeVolume:
-    num_blocks, num_bytes, is_empty = 3, 12345, False
+    num_blocks, num_bytes, is_empty, pager = 3, 12345, False, None
 
     def save(self, path):
         path.write_bytes(b"map")
@@ -80,6 +80,7 @@ class FakeSlam:
         live=False,
         saved_map=None,
         localize=False,
+        max_blocks=None,
     ):
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)

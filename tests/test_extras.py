@@ -112,6 +112,7 @@ REQUIRED = {
     "typer",
     "tomli_w",
     "click",
+    "PIL",
 }
 ELSEWHERE = {"open3d_slam.py"}
 """Scripts that another interpreter runs."""
@@ -162,5 +163,5 @@ def test_every_required_library_is_a_dependency():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     names = {re.split(r"[<>=\[ ]", text)[0].lower() for text in project["dependencies"]}
     homes = packages_distributions()
-    for module in REQUIRED - {"llvmlite", "click"}:  # parts of numba and typer
+    for module in REQUIRED - {"llvmlite", "click", "PIL"}:  # parts of numba, typer and matplotlib
         assert names & {home.lower().replace("_", "-") for home in homes[module]}, module

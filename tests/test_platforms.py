@@ -22,12 +22,11 @@ POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
 
 
 def calls(name):
-    """All calls of a method or function of this name in the package, with their file."""
+    """All calls of a method of this name in the package, with their file."""
     for path in SOURCES:
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
             if isinstance(node, ast.Call):
-                function = node.func
-                if name == (function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")):
+                if name == (node.func.attr if isinstance(node.func, ast.Attribute) else ""):
                     yield path, node
 
 

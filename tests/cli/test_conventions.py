@@ -75,6 +75,7 @@ CALLS = {
     "evaluate trajectory": ["evaluate", "run", "--reference", "recording"],
     "evaluate mesh": ["evaluate", "mesh", "run/mesh.ply", "run/mesh.ply", "--samples", 100, "--no-error-mesh"],
     "evaluate masks": ["evaluate", "masks", "run", "recording"],
+    "doctor": ["doctor"],
     "config": ["config", "--preset", "thesis"],
     "study thesis": ["study", "thesis", "--published", "--out", "published"],
 }
@@ -125,6 +126,17 @@ FAKED = {
             "dudmap.benchmark.heatmaps.save_heat_maps": lambda *_: None,
             "dudmap.benchmark.heatmaps.limits_table": lambda *_: "",
             "dudmap.benchmark.heatmaps.cells_table": lambda *_: "",
+        },
+    ),
+    "benchmark gpu": (
+        ["benchmark", "gpu", "--out", "gpu"],
+        {"dudmap.benchmark.gpu.recordings": lambda *_: [], "dudmap.benchmark.gpu.table": lambda _: ""},
+    ),
+    "benchmark faults": (
+        ["benchmark", "faults"],
+        {
+            "dudmap.benchmark.stream_faults.default_room": lambda *_: SimpleNamespace(name="room"),
+            "dudmap.benchmark.stream_faults.measure_stream_faults": lambda *_: [],
         },
     ),
     "benchmark speed": (

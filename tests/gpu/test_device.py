@@ -1,9 +1,11 @@
 """Which device is taken, and what is said where it does not work; without Warp and without a GPU."""
 
+import sys
+
 import pytest
 
 from dudmap.config import Config
-from dudmap.errors import ConfigError
+from dudmap.errors import ConfigError, MissingExtraError
 from dudmap.gpu import device
 from dudmap.kernels.cpu import CpuBackend
 
@@ -16,6 +18,8 @@ def machine(monkeypatch):
         monkeypatch.setattr(device, "driver_version", lambda: driver)
         monkeypatch.setattr(device, "num_gpus", lambda: gpus)
         monkeypatch.setattr(device, "_has_warp", lambda: warp)
+        if not warp:
+            monkeypatch.setitem(sys.modules, "warp", None)
         monkeypatch.setattr(device, "supported_gpus", lambda: supported)
         device.resolve.cache_clear()
 
@@ -46,7 +50,7 @@ def test_gpus_by_number(machine):
         ({"driver": None}, "no NVIDIA driver was found"),
         ({"driver": (12, 8)}, "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later"),
         ({"gpus": 0}, "finds no GPU"),
-        ({"warp": False}, r"pip install 'dudmap\[gpu\]'"),
+        ({"warp": False}, r'pip install "dudmap\[gpu\]"'),
         ({"supported": 0}, "compute capability 7.5 or later"),
     ],
 )
@@ -59,7 +63,7 @@ def test_what_is_missing_is_said(machine, without, reason):
 
 def test_the_test_device_needs_warp(machine):
     machine(warp=False)
-    with pytest.raises(ConfigError, match="warp-cpu needs Warp"):
+    with pytest.raises(MissingExtraError, match="warp-cpu needs the extra gpu"):
         device.make_backend("warp-cpu")
 
 

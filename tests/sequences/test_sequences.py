@@ -205,7 +205,7 @@ def test_unknown_camera(tmp_path):
         ("60 60 31\n", "cannot understand"),
         ("", "cannot understand"),
         ("fx 60\nfy -60\ncx 31.5\ncy 23.5\n", "positive finite"),
-        ("fx 60\nfy nan\ncx 31.5\ncy 23.5\n", "positive finite"),
+        ("fx 60\nfy nan\ncx 31.5\ncy 23.5\n", "cannot understand the line 'fy nan'"),
         ("fx 60\nfy 60\ncx 31.5\ncy 23.5\nwidth 640\nheight 480\n", "640x480 pixels, but the recording's are 64x48"),
     ],
 )

@@ -222,6 +222,7 @@ def faults(
     assignments: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
     ] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
     from dudmap.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
@@ -230,12 +231,16 @@ def faults(
 
     config = Config().override(assignments or [])
     source = default_room(frames, width, seed) if recording is None else open_sequence(recording)
-    lines, failed = [table_head(source.name, frames)], 0
-    typer.echo(lines[0])
+    lines, failed, rows = [table_head(source.name, frames)], 0, []
+    typer.echo(lines[0], err=as_json)
     for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], frames):
         lines.append(fault_row(run, clean))
-        failed += run.outcome(clean).startswith("FAILED")
-        typer.echo(lines[-1])
+        outcome = run.outcome(clean)
+        rows.append({"fault": run.fault, "outcome": outcome, "rejected": run.rejected, "lost": run.lost})
+        failed += outcome.startswith("FAILED")
+        typer.echo(lines[-1], err=as_json)
+    if as_json:
+        answer({"recording": source.name, "frames": frames, "faults": rows}, "", as_json=True)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text("\n".join(lines) + "\n", encoding="utf-8")

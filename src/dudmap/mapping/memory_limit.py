@@ -56,6 +56,6 @@ def resident_bytes() -> int:
     except ImportError as error:
         raise ConfigError("the memory of the process cannot be read on Windows; run without a memory limit") from error
     if _STATM.exists():
-        return int(_STATM.read_text().split()[1]) * resource.getpagesize()
+        return int(_STATM.read_text(encoding="ascii").split()[1]) * resource.getpagesize()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak

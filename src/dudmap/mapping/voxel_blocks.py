@@ -198,6 +198,7 @@ class VoxelBlocks:
         """Copies of the blocks of entries (n,)."""
         slots = self.slot_of[entries]
         owners = np.flatnonzero(slots >= 0).astype(np.int32)
+        owners = owners[np.argsort(slots[owners])]  # in the order of the mesh
         slots = slots[owners]
         return BlockRecords(
             self.coords[entries], self.free_count[entries], owners,

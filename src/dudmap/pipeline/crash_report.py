@@ -9,6 +9,7 @@ from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
+from dudmap.atomic_file import write_bytes
 from dudmap.errors import InternalError
 
 SECRET = "--token"
@@ -26,7 +27,7 @@ def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, 
     path = folder / f"crash-{time.strftime('%Y%m%d-%H%M%S')}.txt"
     what = f"{type(error).__name__}: {error}"
     try:
-        path.write_text(report_text(error, events), encoding="utf-8", errors="backslashreplace")
+        write_bytes(path, report_text(error, events).encode("utf-8", "backslashreplace"))
         where = f"{path} says where; please report it with this file"
     except OSError as problem:
         where = f"no report could be written ({problem}); please repeat it with another folder and report it"
