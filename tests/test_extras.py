@@ -148,7 +148,7 @@ def test_optional_libraries_are_imported_in_one_way_only():
         "gpu": {"warp"},
         "benchmark": {"warp"},
         "study": set(STUDY),
-        "sequences": {"rosbags"},
+        "sequences": {"rosbags", "lz4"},
         "cameras": {"rosbags"},
     }
     root = Path(dudmap.__file__).parent

@@ -327,5 +327,6 @@ def test_the_shell_completes(line, expected):
 
 def test_completion_can_be_installed():
     script = "import sys; sys.argv = ['dudmap', '--show-completion', 'bash']; from dudmap.cli import main; main()"
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False)
+    environment = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}  # there may be no shell above
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False)
     assert "complete -o default" in done.stdout, done.stderr

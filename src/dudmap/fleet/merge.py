@@ -19,6 +19,7 @@ from dudmap.fleet.inputs import MapHeader, check_runs
 from dudmap.fleet.registration import RegisteredPair, proposed_pairs, register_pairs
 from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
+from dudmap.mapping import morton
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging.block_sums import MAX_COUNT, VOXELS
 from dudmap.merging.map_fusion import FusedRange, joined
@@ -200,7 +201,7 @@ def _check_out(out: Path) -> None:
 def _load_kernels(like: MapHeader) -> None:
     """Compile the kernels before any worker starts: two would write the same cache at a time."""
     words = np.full((1, VOXELS), MAX_COUNT << 8, np.int32)
-    block = FusedRange(np.zeros(1, np.int64), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
+    block = FusedRange(morton.encode(np.zeros((1, 3), np.int64)), np.ones(1, bool), np.zeros(1, np.uint8), words, words)
     volume = block.volume(like.volume())
     sample_map(volume, np.zeros((1, 3)))
     volume.extract_mesh()

@@ -22,8 +22,10 @@ REGION = 1 << REGION_BITS
 """Number of blocks along the edge of a region, and its logarithm to base 2."""
 MARGIN = 4
 """Blocks beside the view that are in memory with it, so that all blocks that touch a changed piece of the mesh are."""
-ROOM = 0.75
+ROOM = 0.85
 """Share of the allowed blocks to which the memory is emptied, so that the index is not rebuilt with every region."""
+MAX_PENDING = 8
+"""Regions that may wait to be written, each a copy of up to 17 MB."""
 RETRY_AFTER = 100
 """Moves of the window before a store that could not be written is tried again."""
 Region = tuple[int, int, int]
@@ -237,6 +239,9 @@ class BlockPager:
         if self._unchanged_since.pop(region, -1) == frame_number:
             return
         self._serial[region] = self._next_serial = self._next_serial + 1
+        for pending in list(self._writing)[: max(len(self._writing) - MAX_PENDING + 1, 0)]:
+            if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
+                del self._writing[pending]
         records = blocks.records(entries)
         self._writing[region] = records, self._submit(self._stored.write, region, records)
 
