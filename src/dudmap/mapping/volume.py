@@ -322,7 +322,7 @@ class TsdfVolume:
     def records(self) -> Iterator[BlockRecords]:
         """Copies of all blocks, in parts: everything at once if it is in memory, else region by region."""
         if self.pager is None:
-            yield self.blocks.records(np.arange(self.blocks.num_entries))
+            yield self.blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # as in the mesh
             return
         for first in self._visited_regions():
             yield self.blocks.records(self.blocks.entries_in(first, first + REGION))

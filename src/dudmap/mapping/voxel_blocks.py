@@ -194,11 +194,12 @@ class VoxelBlocks:
         coords = self.coords[: self.num_entries]
         return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
 
-    def records(self, entries: NDArray[np.integer]) -> BlockRecords:
-        """Copies of the blocks of entries (n,)."""
+    def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
+        """Copies of the blocks of entries (n,), the voxels in the order of the entries or of the slots."""
         slots = self.slot_of[entries]
         owners = np.flatnonzero(slots >= 0).astype(np.int32)
-        owners = owners[np.argsort(slots[owners])]  # in the order of the mesh
+        if by_slot:
+            owners = owners[np.argsort(slots[owners])]
         slots = slots[owners]
         return BlockRecords(
             self.coords[entries], self.free_count[entries], owners,
