@@ -1,5 +1,6 @@
 """How many blocks of a map fit into the memory that the process may use."""
 
+import ctypes
 import sys
 from pathlib import Path
 
@@ -38,6 +39,8 @@ class MemoryLimit:
     def __call__(self, blocks: VoxelBlocks) -> int:
         """Largest number of blocks with voxels that a map may have in memory now."""
         spare = SAFE_SHARE * self.limit - resident_bytes()
+        if spare < 0 and _return_freed():
+            spare = SAFE_SHARE * self.limit - resident_bytes()
         return blocks.num_slots + int(spare / blocks.slot_bytes)  # released slots are resident too
 
     def capacity(self, blocks: VoxelBlocks) -> int:
@@ -59,3 +62,11 @@ def resident_bytes() -> int:
         return int(_STATM.read_text(encoding="ascii").split()[1]) * resource.getpagesize()
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _return_freed() -> bool:
+    """Have the C library give freed memory back to the system, which it keeps for itself in pieces between others."""
+    if sys.platform != "linux":
+        return False
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc only
+    return trim is not None and bool(trim(0))
