@@ -46,7 +46,7 @@ def main() -> None:
     print("| walk m | ms per frame, median | memory MB | blocks in memory | on disk | lost | corrections |")
     print("|---|---|---|---|---|---|---|")
     times, lost, corrected, tenth = [], 0, [], max(len(corridor) // 10, 1)
-    medians = []
+    medians, reasons = [], {}
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(corridor.__getitem__, 0)
         for number in range(len(corridor)):
@@ -56,7 +56,9 @@ def main() -> None:
             times.append(1000 * (time.perf_counter() - start))
             following = reader.submit(corridor.__getitem__, min(number + 1, len(corridor) - 1))
             following.result()
-            lost += result.T_world_camera is None
+            if result.T_world_camera is None:
+                lost += 1
+                reasons[result.lost_reason] = [*reasons.get(result.lost_reason, []), number]
             if result.corrected:
                 corrected.append(number)
             if (number + 1) % tenth == 0:
@@ -71,6 +73,8 @@ def main() -> None:
     print(f"\ntime per frame, last tenth over first: {medians[-1] / medians[0]:.2f}; slowest frame {max(times):.0f} ms")
     print(f"peak memory {peak_rss_mb()} MB; ATE {100 * found['ate_rmse_m']:.1f} cm; "
           f"corrected at frames {corrected}")  # fmt: skip
+    for reason, numbers in reasons.items():
+        print(f"lost, {reason}: frames {numbers}")
     shares = [_covered(corridor, slam, number) for number in range(0, len(corridor), max(len(corridor) // 60, 1))]
     print(f"surfaces in the map, 60 views: mean {np.mean(shares):.3f}, least {min(shares):.3f}")
     pieces = [len(piece.faces) for piece in slam.volume.extract_pieces()]
