@@ -233,6 +233,7 @@ def test_the_grids_hold_what_is_asked_for():
     assert len(nobody) == 1
 
 
+@pytest.mark.slow
 def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
     sweep = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.0,))
     cells = limits.grid_cells((sweep,), 6)

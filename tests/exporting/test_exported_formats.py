@@ -185,6 +185,7 @@ def test_point_clouds(run, mesh, tmp_path):
 # -- robots ------------------------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_grid_agrees_with_what_the_camera_saw(made, run, mesh, tmp_path):
     _, sequence, T_map_true = made
     with np.load(exported(run, tmp_path / "map.npz", resolution=0.04)) as data:

@@ -82,6 +82,7 @@ def test_one_pass_with_given_masks(recording, tmp_path):
     assert any(name.startswith("thumbnails/") for name in whole)
 
 
+@pytest.mark.slow
 def test_two_passes(recording, tmp_path):
     whole, parts = both(recording, tmp_path, passes=2)
     assert whole == parts
