@@ -7,7 +7,7 @@ from pathlib import Path
 from dudmap.errors import ConfigError
 from dudmap.mapping.voxel_blocks import VoxelBlocks
 
-SAFE_SHARE = 0.85
+SAFE_SHARE = 0.75
 """Share of the limit that is used: what is needed for a moment, such as the mesh of a region, fits into the rest."""
 LEAST = 400_000_000
 """Memory to leave for the kernels, the frames and the part of the map in view, bytes."""
