@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from dudmap.errors import MapError
 from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from small_maps import CAMERA, CONFIG, integrated, voxels
@@ -146,14 +145,6 @@ def test_what_the_host_changes_reaches_the_device(recording):
     paints = np.array([[a[key][1], b[key][1]] for key in a])
     assert (paints[:, 0] != paints[:, 1]).mean() < 1e-2
     assert (paints != 0).any()
-
-
-def test_too_large_a_map_says_how_large_a_voxel_fits(monkeypatch, maps):
-    from dudmap.gpu import memory
-
-    monkeypatch.setattr(memory, "free_memory", lambda device: 1000)
-    with pytest.raises(MapError, match=r"voxel_size to at least \d"):
-        on_device(maps[0], maps[1].backend).raycast(np.eye(4))
 
 
 def on_device(volume, backend):

@@ -382,6 +382,12 @@ def gpu(
     recording: Annotated[
         list[Path] | None, typer.Option("--recording", help="Also measure this recording; repeatable.")
     ] = None,
+    open3d: Annotated[
+        Path | None,
+        typer.Option(
+            "--open3d", metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option("--out", help="Output folder for gpu.md and gpu.json.")] = Path(
         "runs/benchmark/gpu"
     ),
@@ -393,9 +399,10 @@ def gpu(
     Without a GPU, only the CPU is measured, and the table says why.
     """
     from dudmap.benchmark import gpu as measurements
+    from dudmap.benchmark.interleaved import find_open3d
     from dudmap.pipeline.environment import machine, versions
 
-    rows = []
+    rows, python = [], find_open3d(open3d)
     steps, shapes = measurements.numbers(voxels, sizes)
     if quick:
         steps, shapes, frames = steps[:1], [(320, 240)], min(frames, 12)
@@ -404,6 +411,10 @@ def gpu(
             for one in measurements.devices(device):
                 typer.echo(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
                 rows.append(measurements.measure(name, each, frames, step, one))
+        if python is not None:
+            other = measurements.devices(device)[0].upper()
+            typer.echo(f"measuring {name}, Open3D's dense SLAM", err=True)
+            rows += measurements.measure_open3d(python, name, each, frames, steps, "CPU:0" if other == "CPU" else other)
     text = measurements.table(rows)
     out.mkdir(parents=True, exist_ok=True)
     (out / "gpu.md").write_text(text, encoding="utf-8")

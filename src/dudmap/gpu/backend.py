@@ -167,12 +167,13 @@ class WarpBackend:
         images_ = self._up(view.depth), self._up(color), self._up(weights)
         self._launch(fusion.pack_pixels, (height, width), *images_, p, pixels)
         occupied = wp.zeros(len(visible), dtype=wp.int32, device=self.device)
+        written = candidates[visible.numpy()]
+        # Nothing may fail for lack of memory from here on: the CPU would fuse the frame a second time.
         self._launch(
             fusion.integrate, (len(visible), BLOCK**3), visible, slots, repeats, float(count), coords, t, camera,
             height, width, pixels, resident(grid.geometry, self.device), resident(grid.colors, self.device), p,
             occupied,
         )  # fmt: skip
-        written = candidates[visible.numpy()]
         wrote(grid.geometry, self.device, written)
         wrote(grid.colors, self.device, written)
         return FusedBlocks(written, occupied.numpy().copy())

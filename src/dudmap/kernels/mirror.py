@@ -21,6 +21,10 @@ class DeviceCopy(Protocol):
         """Elements (n,) in the host's memory."""
         ...
 
+    def max_rows(self) -> int | None:
+        """Largest number of rows to use, where the device has no room for many more; None = no bound."""
+        ...
+
     def grow(self, host: NDArray, value: int) -> None:
         """Follow the host's array to more rows, the new ones holding ``value``."""
         ...
@@ -58,10 +62,20 @@ class Mirror:
         """Elements (n,) at rows and columns (n,), without bringing whole rows over."""
         return self._array[rows, columns] if self.copy is None else self.copy.take(rows, columns)
 
+    @property
+    def max_rows(self) -> int | None:
+        """Largest number of rows to use, where a device has no room for many more; None = no bound."""
+        return None if self.copy is None else self.copy.max_rows()
+
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
         """Rows (n,), or all of them, have been written in the host's memory."""
         if self.copy is not None:
             self.copy.host_wrote(rows)
+
+    def detach(self) -> None:
+        """Give up the copy; the array takes over what the device wrote."""
+        _ = self.host
+        self.copy = None
 
     def fill(self, rows: NDArray[np.integer], value: int) -> None:
         """Overwrite rows (n,)."""
