@@ -1,11 +1,11 @@
 """How far a device's results are from the CPU's, beside what the smallest possible change of the input does on the CPU.
 
-    python benchmarks/agreement.py [--device warp-cpu] [--frames N] [--first N] [--voxel METRES] [RECORDING ...]
+    python benchmarks/agreement.py [--device warp-cpu] [--frames N] [--first N] [--voxel M] [--set K=V] [RECORDING ...]
 
-Each recording (by default the synthetic room without noise, four seeds, 320x240, 12 frames) is processed three times: on
-the CPU, on the device, and on the CPU with every reading of the depth greater by one unit in the last place. Printed is
-how far the second and the third are from the first: where both are alike, the device adds nothing to what any rounding
-does.
+Each recording (by default the synthetic room without noise, four seeds, 320x240, 12 frames) is processed three times:
+on the CPU, on the device, and on the CPU with every reading of the depth greater by one unit in the last place. Printed
+is how far the second and the third are from the first: where both are alike, the device adds nothing to what any
+rounding does.
 """
 
 import argparse
@@ -40,15 +40,17 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=FRAMES)
     parser.add_argument("--first", type=int, default=0)
     parser.add_argument("--voxel", type=float, default=0.02)
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     wanted = parser.parse_args()
     rows = []
     for name, camera, frames in inputs(wanted):
-        reference = processed(camera, frames, "cpu", wanted.voxel)
+        settings = [f"volume.voxel_size={wanted.voxel}", "sensor.self_calibration=false", *wanted.set]
+        reference = processed(camera, frames, "cpu", settings)
         for what, device, given in (
             (wanted.device, wanted.device, frames),
             ("CPU, depth nudged", "cpu", [nudged(frame) for frame in frames]),
         ):
-            other = processed(camera, given, device, wanted.voxel)
+            other = processed(camera, given, device, settings)
             rows.append([name, what, *differences(reference, other, wanted.voxel)])
             sys.stderr.write(f"{name}, {what}\n")
     head = ["recording", "against the CPU", "median, mm", "largest, mm", "largest, deg", "IoU", "vertices near, %"]
@@ -73,10 +75,9 @@ def nudged(frame: Frame) -> Frame:
     return replace(frame, depth=np.where(depth > 0, np.nextafter(depth, np.float32(np.inf)), depth))
 
 
-def processed(camera: Camera, frames: list[Frame], device: str, voxel: float) -> Result:
+def processed(camera: Camera, frames: list[Frame], device: str, settings: list[str]) -> Result:
     """Poses (n, 4, 4), masks (n, H, W) and vertices (v, 3)."""
-    settings = [f"device={device}", f"volume.voxel_size={voxel}", "sensor.self_calibration=false"]
-    slam = Slam(camera, Config().override(settings))
+    slam = Slam(camera, Config().override([*settings, f"device={device}"]))
     results = [slam.process(frame) for frame in frames]
     poses = [np.full((4, 4), np.nan) if each.T_world_camera is None else each.T_world_camera for each in results]
     return np.array(poses), np.array([each.dynamic_mask for each in results]), slam.volume.extract_mesh().vertices

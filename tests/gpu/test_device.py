@@ -20,6 +20,7 @@ def machine(monkeypatch):
         monkeypatch.setattr(device, "driver_failure", lambda: failure)
         monkeypatch.setattr(device, "num_gpus", lambda: gpus)
         monkeypatch.setattr(device, "_has_warp", lambda: warp)
+        monkeypatch.setattr(device, "warp_failure", lambda: "")
         if not warp:
             monkeypatch.setitem(sys.modules, "warp", None)
         monkeypatch.setattr(device, "supported_gpus", lambda: list(supported))
@@ -76,6 +77,14 @@ def test_a_driver_that_does_not_start(monkeypatch):
     assert "error 999: see nvidia-smi" in device.driver_failure.__wrapped__()
     driver.cuInit = lambda flags: 100
     assert device.driver_failure.__wrapped__() == ""
+
+
+def test_a_warp_that_does_not_start(monkeypatch):
+    def broken():
+        raise OSError("warp.so: cannot open\nshared object file")
+
+    monkeypatch.setattr(device, "_load_warp", broken)
+    assert device.warp_failure.__wrapped__() == "Warp does not start (warp.so: cannot open shared object file)"
 
 
 def test_a_device_that_has_failed_is_not_used_again(machine):

@@ -96,6 +96,8 @@ def obstacle() -> str:
         return "the NVIDIA driver finds no GPU"
     if not _has_warp():
         return 'Warp is not installed (pip install "dudmap[gpu]")'
+    if failure := warp_failure():
+        return failure
     if not supported_gpus():
         return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
     return ""
@@ -136,6 +138,16 @@ def num_gpus() -> int:
     if library is None or library.cuInit(0) != 0 or library.cuDeviceGetCount(ctypes.byref(count)) != 0:
         return 0
     return count.value
+
+
+@cache
+def warp_failure() -> str:
+    """Why Warp, which is installed, does not start, as part of a sentence; empty where it does."""
+    try:
+        _load_warp()
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"Warp does not start ({' '.join(str(error).split())})"
+    return ""
 
 
 @cache
