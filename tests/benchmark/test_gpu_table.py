@@ -12,8 +12,10 @@ from dudmap.benchmark import gpu
 from dudmap.errors import ConfigError
 from dudmap.gpu import faults
 from dudmap.gpu.device import make_backend
+from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.synthetic import sequence
 from dudmap.synthetic.recording import DEFAULT_CAMERA
+from small_maps import CAMERA, integrated
 
 
 def test_runs_on_the_cpu_and_says_that_no_gpu_was_measured(monkeypatch):
@@ -58,6 +60,20 @@ def test_threads_of_launches_are_counted():
         backend.label(*np.zeros((3, 12, 20), np.float32), 1.0, 5)
     assert threads == {"intensities": 240, "first_spins": 240, "mean_field_sweep": 1200, "probabilities": 240}
     assert wp.launch.__module__.startswith("warp")
+
+
+def test_threads_of_recorded_launches_are_counted():
+    pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+    from dudmap.gpu.linearization import PER_THREAD
+
+    volume, room = integrated(sequence(frames=1, camera=CAMERA), "warp-cpu", frames=1), np.zeros((120, 160), np.float32)
+    parameters = RegistrationParameters(volume.band, 0.02, 0.0, 0.02, 0.1, 0.003, 1.0)
+    arguments = room, room, room, CAMERA.intrinsics, np.eye(3, 4, dtype=np.float32), parameters
+    threads = {}
+    with gpu.counted_launches(threads):
+        for _ in range(3):
+            volume.backend.linearize(volume.grid, *arguments)
+    assert 120 * 160 <= threads["linearize"] / 3 * PER_THREAD < 120 * 160 + 128 * PER_THREAD
 
 
 def test_every_kernel_with_a_bound_exists():

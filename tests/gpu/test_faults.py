@@ -149,11 +149,14 @@ def test_a_map_grows_by_the_host_where_two_copies_do_not_fit(recording, monkeypa
     expected = weights(integrated(recording, "cpu"))
     volume = integrated(recording, "warp-cpu", frames=2)
     blocks = volume.blocks
+    linearized(volume, recording)
+    assert blocks.geometry_mirror.copy.users  # recorded launches, which would keep the smaller array
     rows = 2 * len(blocks.geometry_mirror.stale)
     blocks.geometry_mirror.grow(rows, 0)
     copy = blocks.geometry_mirror.copy
     monkeypatch.setattr(memory, "free_memory", lambda device: 3e9 if len(copy.array) == 0 else 1000)
     assert len(copy.current) == rows
+    assert not copy.users
     monkeypatch.undo()
     add(volume, recording, 2, 3)
     found = weights(volume)

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from dudmap.gpu.device import make_backend
 from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from small_maps import CAMERA, CONFIG, integrated, voxels
@@ -64,6 +65,19 @@ def test_sums_are_the_same_in_every_run(maps, recording):
     assert np.array_equal(one.H, two.H)
     assert np.array_equal(one.b, two.b)
     assert one.cost == two.cost
+
+
+def test_prepared_launches_follow_what_changes(maps, recording):
+    """Pose, images, parameters and the map change between calls; each result is that of a back end that begins."""
+    volume = on_device(maps[0], make_backend("warp-cpu"))
+    for index, tukey in ((4, 0.0), (4, 0.05), (3, 0.05), (4, 0.0)):
+        found = linearized(volume, recording, tukey, index)
+        fresh = linearized(on_device(maps[0], make_backend("warp-cpu")), recording, tukey, index)
+        assert np.array_equal(found.H, fresh.H)
+        assert np.array_equal(found.b, fresh.b)
+    volume.blocks.write(volume.active_slots, *np.zeros((2, volume.num_blocks, 512), np.int32))
+    assert linearized(volume, recording).num_inliers == 0
+    assert np.array_equal(found.residuals[1], fresh.residuals[1], equal_nan=True)  # not read, nor overwritten, so far
 
 
 def test_samples_are_those_of_the_cpu(maps, recording):

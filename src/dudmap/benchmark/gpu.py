@@ -173,17 +173,22 @@ def counted_launches(threads: dict[str, int]) -> Iterator[None]:
     """Add the threads of every launch within the block to those of its kernel."""
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    launch = wp.launch
+    launch, repeat = wp.launch, wp.Launch.launch
 
     def counted(kernel: Any, dim: Any, *arguments: Any, **named: Any) -> Any:  # noqa: ANN401
-        threads[kernel.key] = threads.get(kernel.key, 0) + int(np.prod(dim))
+        if not named.get("record_cmd"):
+            threads[kernel.key] = threads.get(kernel.key, 0) + int(np.prod(dim))
         return launch(kernel, dim, *arguments, **named)
 
-    wp.launch = counted
+    def repeated(command: Any, *arguments: Any) -> None:  # noqa: ANN401
+        threads[command.kernel.key] = threads.get(command.kernel.key, 0) + command.bounds.size
+        repeat(command, *arguments)
+
+    wp.launch, wp.Launch.launch = counted, repeated
     try:
         yield
     finally:
-        wp.launch = launch
+        wp.launch, wp.Launch.launch = launch, repeat
 
 
 def add_up(results: Iterable[Any], times: dict[str, float]) -> None:

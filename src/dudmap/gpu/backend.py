@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from dudmap.gpu.kernels import fusion, images, surface
 from dudmap.gpu.kernels.formulas import Motion
 from dudmap.gpu.kernels.structs import Camera, Lattice, struct
-from dudmap.gpu.memory import Images, OnDevice, resident, wrote
+from dudmap.gpu.linearization import Linearization
+from dudmap.gpu.memory import Images, resident, users_of, wrote
 from dudmap.gpu.meshing import extract_surface
-from dudmap.kernels import meshing, raycasting, registration, visibility
+from dudmap.kernels import meshing, raycasting, visibility
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
@@ -40,10 +41,6 @@ from dudmap.kernels.parameters import (
     VoxelGrid,
 )
 
-GROUPS = 64
-"""Partial sums that are left after the first level of a sum."""
-PER_THREAD = 8
-"""Pixels that one thread adds up in a linearisation."""
 _IMAGES: dict[str, Images] = {}
 
 
@@ -212,24 +209,21 @@ class WarpBackend:
         T_grid_camera: NDArray[np.float32],
         parameters: RegistrationParameters,
     ) -> NormalEquations:
-        """See ``Backend.linearize``; the residuals stay on the device until one of their images is asked for."""
-        threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
-        partial = self._empty((registration.NUM_SUMS, threads))
-        residuals = self._empty((2, *depth.shape))
-        self._launch(
-            surface.linearize, threads, self._up(depth), self._up(intensity), self._up(weights), _camera(intrinsics),
-            _motion(T_grid_camera), self._lattice(grid), float(grid.voxel_size), float(grid.sdf_unit),
-            struct(parameters), PER_THREAD, residuals, partial,
-        )  # fmt: skip
-        parts = self._empty((registration.NUM_SUMS, GROUPS), wp.float64)
-        self._launch(surface.add_up, parts.shape, partial, GROUPS, parts)
-        sums = self._empty(registration.NUM_SUMS, wp.float64)
-        self._launch(surface.finish, registration.NUM_SUMS, parts, sums)
-        total = sums.numpy().copy()
-        return NormalEquations(
-            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
-            float(total[30]), float(total[31]), OnDevice(residuals),
-        )  # fmt: skip
+        """See ``Backend.linearize``; the images can no longer be written to. Those of the last call stay prepared."""
+        images = depth, intensity, weights
+        for image in images:
+            image.flags.writeable = False
+        arrays = *(self._up(image) for image in images), *self._map(grid)
+        numbers = *intrinsics.tolist(), *grid.shape, grid.voxel_size, grid.sdf_unit, parameters
+        users = users_of(grid.geometry)
+        known = users.get("linearize")
+        if known is None or known[1] != numbers or any(a is not b for a, b in zip(known[0], arrays, strict=True)):
+            linearization = Linearization(
+                self.device, arrays[:3], _camera(intrinsics), self._lattice(grid), struct(parameters),
+                float(grid.voxel_size), float(grid.sdf_unit),
+            )  # fmt: skip
+            known = users["linearize"] = arrays, numbers, linearization
+        return known[2](T_grid_camera)
 
     def sample(
         self,
@@ -343,9 +337,13 @@ class WarpBackend:
         """A copy on the device, also where host and device share their memory: kernels may write to it."""
         return wp.array(array, dtype=wp.uint8, device=self.device)
 
+    def _map(self, grid: VoxelGrid) -> tuple[Any, Any]:
+        """Cells of the window, and voxels."""
+        return resident(grid.window, self.device), resident(grid.geometry, self.device)
+
     def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
         lattice = Lattice()
-        lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
+        lattice.cells, lattice.geometry = self._map(grid)
         lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
         return lattice
 

@@ -69,12 +69,17 @@ class RowCopy:
         host: The array in the host's memory.
         device: Name of the device.
 
+    Attributes:
+        array: The array on the device.
+        users: What refers to that array and is forgotten when another takes its place.
+
     Raises:
         DeviceFullError: It does not fit; as of ``current``.
     """
 
     def __init__(self, host: NDArray[np.int32], device: str) -> None:
         self.device = device
+        self.users: dict[str, Any] = {}
         self._host, self._width = host, int(np.prod(host.shape[1:], dtype=np.int64))
         self._stale: list[NDArray] = []  # rows that the host wrote
         self._all_stale = False
@@ -161,6 +166,7 @@ class RowCopy:
 
     def _enlarge(self) -> None:
         """Follow the host's array to more rows: on the device where both arrays fit, else by the host."""
+        self.users.clear()
         if has_room(self._host.nbytes, self.device):
             before = self.array
             self.array = wp.full(self._host.shape, self._value, dtype=wp.int32, device=self.device)
@@ -193,6 +199,11 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
     if not isinstance(array, Mirror):
         return wp.array(np.ascontiguousarray(array), dtype=wp.int32, device=device)
     return _copy(array, device).current
+
+
+def users_of(array: Mirror | NDArray[np.int32]) -> dict[str, Any]:
+    """See ``RowCopy.users``; none are kept of an array in the host's memory."""
+    return array.copy.users if isinstance(array, Mirror) and isinstance(array.copy, RowCopy) else {}
 
 
 def wrote(array: Mirror | NDArray[np.int32], device: str, rows: NDArray[np.int32]) -> None:
