@@ -18,7 +18,8 @@ class Device:
         self.error, self.only, self.launched = "", None, []
         for name in ("launch", "copy", "empty", "zeros", "full"):
             monkeypatch.setattr(wp, name, self._guarded(getattr(wp, name)))
-        monkeypatch.setattr(wp.array, "numpy", self._guarded(wp.array.numpy))
+        for owner, name in ((wp.array, "numpy"), (wp.Launch, "launch")):
+            monkeypatch.setattr(owner, name, self._guarded(getattr(owner, name)))
 
     def breaks(self, error=LOST, only=None):
         self.error, self.only = error, only
@@ -28,7 +29,8 @@ class Device:
 
     def _guarded(self, function):
         def call(*arguments, **named):
-            kernel = getattr(arguments[0], "key", None) if arguments else None
+            first = arguments[0] if arguments else None
+            kernel = getattr(getattr(first, "kernel", first), "key", None)  # of a recorded launch, or of a kernel
             if self.error and self.only in (None, kernel):
                 raise RuntimeError(self.error)
             if isinstance(kernel, str):

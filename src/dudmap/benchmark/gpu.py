@@ -184,7 +184,7 @@ def counted_launches(threads: dict[str, int]) -> Iterator[None]:
         threads[command.kernel.key] = threads.get(command.kernel.key, 0) + command.bounds.size
         repeat(command, *arguments)
 
-    wp.launch, wp.Launch.launch = counted, repeated
+    wp.launch, wp.Launch.launch = counted, repeated  # pyright: ignore[reportAttributeAccessIssue]
     try:
         yield
     finally:

@@ -209,21 +209,19 @@ class WarpBackend:
         T_grid_camera: NDArray[np.float32],
         parameters: RegistrationParameters,
     ) -> NormalEquations:
-        """See ``Backend.linearize``; the images can no longer be written to. Those of the last call stay prepared."""
-        images = depth, intensity, weights
-        for image in images:
+        """See ``Backend.linearize``; the images can no longer be written to."""
+        for image in (depth, intensity, weights):
             image.flags.writeable = False
-        arrays = *(self._up(image) for image in images), *self._map(grid)
-        numbers = *intrinsics.tolist(), *grid.shape, grid.voxel_size, grid.sdf_unit, parameters
+        images, lattice = (self._up(depth), self._up(intensity), self._up(weights)), self._lattice(grid)
+        key = "linearize", depth.shape, *intrinsics.tolist(), grid.voxel_size, grid.sdf_unit
         users = users_of(grid.geometry)
-        known = users.get("linearize")
-        if known is None or known[1] != numbers or any(a is not b for a, b in zip(known[0], arrays, strict=True)):
-            linearization = Linearization(
-                self.device, arrays[:3], _camera(intrinsics), self._lattice(grid), struct(parameters),
-                float(grid.voxel_size), float(grid.sdf_unit),
+        recorded = users.get(key)
+        if recorded is None or recorded.lattice.cells is not lattice.cells:
+            recorded = users[key] = Linearization(
+                self.device, images, _camera(intrinsics), lattice, parameters, float(grid.voxel_size),
+                float(grid.sdf_unit),
             )  # fmt: skip
-            known = users["linearize"] = arrays, numbers, linearization
-        return known[2](T_grid_camera)
+        return recorded(images, parameters, T_grid_camera)
 
     def sample(
         self,
@@ -337,13 +335,9 @@ class WarpBackend:
         """A copy on the device, also where host and device share their memory: kernels may write to it."""
         return wp.array(array, dtype=wp.uint8, device=self.device)
 
-    def _map(self, grid: VoxelGrid) -> tuple[Any, Any]:
-        """Cells of the window, and voxels."""
-        return resident(grid.window, self.device), resident(grid.geometry, self.device)
-
     def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
         lattice = Lattice()
-        lattice.cells, lattice.geometry = self._map(grid)
+        lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
         lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
         return lattice
 

@@ -79,7 +79,7 @@ class RowCopy:
 
     def __init__(self, host: NDArray[np.int32], device: str) -> None:
         self.device = device
-        self.users: dict[str, Any] = {}
+        self.users: dict[Any, Any] = {}
         self._host, self._width = host, int(np.prod(host.shape[1:], dtype=np.int64))
         self._stale: list[NDArray] = []  # rows that the host wrote
         self._all_stale = False
@@ -201,7 +201,7 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
     return _copy(array, device).current
 
 
-def users_of(array: Mirror | NDArray[np.int32]) -> dict[str, Any]:
+def users_of(array: Mirror | NDArray[np.int32]) -> dict[Any, Any]:
     """See ``RowCopy.users``; none are kept of an array in the host's memory."""
     return array.copy.users if isinstance(array, Mirror) and isinstance(array.copy, RowCopy) else {}
 
