@@ -69,9 +69,7 @@ class WarpBackend:
         if p.fill_holes:
             image = self._run(images.fill_holes, shape, image, p.alpha, p.hole_noise)
         if p.smooth:
-            spatial = np.exp(-(np.arange(p.radius + 1) ** 2) / (2 * p.sigma_px**2)).astype(np.float32)
-            spatial.flags.writeable = False
-            weights = wp.array(spatial, device=self.device)
+            weights = wp.array(p.spatial_weights, device=self.device)
             image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 1, 0)
             image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 0, 1)
         return self._images.down(image)

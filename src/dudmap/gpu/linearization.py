@@ -17,7 +17,7 @@ from dudmap.gpu.kernels.formulas import Motion
 from dudmap.gpu.kernels.structs import struct
 from dudmap.gpu.memory import OnDevice
 from dudmap.kernels.parameters import NormalEquations, RegistrationParameters
-from dudmap.kernels.registration import NUM_SUMS, SYMMETRIC
+from dudmap.kernels.registration import NUM_SUMS, normal_equations
 
 GROUPS = 64
 """Partial sums that are left after the first level of a sum."""
@@ -80,11 +80,7 @@ class Linearization:
         self._first.launch()
         for launch in self._others:
             launch.launch()
-        total = self._sums.numpy().copy()
-        return NormalEquations(
-            total[SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]),
-            float(total[31]), OnDevice(residuals),
-        )  # fmt: skip
+        return normal_equations(self._sums.numpy().copy(), OnDevice(residuals))
 
     def _recorded(self, kernel: Any, dim: Any, *arguments: Any) -> Any:  # noqa: ANN401
         return wp.launch(kernel, dim=dim, inputs=list(arguments), device=self._device, record_cmd=True)
