@@ -176,12 +176,14 @@ def load_state(path):
     from dudmap.state.database import StateReader
     from dudmap.state.system import restore
 
-    reader = StateReader(path)
     try:
+        reader = StateReader(path)
         reader.meta()
         restore(reader, {"volume": volume()})
-    finally:
         reader.close()
+    finally:
+        for companion in ("-wal", "-shm"):  # SQLite makes them beside any database that is read while it may be written
+            path.with_name(path.name + companion).unlink(missing_ok=True)
 
 
 def keyframes(folder):
