@@ -162,6 +162,30 @@ def load_map(path):
     loaded.raycast(np.eye(4), loaded.camera)
 
 
+def state(folder):
+    from dudmap.state.database import StateDatabase
+    from dudmap.state.system import take_snapshot
+
+    database = StateDatabase(folder / "state.db")
+    database.write(take_snapshot({"volume": volume(), "numbers": np.arange(100.0)}, database), {"next": 1})
+    database.close()
+    return folder / "state.db"
+
+
+def load_state(path):
+    from dudmap.state.database import StateReader
+    from dudmap.state.system import restore
+
+    try:
+        reader = StateReader(path)
+        reader.meta()
+        restore(reader, {"volume": volume()})
+        reader.close()
+    finally:
+        for companion in ("-wal", "-shm"):  # SQLite makes them beside any database that is read while it may be written
+            path.with_name(path.name + companion).unlink(missing_ok=True)
+
+
 def keyframes(folder):
     from dudmap.places.place_recognition import Keyframe, PlacedFeatures
     from dudmap.places.saved_map import SavedMap
@@ -370,6 +394,7 @@ LOADERS = {
     "archive tar.xz": Loader(partial(archive, "xztar"), read_recording),
     "masks": Loader(masks, load_masks),
     "map": Loader(map_file, load_map),
+    "state of a run": Loader(state, load_state),
     "keyframes": Loader(keyframes, load_keyframe_file),
     "depth model": Loader(depth_model, load_depth_model),
     "configuration": Loader(partial(text, "config.toml", configuration), load_config),
