@@ -4,7 +4,9 @@ import sys
 from types import SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
+from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import ConfigError, MissingExtraError
 from dudmap.gpu import device, faults
@@ -59,6 +61,13 @@ def test_one_gpu(machine):
     assert device.resolve("cuda:0") == "cuda:0"
     with pytest.raises(ConfigError, match=r"there is no device cuda:1; this machine has cuda:0$"):
         device.resolve("cuda:1")
+
+
+def test_the_command_line_refuses_before_the_recording_is_opened(machine, tmp_path):
+    machine(driver=(12, 8))
+    done = CliRunner().invoke(app, ["run", str(tmp_path / "nothing"), "--device", "cuda"])
+    assert done.exit_code == 1
+    assert "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later" in done.stderr
 
 
 def test_an_old_gpu_beside_a_new_one(machine):

@@ -1,16 +1,19 @@
 """Checkpoints and runs are the same on the device and on the CPU, and can be continued on the other one."""
 
+import json
+
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 
 from dudmap import synthetic
+from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.gpu.fallback import FallbackBackend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.pipeline.observer import RunObserver
-from dudmap.pipeline.resume import resume
 from dudmap.pipeline.run import run
 from dudmap.pipeline.storing import Storing
 from dudmap.slam import Slam
@@ -90,7 +93,8 @@ def test_a_run_is_continued_on_the_other_device(first, second, tmp_path):
     out = tmp_path / "run"
     with pytest.raises(KeyboardInterrupt):
         run(open_sequence(recording), config, out, progress=False, observers=(Interrupt(),), storing=storing)
-    report = resume(out, device=second, progress=False)
-    assert report.metrics["complete"]
-    assert report.metrics["tracked"] == FRAMES
+    done = CliRunner().invoke(app, ["run", "--resume", str(out), "--device", second, "--json"])
+    metrics = json.loads(done.stdout)
+    assert metrics["complete"]
+    assert metrics["tracked"] == FRAMES
     assert Config.load(out / "config.toml").device == second

@@ -148,6 +148,7 @@ def run(
     moving object.
     """
     from dudmap.geometry.calibration import Calibration
+    from dudmap.gpu.device import resolve
     from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.pipeline.storing import Storing
@@ -164,6 +165,7 @@ def run(
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
     parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
+    resolve(parameters.device)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:
