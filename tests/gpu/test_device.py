@@ -96,6 +96,20 @@ def test_a_warp_that_does_not_start(monkeypatch):
     assert device.warp_failure.__wrapped__() == "Warp does not start (warp.so: cannot open shared object file)"
 
 
+def test_a_gpu_that_does_nothing(machine, monkeypatch):
+    """Another program fills its memory: ``auto`` says so and takes the CPU, and who asked for it is refused."""
+    machine()
+    monkeypatch.setattr(device, "_load_warp", lambda: None)
+    monkeypatch.setattr(device, "start_failure", lambda name: f"Failed to acquire primary context for device {name}")
+    with pytest.raises(ConfigError, match=r"device cuda cannot be used: Failed to acquire .*; take --device cpu"):
+        device.make_backend("cuda")
+    try:
+        with pytest.warns(faults.DeviceWarning, match=r"cuda:0 failed \(Failed to acquire"):
+            assert isinstance(device.make_backend("auto"), CpuBackend)
+    finally:
+        faults.forget()
+
+
 def test_a_device_that_has_failed_is_not_used_again(machine):
     machine()
     with pytest.warns(faults.DeviceWarning, match="cuda:0 failed"):

@@ -12,7 +12,7 @@ from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.geometry import se3
 from dudmap.gpu import fallback, faults, memory
-from dudmap.gpu.device import make_backend
+from dudmap.gpu.device import make_backend, start_failure
 from dudmap.gpu.faults import DeviceWarning
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
@@ -183,6 +183,12 @@ def test_single_voxels_are_read_from_the_host_after_a_loss(recording, device, to
     _ = volume.blocks.geometry
     device.breaks()
     np.testing.assert_allclose(volume.known_share(depth, CAMERA, T), expected, atol=1e-6)
+
+
+def test_a_device_is_tried_before_it_is_used(device):
+    assert start_failure.__wrapped__("cpu") == ""
+    device.breaks(FULL)
+    assert start_failure.__wrapped__("cpu") == FULL
 
 
 def test_errors_of_the_program_are_raised(recording, monkeypatch):

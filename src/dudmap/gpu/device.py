@@ -47,6 +47,11 @@ def make_backend(device: str) -> Backend:
     if name == "cpu" or faults.is_lost(in_warp):
         return CpuBackend()
     _load_warp()
+    if failure := start_failure(in_warp):
+        if device != "auto":
+            raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
+        faults.lose(RuntimeError(failure), in_warp)
+        return CpuBackend()
     from dudmap.gpu.fallback import FallbackBackend
 
     return cast("Backend", FallbackBackend(in_warp))
@@ -100,6 +105,19 @@ def obstacle() -> str:
         return failure
     if not supported_gpus():
         return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    return ""
+
+
+@cache
+def start_failure(device: str) -> str:
+    """Why a device, by its name in Warp, does nothing, such as one whose memory other programs fill; empty where it
+    does."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    try:
+        wp.zeros(1, dtype=wp.int32, device=device).numpy()
+    except (RuntimeError, OSError) as error:
+        return " ".join(str(error).split())
     return ""
 
 
