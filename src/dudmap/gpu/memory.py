@@ -23,8 +23,9 @@ WARP_TYPES = {
 
 SPARE = 1.2
 """Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
-GROWTH = 1.5
-"""Factor by which a map grows (``VoxelBlocks.allocate``)."""
+GROWTH = 1.15
+"""Rows on the device in units of those in use, when it follows the host: what is spare on the host takes no memory, but
+on a device it does."""
 USED = 0.8
 """Share of the rows to use where no more fit: the rest is for blocks that come into view before others can leave."""
 PIECE = 4096
@@ -67,6 +68,7 @@ class RowCopy:
 
     Args:
         host: The array in the host's memory.
+        used: Number of rows in use, from the first on.
         device: Name of the device.
 
     Attributes:
@@ -77,8 +79,8 @@ class RowCopy:
         DeviceFullError: It does not fit; as of ``current``.
     """
 
-    def __init__(self, host: NDArray[np.int32], device: str) -> None:
-        self.device = device
+    def __init__(self, host: NDArray[np.int32], used: int, device: str) -> None:
+        self.device, self._used = device, used
         self.users: dict[Any, Any] = {}
         self._host, self._width = host, int(np.prod(host.shape[1:], dtype=np.int64))
         self._stale: list[NDArray] = []  # rows that the host wrote
@@ -92,10 +94,10 @@ class RowCopy:
     @property
     def current(self) -> Any:  # noqa: ANN401 - an array of Warp
         """The device's array with everything that the host wrote."""
-        if len(self.array) < len(self._host):
+        if len(self.array) < self._used:
             self._enlarge()
         if self._all_stale:
-            wp.copy(self.array, wp.array(self._host, dtype=wp.int32, device="cpu", copy=False))
+            wp.copy(self.array, wp.array(self._host[: len(self.array)], dtype=wp.int32, device="cpu", copy=False))
         elif self._stale:
             rows = np.unique(np.concatenate(self._stale)).astype(np.int32)
             source = wp.array(self._wide(self._host)[rows], device=self.device)
@@ -150,10 +152,10 @@ class RowCopy:
 
     def max_rows(self) -> int | None:
         """See ``mirror.DeviceCopy``; it is told that the map has reached the bound."""
-        free, own = free_memory(self.device), 2 * self._host.nbytes  # geometry and colours
+        free, own = free_memory(self.device), 2 * len(self.array) * self._row_bytes()  # geometry and colours
         if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
             return None
-        rows = int(USED * len(self._host))
+        rows = int(USED * len(self.array))
         faults.tell(
             f"{self.device} has room for {rows} blocks of the map; those farthest from the camera wait on disk, "
             "as with --max-memory"
@@ -161,15 +163,20 @@ class RowCopy:
         return rows
 
     def grow(self, host: NDArray[np.int32], value: int) -> None:
-        """See ``mirror.DeviceCopy``; the device follows at the next use, where a lack of memory can be answered."""
+        """See ``mirror.DeviceCopy``."""
         self._host, self._value = host, value
+
+    def use(self, num_rows: int) -> None:
+        """See ``mirror.DeviceCopy``; the device follows at the next use, where a lack of memory can be answered."""
+        self._used = num_rows
 
     def _enlarge(self) -> None:
         """Follow the host's array to more rows: on the device where both arrays fit, else by the host."""
         self.users.clear()
-        if has_room(self._host.nbytes, self.device):
-            before = self.array
-            self.array = wp.full(self._host.shape, self._value, dtype=wp.int32, device=self.device)
+        rows = self._wanted_rows()
+        if has_room(rows * self._row_bytes(), self.device):
+            before, shape = self.array, (rows, *self._host.shape[1:])
+            self.array = wp.full(shape, self._value, dtype=wp.int32, device=self.device)
             wp.copy(self.array, before, count=before.size)
         else:
             self.pull(self._host)
@@ -177,9 +184,16 @@ class RowCopy:
             self._upload()
 
     def _upload(self) -> None:
-        check_room(self._host.nbytes, self.device)
-        self.array = wp.array(self._host, dtype=wp.int32, device=self.device)
+        rows = self._wanted_rows()
+        check_room(rows * self._row_bytes(), self.device)
+        self.array = wp.array(self._host[:rows], dtype=wp.int32, device=self.device)
         self._stale, self._all_stale = [], False
+
+    def _wanted_rows(self) -> int:
+        return min(int(GROWTH * self._used) + 1, len(self._host))
+
+    def _row_bytes(self) -> int:
+        return self._width * self._host.itemsize
 
     def _rows(self) -> Any:  # noqa: ANN401
         return self.array if self.array.ndim == 2 else self.array.reshape((-1, 1))
@@ -218,7 +232,7 @@ def wrote(array: Mirror | NDArray[np.int32], device: str, rows: NDArray[np.int32
 
 def _copy(mirror: Mirror, device: str) -> RowCopy:
     if not (isinstance(mirror.copy, RowCopy) and mirror.copy.device == device):
-        mirror.copy = RowCopy(mirror.host, device)
+        mirror.copy = RowCopy(mirror.host, mirror.used, device)
     return mirror.copy
 
 

@@ -21,6 +21,10 @@ class DeviceCopy(Protocol):
         """Elements (n,) in the host's memory."""
         ...
 
+    def use(self, num_rows: int) -> None:
+        """So many rows are in use from now on; the device needs no others."""
+        ...
+
     def max_rows(self) -> int | None:
         """Largest number of rows to use, where the device has no room for many more; None = no bound."""
         ...
@@ -39,11 +43,12 @@ class Mirror:
         array: The array in the host's memory.
 
     Attributes:
+        used: Number of rows in use, all unless ``use`` says otherwise; the others are spare.
         copy: Copy on a device; None = none.
     """
 
     def __init__(self, array: NDArray) -> None:
-        self._array = array
+        self._array, self.used = array, len(array)
         self.copy: DeviceCopy | None = None
 
     @property
@@ -61,6 +66,12 @@ class Mirror:
     def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray:
         """Elements (n,) at rows and columns (n,), without bringing whole rows over."""
         return self._array[rows, columns] if self.copy is None else self.copy.take(rows, columns)
+
+    def use(self, num_rows: int) -> None:
+        """Take note of the number of rows in use."""
+        self.used = num_rows
+        if self.copy is not None:
+            self.copy.use(num_rows)
 
     @property
     def max_rows(self) -> int | None:
