@@ -100,7 +100,8 @@ def resume_system(path: Path, device: str | None) -> "Slam":
     check_code(meta, path)
     camera = meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])}
     config = on_device(Config.model_validate_json(meta["config"]), device)
-    return restore(reader, Slam(Camera(**camera), config), device=config.device)
+    slam = Slam(Camera(**camera), config)
+    return restore(reader, slam, device=slam.device)
 
 
 def on_device(config: Config, device: str | None) -> Config:
