@@ -1,6 +1,6 @@
 """Merging of many runs through one building: accuracy, false joins, time and memory.
 
-python benchmarks/fleet.py [--runs 8|64] [--folder DIR] [--workers 1 2] [--separate 200] [--out FILE.json]
+python benchmarks/fleet.py [--runs 8|64] [--layout 0] [--folder DIR] [--workers 1 2] [--separate 200] [--out FILE.json]
 
 The recordings (benchmarks/building.py) are rendered and run once and kept in the folder. The merge is repeated for each
 number of workers. Pairs without overlap are those whose true surfaces share less than 1 % of their cells of 10 cm; so
@@ -79,12 +79,12 @@ def chosen(points):
     return points[np.random.default_rng(0).permutation(len(points))[:VERTICES]]
 
 
-def prepare(count: int, folder: Path) -> list[Path]:
+def prepare(count: int, layout: int, folder: Path) -> list[Path]:
     """Run the system over the recordings that are not done yet."""
     config = Config().override(["volume.voxel_size=0.02", "relocalization.keyframe_gap=5"])
     for walk in walks(count):
         if not (folder / walk.name / "metrics.json").is_file():
-            found = run(recording(walk), config, folder / walk.name, progress=False, ahead=0).metrics
+            found = run(recording(walk, layout), config, folder / walk.name, progress=False, ahead=0).metrics
             print(walk.name, {key: found.get(key) for key in ("tracked", "lost", "ate_rmse_m")}, flush=True)
     return [folder / walk.name for walk in walks(count)]
 
@@ -115,9 +115,9 @@ def is_false(error: tuple[float, float]) -> bool:
     return error[0] > FALSE_DISTANCE or error[1] > FALSE_ANGLE_DEG
 
 
-def scored(report: FleetReport, runs: list[TrueRun]) -> dict[str, object]:
+def scored(report: FleetReport, runs: list[TrueRun], layout: int) -> dict[str, object]:
     """All figures of a merge."""
-    part, graph, scene = report.graph.components[0], report.graph, building()
+    part, graph, scene = report.graph.components[0], report.graph, building(layout=layout)
     errors = {(join.a, join.b): pose_errors(join, runs) for join in graph.kept}
     accepted = [(one, Join(one.a, one.b, one.pair.T_a_b)) for one in report.pairs if one.pair.T_a_b is not None]
     right = np.array([error for error in errors.values() if not is_false(error)]).reshape(-1, 2)
@@ -170,12 +170,13 @@ def main() -> None:
     """Print all figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=64, help="number of runs: 8 on two floors, else of 64")
+    parser.add_argument("--layout", type=int, default=0, help="number of the building; each has a folder of its own")
     parser.add_argument("--folder", type=Path, default=Path("runs/fleet"), help="where runs and worlds are kept")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--separate", type=int, default=200, help="pairs without overlap to compare at least")
     parser.add_argument("--out", type=Path, help="write all figures as JSON")
     options = parser.parse_args()
-    folders = prepare(options.runs, options.folder)
+    folders = prepare(options.runs, options.layout, options.folder)
     runs = [TrueRun(folder) for folder in folders]
     rows: dict[str, object] = {}
     report = None
@@ -184,7 +185,7 @@ def main() -> None:
         report = merge_fleet(
             folders, world, workers=workers, note=lambda text: print(text, file=sys.stderr, flush=True)
         )
-        rows[f"{workers} workers"] = scored(report, runs)
+        rows[f"{workers} workers"] = scored(report, runs, options.layout)
         print(json.dumps(rows[f"{workers} workers"], indent=1), *report.sentences, sep="\n", flush=True)
     assert report is not None
     rows["without overlap"] = separate_pairs(folders, runs, report, options.separate, options.workers[-1])
