@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from building import building, recording, walks
+from building import CEILING, FLOORS, STOREY, Walk, building, recording, walks
 
 from dudmap.config import Config
 from dudmap.fleet.merge import FleetReport, merge_fleet
@@ -41,8 +41,8 @@ GHOST = 0.05
 class TrueRun:
     """A run folder with what is true of it, in the frame of the building."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, walk: Walk) -> None:
+        self.folder, self.walk = folder, walk
         estimate, truth = Trajectory.load(folder / "trajectory.txt"), Trajectory.load(folder / "groundtruth.txt")
         self.estimated = estimate.Ts_world_camera
         start, end = truth.timestamps[[0, -1]]
@@ -130,8 +130,8 @@ def scored(report: FleetReport, runs: list[TrueRun], layout: int) -> dict[str, o
     for entry in report.tree["ranges"]:
         volume = TsdfVolume.load(report.out / entry["file"])
         world.append(volume.extract_mesh().vertices.astype(np.float64))
-    points = chosen(moved(T_building_world, np.concatenate(world)))
-    union = surface_figures(scene, points)
+    vertices = chosen(np.concatenate(world))
+    union = surface_figures(scene, moved(T_building_world, vertices))
     alone = {key: float(np.mean([one[key] for one in single])) for key in ("accuracy_mm", "ghost_share")}
     everything = itertools.combinations(range(len(runs)), 2)
     overlapping = [(a, b) for a, b in everything if runs[a].overlap(runs[b]) > MUCH_OVERLAP]
@@ -147,9 +147,28 @@ def scored(report: FleetReport, runs: list[TrueRun], layout: int) -> dict[str, o
         "joins_within_1cm_02deg": int(np.sum((right[:, 0] < 0.01) & (right[:, 1] < 0.2))),
         "ate_rmse_mm": round(1000 * float(np.sqrt(np.mean(ate**2))), 2),
         "single": alone, "union": union, "union_over_single": union["accuracy_mm"] / alone["accuracy_mm"],
+        "union_over_single_by_floor": by_floor(scene, vertices, report, runs),
         **{key: report.tree[key] for key in ("workers", "registration_s", "total_s", "cpu_s", "peak_rss_mb", "tiles")},
         "parts": len(report.tree["ranges"]), "map_blocks": report.tree["map_blocks"],
     }  # fmt: skip
+
+
+def by_floor(scene, vertices, report: FleetReport, runs: list[TrueRun]) -> dict[str, float]:
+    """Accuracy of the union over that of the single runs for each floor by itself, aligned by its own runs: without the
+    drift of the rides that connect the floors."""
+    out = {}
+    for floor in range(FLOORS):
+        own = [run for run in report.graph.components[0] if runs[run].walk.floor == floor]
+        own = [run for run in own if runs[run].walk.kind != "lift"]
+        if len(own) < 2:
+            continue
+        placed = np.concatenate([report.graph.Ts[run] @ runs[run].estimated for run in own])
+        points = moved(aligned(np.concatenate([runs[run].true for run in own]), placed), vertices)
+        inside = (points[:, 2] > floor * STOREY - 0.1) & (points[:, 2] < floor * STOREY + CEILING + 0.1)
+        single = [surface_figures(scene, moved(runs[run].T_building_run, runs[run].vertices)) for run in own]
+        alone = float(np.mean([one["accuracy_mm"] for one in single]))
+        out[str(floor)] = round(surface_figures(scene, points[inside])["accuracy_mm"] / alone, 3)
+    return out
 
 
 def separate_pairs(folders: list[Path], runs: list[TrueRun], report: FleetReport, count: int, workers: int) -> dict:
@@ -177,7 +196,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, help="write all figures as JSON")
     options = parser.parse_args()
     folders = prepare(options.runs, options.layout, options.folder)
-    runs = [TrueRun(folder) for folder in folders]
+    runs = [TrueRun(folder, walk) for folder, walk in zip(folders, walks(options.runs), strict=True)]
     rows: dict[str, object] = {}
     report = None
     for workers in options.workers:

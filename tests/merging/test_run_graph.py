@@ -74,6 +74,7 @@ def test_runs_of_one_place_are_proposed():
     pairs = most_similar(votes, 3)
     assert {(k, k + 1) for k in range(38)} <= set(pairs)
     assert len(pairs) <= 39 * 3
+    assert len(most_similar(similarity([runs[0]] * 30), 3)) >= 30  # copies are compared, too
 
 
 coordinate = st.integers(-(1 << 20), (1 << 20) - 1)

@@ -117,4 +117,4 @@ def _more_partners(graph: RunGraph, similar: NDArray[np.float32], found: Pairs) 
 def _block_centers(run: Path) -> NDArray[np.float64]:
     """Centres (k, 3) of the blocks with voxels of a run, metres."""
     header = MapHeader.read(run / MAP_FILE)
-    return (header.coords[header.has_voxels] + 0.5) * header.volume().block_size
+    return (header.coords[header.has_voxels].astype(np.float64) + 0.5) * header.volume().block_size

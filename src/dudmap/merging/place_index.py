@@ -26,8 +26,8 @@ those that are noise."""
 LEAST_VARIANCE = 1e-6
 """Added to each variance, so that copies of one run do not divide by zero; the variances of all components sum to 1 at
 most."""
-NEIGHBOURS = 20
-"""Runs that a keyframe votes for."""
+NEIGHBOURS, LEAST_VOTE = 20, 1e-4
+"""Runs that a keyframe votes for, more if they are equally similar, and its vote for the last of them."""
 PARTNERS = 8
 """Runs that each run is compared with; several, since look-alikes compete with the neighbours of a run."""
 
@@ -67,16 +67,16 @@ def similarity(runs: Sequence[NDArray[np.float32]]) -> NDArray[np.float32]:
         runs: Descriptors (k, d) of the keyframes of each run.
     """
     everything = _whitened(np.concatenate(runs))
-    ends = np.cumsum([len(run) for run in runs])
-    held = np.flatnonzero([len(run) > 0 for run in runs])
-    starts = (ends - [len(run) for run in runs])[held]
+    sizes = np.array([len(run) for run in runs], np.int64)
+    ends, held = np.cumsum(sizes), np.flatnonzero(sizes)
+    starts = (ends - sizes)[held]
     votes = np.zeros((len(runs), len(runs)), np.float32)
     for a, start in zip(held, starts, strict=True):
         best = np.maximum.reduceat(everything[start : ends[a]] @ everything.T, starts, axis=1)
         best[:, held == a] = -1
         last = min(NEIGHBOURS, len(held)) - 1
         limit = -np.sort(-best, axis=1)[:, last : last + 1]
-        votes[a, held] = np.maximum(best - limit, 0).sum(axis=0)
+        votes[a, held] = np.where(best >= limit, best - limit + LEAST_VOTE, 0).sum(axis=0)
     np.fill_diagonal(votes, 0)
     return votes + votes.T
 

@@ -30,10 +30,11 @@ def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
     for a, b in outside:
         if connected[a] != connected[b]:
             continue
-        flow = maximum_flow(capacity, a, b).flow
-        for start, left in ((a, capacity - flow), (b, (capacity - flow).T)):
+        left = csr_array(capacity - maximum_flow(capacity, a, b).flow)
+        left.eliminate_zeros()
+        for start, reached in ((a, left), (b, csr_array(left.T))):
             side = np.zeros(len(names), bool)
-            side[breadth_first_order(_positive(left), start, return_predecessors=False)] = True
+            side[breadth_first_order(reached, start, return_predecessors=False)] = True
             cut = side[inside[:, 0]] != side[inside[:, 1]]
             after = _labels(inside[~cut], len(names))
             separated = np.sum((connected[outside[:, 0]] == connected[outside[:, 1]])
@@ -45,10 +46,6 @@ def best_cut(edges: Sequence[Pair], apart: Sequence[Pair]) -> set[int]:
 
 def _matrix(ends: np.ndarray, count: int) -> csr_array:
     return csr_array((np.ones(len(ends), np.int32), (ends[:, 0], ends[:, 1])), shape=(count, count))
-
-
-def _positive(matrix: csr_array) -> csr_array:
-    return csr_array((matrix > 0).astype(np.int32))
 
 
 def _labels(ends: np.ndarray, count: int) -> np.ndarray:
