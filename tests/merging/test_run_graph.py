@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from dudmap.geometry import se3
 from dudmap.mapping import morton
-from dudmap.merging.run_graph import Join, consistent, solve, supported
+from dudmap.merging.run_graph import SIGMA_DISTANCE, Join, consistent, drift_covariance, solve, supported
 from dudmap.merging.smallest_cuts import best_cut
 
 RUNS = 24
@@ -110,6 +110,15 @@ def test_the_cut_with_most_contradictions_is_made():
     assert best_cut(chain, [(1, 3), (2, 4), (0, 4)]) == {2}  # only (2, 3) separates all three
     assert best_cut(chain, []) == set()
     assert best_cut(chain, [(7, 8)]) == set()
+
+
+def test_the_error_of_a_join_is_drift_at_the_middle_of_the_common_surface(world):
+    T, middle = world[0][5], np.array([4.0, -3.0, 1.0])
+    R, at_b = T[:3, :3], se3.inverse(T)[:3] @ np.r_[middle, 1.0]
+    J = R @ np.hstack([np.eye(3), -se3.hat(at_b)])  # motion of that point by a twist e behind T
+    for overlap, sigma in ((0.5, SIGMA_DISTANCE), (0.25, 4 * SIGMA_DISTANCE)):
+        moved = J @ drift_covariance(T, middle, overlap) @ J.T
+        np.testing.assert_allclose(moved, sigma**2 * np.eye(3), atol=1e-12)
 
 
 def test_the_error_of_a_ring_goes_where_a_relative_pose_is_uncertain():

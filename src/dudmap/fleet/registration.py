@@ -31,10 +31,10 @@ class RegisteredPair:
     @property
     def join(self) -> Join | None:
         """The accepted relative pose, if there is one."""
-        T, alignment = self.pair.T_a_b, self.pair.alignment
-        if T is None or alignment is None:
+        T, alignment, agreement = self.pair.T_a_b, self.pair.alignment, self.pair.agreement
+        if T is None or alignment is None or agreement is None:
             return None
-        return Join(self.a, self.b, T, drift_covariance(T, alignment.center))
+        return Join(self.a, self.b, T, drift_covariance(T, alignment.center, agreement.overlap))
 
 
 def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:

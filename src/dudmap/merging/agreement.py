@@ -70,6 +70,10 @@ class Agreement:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
         if self.denied > MAX_DENIED:
             return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
+        return self.color_reason(many)
+
+    def color_reason(self, many: bool) -> str:
+        """Sentence on how the colours disagree, empty if they agree."""
         if self.color_correlation < MIN_CORRELATION or self.color_share < MIN_COLOR_SHARE:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "

@@ -48,8 +48,12 @@ class MapPair:
 
     @property
     def contradicted(self) -> bool:
-        """Whether the surfaces lie on each other and disagree."""
-        return self.T_a_b is None and self.agreement is not None and self.agreement.enough
+        """Whether the surfaces lie on each other and have other colours, as two places of many that look alike.
+
+        Free space alone does not count: somebody who stayed in one map, or a bent map, also makes it disagree.
+        """
+        found = self.agreement
+        return self.T_a_b is None and found is not None and found.enough and bool(found.color_reason(many=True))
 
     def tree(self) -> dict[str, Any]:
         """The figures, for a JSON file."""
