@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.observation import Level
-from dudmap.kernels.parameters import ImageStack
+from dudmap.kernels.gradient_noise import NUM_SUMS, noise_sums
+from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 
 FILTER_PX = 4.0
 """Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
@@ -22,6 +22,8 @@ INTERPOLATED = 2 * (2 / 3) ** 2
 a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
 STEEPEST = 9.5
 """Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
+"""Index of each element of a symmetric matrix among the six of its upper triangle, row by row."""
 REGULAR = 1e-6
 """Share by which the diagonal of the noise is raised."""
 AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
@@ -127,9 +129,7 @@ def gradient_noise(
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
     map_width: int,
-    color_weight: float,
-    config: TrackerConfig,
-    sensor: SensorConfig,
+    parameters: RegistrationParameters,
 ) -> GradientNoise | None:
     """What noise of the gradients contributes to H in a view.
 
@@ -148,57 +148,35 @@ def gradient_noise(
         R_world_camera: (3, 3).
         voxel_size: Metres.
         map_width: Width of the images that the map was made of, pixels.
-        color_weight: Weight of the intensities.
-        config, sensor: The weights of the residuals.
+        parameters: The weights of the residuals.
 
     Returns:
         None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
         neighbouring voxels take the same reading, and the noise is another one.
     """
-    stride = max(1, level.camera.width // SAMPLES_ACROSS)
-    part = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    on_map = np.isfinite(residuals[1][part]) & (weights[part] > 0)
-    if np.count_nonzero(on_map) < MIN_SAMPLES:
+    camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
+    scale = camera.width / map_width
+    sums, numbers = np.zeros(NUM_SUMS), (FILTER_PX * camera.width / 640, scale, voxel_size, INTERPOLATED, STEEPEST)
+    noise_sums(
+        stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
+        *numbers, sums,
+    )  # fmt: skip
+    count, depth, weight = sums[:3]
+    if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
         return None
-    v, u = (stride * index + stride // 2 for index in np.nonzero(on_map))
-    z, camera = level.depth[v, u].astype(np.float64), level.camera
-    p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
-    distance, difference = (np.abs(residuals[number][v, u]).astype(np.float64) for number in range(2))
-    sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
-    if float(pixel.mean()) * camera.width / map_width > voxel_size:
-        return None
-    scale = np.minimum(sensor.sigma(1.0) / sigma, 1) if config.noise_weighting else np.ones_like(z)
-    if config.robust == "tukey":
-        robust = (1 - np.minimum(distance * scale / config.tukey, 1) ** 2) ** 2
-    else:
-        robust = config.huber / np.maximum(distance * scale, config.huber)
-    width = np.hypot(FILTER_PX * camera.width / 640 * pixel, voxel_size / 2)
-    static = stride**2 * weights[v, u].astype(np.float64)
-    w = static * robust * scale**2
-    steps = _depth_steps(level.depth, v, u, pixel) * camera.width / map_width
-    w_noise = w * (sigma**2 * pixel**2 / (8 * np.pi * width**4) + INTERPOLATED * steps**2 / 12 / voxel_size**2)
-    w_color = color_weight * static * config.color_huber / np.maximum(difference, config.color_huber)
-    color_variance = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if color_weight > 0 else 0.0
-    distances, intensities = _isotropic(w_noise, p), _isotropic(w_color * color_variance, p)
-    variance = float(w_noise.sum() / max(w.sum(), 1e-12))
-    return GradientNoise(distances, intensities, (max(variance, 1e-12), color_variance), float(z.mean()))
+    s_d, s_c = sums[3] / max(weight, 1e-12), 0.0
+    distances, intensities = (stride**2 * _isotropic(part, R_world_camera) for part in np.split(sums[3:], 2))
+    if parameters.color_weight > 0:
+        s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2
+    return GradientNoise(distances, s_c * intensities, (max(s_d, 1e-12), s_c), depth / count)
 
 
-def _depth_steps(
-    depth: NDArray[np.float32], v: NDArray[np.intp], u: NDArray[np.intp], pixel: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Change (n,) of the depth from a pixel to the next, metres, at most that of the steepest surface."""
-    h, w = depth.shape
-    across = depth[v, np.minimum(u + 1, w - 1)] - depth[v, np.maximum(u - 1, 0)]
-    down = depth[np.minimum(v + 1, h - 1), u] - depth[np.maximum(v - 1, 0), u]
-    return np.minimum(np.hypot(across, down) / 2, STEEPEST * pixel)
-
-
-def _isotropic(w: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum (6, 6) of w J' J with J = [I, -hat(p)] over points (n, 3), of weights (n,)."""
+def _isotropic(moments: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum (6, 6) of w J' J with J = [I, -hat(p)] over points turned by R (3, 3), of which ``noise_sums`` gave the
+    ``moments`` (10,)."""
     N = np.zeros((6, 6))
-    first, second = w @ p, (w[:, None] * p).T @ p
-    N[:3, :3] = np.eye(3) * w.sum()
+    first, second = R @ moments[1:4], R @ moments[4:][SYMMETRIC] @ R.T
+    N[:3, :3] = np.eye(3) * moments[0]
     N[3:, :3] = [[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]]
     N[:3, 3:] = N[3:, :3].T
     N[3:, 3:] = np.eye(3) * np.trace(second) - second
