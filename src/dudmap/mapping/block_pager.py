@@ -169,8 +169,8 @@ class BlockPager:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
             read = self._reading.pop(region, None)
-            waiting = read is None or read.cancel()  # behind regions that are to be written, whom it need not wait for
-            records = self._read(region) if waiting else read.result()
+            # one that waits behind regions to be written is read at once
+            records = self._read(region) if read is None or read.cancel() else read.result()
             if region not in self._archived:
                 self._unchanged_since[region] = frame_number
         del self._away[region]
