@@ -76,3 +76,39 @@ def noise_sums(
                 sums[n + 7] += share * y * y
                 sums[n + 8] += share * y * z
                 sums[n + 9] += share * z * z
+
+
+@kernel
+def isotropic(moments, R, share, regular, out):
+    """Sum of w J' J with J = [I, -hat(p)] over points turned by a rotation, of which ``noise_sums`` gave the moments.
+
+    Args:
+        moments: (NUM_MOMENTS,) float64.
+        R: (3, 3) float64.
+        share: Factor of the result.
+        regular: Share by which the diagonal is raised: readings in one line leave a rotation without any.
+        out: (6, 6) float64 out.
+    """
+    second = np.empty((3, 3))
+    second[0, 0], second[0, 1], second[0, 2] = moments[4], moments[5], moments[6]
+    second[1, 1], second[1, 2], second[2, 2] = moments[7], moments[8], moments[9]
+    second[1, 0], second[2, 0], second[2, 1] = moments[5], moments[6], moments[8]
+    trace = moments[4] + moments[7] + moments[9]
+    x = R[0, 0] * moments[1] + R[0, 1] * moments[2] + R[0, 2] * moments[3]
+    y = R[1, 0] * moments[1] + R[1, 1] * moments[2] + R[1, 2] * moments[3]
+    z = R[2, 0] * moments[1] + R[2, 1] * moments[2] + R[2, 2] * moments[3]
+    out[:] = 0.0
+    out[3, 1], out[4, 0], out[3, 2], out[5, 0], out[4, 2], out[5, 1] = -z, z, y, -y, -x, x
+    for i in range(3):
+        out[i, i] = moments[0]
+        for j in range(3):
+            out[i, 3 + j] = out[3 + j, i]
+            total = trace if i == j else 0.0
+            for k in range(3):
+                for m in range(3):
+                    total -= R[i, k] * second[k, m] * R[j, m]
+            out[3 + i, 3 + j] = total
+    for i in range(6):
+        out[i, i] *= 1 + regular
+        for j in range(6):
+            out[i, j] *= share

@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.frames.observation import Level
-from dudmap.kernels.gradient_noise import NUM_SUMS, noise_sums
+from dudmap.kernels.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, noise_sums
 from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 
 FILTER_PX = 4.0
@@ -22,8 +22,6 @@ INTERPOLATED = 2 * (2 / 3) ** 2
 a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
 STEEPEST = 9.5
 """Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
-SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
-"""Index of each element of a symmetric matrix among the six of its upper triangle, row by row."""
 REGULAR = 1e-6
 """Share by which the diagonal of the noise is raised."""
 AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
@@ -76,9 +74,13 @@ class GradientNoise:
     depth: float
 
     def is_exceeded(self, H: NDArray[np.float64], least: float) -> bool:
-        """Whether H has at least ``least`` times the information of the noise on every direction. Then one of its two
-        terms has."""
-        return bool(_eigenvalues(H, self.distances + self.intensities)[0][0] >= least)
+        """Whether H has more than ``least`` times the information of the noise on every direction: whether their
+        difference is positive definite. Then one of its two terms has."""
+        try:
+            np.linalg.cholesky(H - least * (self.distances + self.intensities))
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def observability(
         self,
@@ -164,23 +166,12 @@ def gradient_noise(
     count, depth, weight = sums[:3]
     if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
         return None
-    s_d, s_c = sums[3] / max(weight, 1e-12), 0.0
-    distances, intensities = (stride**2 * _isotropic(part, R_world_camera) for part in np.split(sums[3:], 2))
-    if parameters.color_weight > 0:
-        s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2
-    return GradientNoise(distances, s_c * intensities, (max(s_d, 1e-12), s_c), depth / count)
-
-
-def _isotropic(moments: NDArray[np.float64], R: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum (6, 6) of w J' J with J = [I, -hat(p)] over points turned by R (3, 3), of which ``noise_sums`` gave the
-    ``moments`` (10,)."""
-    N = np.zeros((6, 6))
-    first, second = R @ moments[1:4], R @ moments[4:][SYMMETRIC] @ R.T
-    N[:3, :3] = np.eye(3) * moments[0]
-    N[3:, :3] = [[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]]
-    N[:3, 3:] = N[3:, :3].T
-    N[3:, 3:] = np.eye(3) * np.trace(second) - second
-    return N + REGULAR * np.diag(np.diag(N))  # readings in one line leave a rotation without any
+    s_d = sums[3] / max(weight, 1e-12)
+    s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
+    noise = np.empty((2, 6, 6))
+    for moments, share, out in zip((sums[3:-NUM_MOMENTS], sums[-NUM_MOMENTS:]), (1.0, s_c), noise, strict=True):
+        isotropic(moments, R_world_camera, stride**2 * share, REGULAR, out)
+    return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)
 
 
 def sentence(unobservable: NDArray[np.float64]) -> str:
