@@ -147,7 +147,7 @@ def test_noise_is_the_sum_over_the_readings(robust):
             middle = min(v, 1), min(u, 1)
             step = np.hypot(np.ptp(around[:, middle[1]][[0, -1]]), np.ptp(around[middle[0]][[0, -1]])) / 2
             step = min(step, 9.5 * pixel) * scale
-            width = np.hypot(FILTER_PX * level.camera.width / 640 * pixel, 0.015)
+            width = np.hypot(FILTER_PX * scale * pixel, 0.015)
             variance = (config.sensor.sigma(z) * pixel) ** 2 / (8 * np.pi * width**4)
             variance += 2 * (2 / 3) ** 2 * step**2 / 12 / 0.03**2
             distances += stride**2 * w * variance * J.T @ J

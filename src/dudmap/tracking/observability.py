@@ -11,8 +11,8 @@ from dudmap.kernels.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, nois
 from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 
 FILTER_PX = 4.0
-"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
-gradient noise of the distances is computed."""
+"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of the image that is filtered, with which
+the gradient noise of the distances is computed."""
 INTENSITY_SIGMA = 1 / 255
 """Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
@@ -158,7 +158,7 @@ def gradient_noise(
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
-    sums, numbers = np.zeros(NUM_SUMS), (FILTER_PX * camera.width / 640, scale, voxel_size, INTERPOLATED, STEEPEST)
+    sums, numbers = np.zeros(NUM_SUMS), (FILTER_PX * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
     noise_sums(
         stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
         *numbers, sums,
