@@ -49,8 +49,7 @@ def test_a_row_of_points_finds_what_each_of_them_finds(grid):
         np.ravel_multi_index(tuple(blocks.T), tuple(SHAPE)).astype(np.int32),
         np.ravel_multi_index(tuple(voxels.T), (8, 8, 8)).astype(np.int32),
         (voxels == 7).any(axis=1).astype(np.int32),
-        np.empty(w + 1, dtype=np.int32),
-        np.empty((w, 8), dtype=np.int64),
+        np.empty(w + LANES, dtype=np.int32),
         words,
     )
     assert (words.T == [around(dense, *point) for point in points]).all()

@@ -2,13 +2,12 @@
 
 For two thirds of all points one block holds all eight. A branch on that is mispredicted for every third point. A single
 point therefore always takes eight look-ups; of a row of points, those of the other third are listed first, without a
-branch.
+branch, and both kinds are loaded by vector instructions.
 """
 
 import numpy as np
 
-from dudmap.kernels.gathers import LANES, load_voxels
-from dudmap.kernels.memory import prefetch
+from dudmap.kernels.gathers import LANES, load_voxels, load_voxels_of_blocks
 from dudmap.kernels.threads import kernel, scalar
 
 
@@ -83,11 +82,10 @@ def locate(x, y, z, last, size_y, size_z):
 
 
 @kernel
-def load_row(window, shape, geometry, cells, voxels, crossing, outer, corners, words):
+def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
-    Those of points with all eight in one block come by vector loads; those of the others, a third, are looked up one by
-    one, all addresses before the first load.
+    Those of the points, a third, whose eight voxels lie in several blocks are looked up on their own.
 
     Args:
         window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
@@ -96,48 +94,16 @@ def load_row(window, shape, geometry, cells, voxels, crossing, outer, corners, w
         cells: (w,) int32, cell of the window that holds the point; w is a multiple of ``LANES``.
         voxels: (w,) int32, number within the block of the voxel at its lower corner.
         crossing: (w,) int32, 1 where the eight voxels lie in more than one block, 0 elsewhere.
-        outer, corners: (w + 1,) int32, (w, 8) int64, work space.
+        outer: (w + LANES,) int32, work space.
         words: (8, w) int32 out, corner 4 dx + 2 dy + dz.
     """
-    num_outer = np.uintp(0)
+    flat, num_outer = words.reshape(-1), np.uintp(0)
     for u in range(len(cells)):
         outer[num_outer] = u
         num_outer += np.uintp(crossing[u])
-    for n in range(num_outer):
-        u = np.uintp(outer[n])
-        _find_corners(window, np.int64(cells[u]), np.int64(voxels[u]), shape[1], shape[2], corners[n])
-        for i in range(8):
-            prefetch(geometry, np.uintp(max(corners[n, i], 0)))
-    flat = words.reshape(-1)
     for start in range(0, len(cells), LANES):
         load_voxels(window, geometry, cells, voxels, crossing, start, flat, len(cells))
-    for n in range(num_outer):
-        k = np.uintp(outer[n])
-        for i in range(8):
-            flat[k] = _word(geometry, corners[n, i])
-            k += np.uintp(len(cells))
-
-
-@kernel
-def _find_corners(window, cell, voxel, size_y, size_z, positions):
-    """Write the indices of the eight voxels from ``voxel`` of the block in ``cell`` upwards; -1 = unknown."""
-    x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3  # 1 where the next crosses
-    to_x, to_y, to_z = x * size_y * size_z, y * size_z, z
-    step_x, step_y, step_z = 64 - 512 * x, 8 - 64 * y, 1 - 8 * z
-    for i in range(2):
-        for j in range(2):
-            c, n = cell + i * to_x + j * to_y, voxel + i * step_x + j * step_y
-            positions[4 * i + 2 * j] = _position(np.int64(window[np.uintp(c)]), n)
-            positions[4 * i + 2 * j + 1] = _position(np.int64(window[np.uintp(c + to_z)]), n + step_z)
-
-
-@kernel
-def _position(slot, voxel):
-    """Index of a voxel of a slot; -1 if there is no slot."""
-    return slot * 512 + voxel if slot >= 0 else np.int64(-1)
-
-
-@kernel
-def _word(geometry, position):
-    """Word of a voxel, 0 at index -1; the load does not depend on the test of the index."""
-    return geometry[np.uintp(max(position, 0))] & np.int32(~(position >> 63))
+    if num_outer > 0:
+        outer[num_outer : num_outer + np.uintp(LANES)] = outer[num_outer - np.uintp(1)]
+    for start in range(0, num_outer, LANES):
+        load_voxels_of_blocks(window, shape[1], shape[2], geometry, cells, voxels, outer, start, flat, len(cells))

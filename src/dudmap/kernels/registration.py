@@ -50,9 +50,7 @@ def linearize_rows(
     w = depth.shape[1]
     padded = -(-w // LANES) * LANES
     cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
-    outer = np.empty(padded + 1, np.int32)
-    corners = np.empty((padded, 8), np.int64)
-    words = np.empty((8, padded), np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
     fx = np.empty(w, np.float32)
     fy = np.empty(w, np.float32)
     fz = np.empty(w, np.float32)
@@ -84,7 +82,7 @@ def linearize_rows(
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
             inside[u] = one if ok else zero
 
-        load_row(window, shape, geometry, cells, voxels, crossing, outer, corners, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero

@@ -52,8 +52,8 @@ def sample_rows(
     nan, half, zero = f32(np.nan), f64(0.5), f64(0)
     padded = -(-w // LANES) * LANES
     cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
-    outer, corners = np.empty(padded + 1, np.int32), np.empty((padded, 8), np.int64)
-    words, slots = np.empty((8, padded), np.int32), np.empty(w, np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    slots = np.empty(w, np.int32)
     fractions, inside = np.empty((3, w), np.float32), np.empty(w, np.bool_)
     last, size_y, size_z = last_corner(shape), shape[1], shape[2]
     t = elements(T)
@@ -66,7 +66,7 @@ def sample_rows(
             crossing[u] = crosses if within else np.int32(0)
             fractions[0, u], fractions[1, u], fractions[2, u] = ax, ay, az
             inside[u] = within & (z > f32(0))
-        load_row(window, shape, geometry, cells, voxels, crossing, outer, corners, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
         for u in range(w):
             slots[u] = window[np.uintp(cells[u])] if inside[u] else np.int32(-1)
         for u in range(w):
