@@ -41,7 +41,7 @@ PIXEL_ROWS = 60
 """Image rows of one band of loops over pixels that are cheaper."""
 TILE_ROWS = 15
 """Rows of tiles, or of strided pixels, of one band."""
-PIXELS_PER_BAND = 4800
+PIXELS_PER_BAND = 9600
 """Pixels of one band of a linearisation; the coarsest level is one band."""
 BLOCKS_PER_BAND = 256
 """Blocks of one band of the fusion."""
