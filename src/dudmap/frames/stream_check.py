@@ -1,5 +1,6 @@
 """Recognition of frames that a sensor or a driver has spoilt: wrong stamps, repeated images, a changed unit."""
 
+import statistics
 from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
@@ -129,7 +130,7 @@ class StreamCheck:
 
     @property
     def _usual_interval(self) -> float:
-        return float(np.median(self._intervals)) if self._intervals else 0.0
+        return statistics.median(self._intervals) if self._intervals else 0.0
 
     # -- images --------------------------------------------------------------------------------------------------------
 

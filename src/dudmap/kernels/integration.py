@@ -14,7 +14,7 @@ CACHE_LINE = 16
 
 @kernel
 def used_readings(depth, used, farthest, out):
-    """Readings of ``depth`` (H, W) float32 up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0."""
+    """Readings of ``depth`` (H, W) up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0."""
     source, chosen, target = depth.reshape(-1), used.reshape(-1), out.reshape(-1)
     for n in range(source.size):
         z = source[n]
