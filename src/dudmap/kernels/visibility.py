@@ -94,19 +94,27 @@ def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
         depth: (H, W) float32.
         nearest, farthest, valid: (ceil(H / TILE), ceil(W / TILE)) float32 out; no reading gives inf, 0, 0.
     """
+    h, w = depth.shape
+    zero, one, none = np.float32(0), np.float32(1), np.float32(np.inf)
+    near, far, count = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for ty in range(row_start, row_stop):
+        first, last = ty * TILE, min(ty * TILE + TILE, h)
+        near[:], far[:], count[:] = none, zero, zero
+        for v in range(first, last):
+            row = depth[v]
+            for u in range(w):
+                z = row[u]
+                near[u] = min(near[u], z if z > zero else none)
+                far[u] = max(far[u], z)
+                count[u] += one if z > zero else zero
         for tx in range(nearest.shape[1]):
-            near, far, count, total = np.float32(np.inf), np.float32(0), 0, 0
-            for v in range(ty * TILE, min(ty * TILE + TILE, depth.shape[0])):
-                for u in range(tx * TILE, min(tx * TILE + TILE, depth.shape[1])):
-                    z = depth[v, u]
-                    total += 1
-                    if z > 0:
-                        count += 1
-                        near = min(near, z)
-                        far = max(far, z)
-            nearest[ty, tx], farthest[ty, tx] = near, far
-            valid[ty, tx] = np.float32(count) / np.float32(total)
+            left, right = tx * TILE, min(tx * TILE + TILE, w)
+            lowest, highest, readings = none, zero, zero
+            for u in range(left, right):
+                lowest, highest = min(lowest, near[u]), max(highest, far[u])
+                readings += count[u]
+            nearest[ty, tx], farthest[ty, tx] = lowest, highest
+            valid[ty, tx] = readings / np.float32((right - left) * (last - first))
 
 
 @kernel
