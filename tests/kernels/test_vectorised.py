@@ -31,7 +31,7 @@ FEWEST = {
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
     (labeling, "mean_field"): {"loops": 1},
     (filtering, "bilateral"): {"loops": 2, "fma": 3, "packed": 28},
-    (filtering, "fill_holes"): {"loops": 4, "packed": 8},
+    (filtering, "fill_holes"): {"loops": 2, "packed": 12},
     (filtering, "limit_depth"): {"loops": 1},
     (filtering, "pad"): {"loops": 1},
     (filtering, "intensities"): {"loops": 1, "fma": 2, "packed": 3, "converted": 2},

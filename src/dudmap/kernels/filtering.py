@@ -108,25 +108,27 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
         out: (H, W) float32 out.
     """
     h, w = depth.shape
-    outside = np.zeros(w, np.float32)
     line = np.zeros(w + 2 * LONGEST_RUN, np.float32)
     holes = np.empty(w, np.uint8)
+    zero, one = np.float32(0), np.float32(1)
     for v in range(row_start, row_stop):
-        out[v] = depth[v]
-        line[LONGEST_RUN : LONGEST_RUN + w] = depth[v]
-        above = depth[v - 1] if v > 0 else outside
-        above2, above3 = depth[v - 2] if v > 1 else outside, depth[v - 3] if v > 2 else outside
-        below = depth[v + 1] if v + 1 < h else outside
-        below2, below3 = depth[v + 2] if v + 2 < h else outside, depth[v + 3] if v + 3 < h else outside
+        row, target = depth[v], out[v]
+        for u in range(w):
+            line[np.uintp(u + LONGEST_RUN)] = target[u] = row[u]
+        above, above2, above3 = depth[max(v - 1, 0)], depth[max(v - 2, 0)], depth[max(v - 3, 0)]
+        below, below2, below3 = depth[min(v + 1, h - 1)], depth[min(v + 2, h - 1)], depth[min(v + 3, h - 1)]
+        # rows outside the image have no reading
+        i1, i2, i3 = one if v > 0 else zero, one if v > 1 else zero, one if v > 2 else zero
+        j1, j2, j3 = one if v + 1 < h else zero, one if v + 2 < h else zero, one if v + 3 < h else zero
         for u in range(w):
             k = np.uintp(u)
             a1, a2, a3 = line[np.uintp(u + 2)], line[np.uintp(u + 1)], line[k]
             b1, b2, b3 = line[np.uintp(u + 4)], line[np.uintp(u + 5)], line[np.uintp(u + 6)]
             in_row = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
-            in_column = is_small_hole(
-                above[k], above2[k], above3[k], below[k], below2[k], below3[k], slope, noise_floor
-            )
-            holes[k] = (line[np.uintp(u + 3)] <= 0) & (in_row | in_column)
+            a1, a2, a3 = i1 * above[k], i2 * above2[k], i3 * above3[k]
+            b1, b2, b3 = j1 * below[k], j2 * below2[k], j3 * below3[k]
+            in_column = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
+            holes[k] = (line[np.uintp(u + 3)] <= zero) & (in_row | in_column)
         for u in range(w):
             if holes[u] == 0:
                 continue
