@@ -34,7 +34,7 @@ class RegionStore:
         connection.execute("PRAGMA synchronous = OFF")
         columns = ", ".join(f"{name} BLOB" for name in COLUMNS)
         connection.execute(f"CREATE TABLE regions (x INTEGER, y INTEGER, z INTEGER, {columns}, PRIMARY KEY (x, y, z))")
-        self.close = weakref.finalize(self, _remove, connection, folder)
+        self.close = weakref.finalize(self, _remove, connection, self._lock, folder)
 
     def write(self, region: tuple[int, int, int], records: BlockRecords) -> None:
         """Store a region, in place of what was stored of it.
@@ -94,6 +94,7 @@ def records_of(blobs: Sequence[bytes]) -> BlockRecords:
     return records
 
 
-def _remove(connection: sqlite3.Connection, folder: tempfile.TemporaryDirectory) -> None:
-    connection.close()
+def _remove(connection: sqlite3.Connection, lock: threading.Lock, folder: tempfile.TemporaryDirectory) -> None:
+    with lock:  # a connection that is closed while another thread uses it ends the process
+        connection.close()
     folder.cleanup()
