@@ -134,6 +134,15 @@ class VolumeConfig(ConfigSection):
     """Weight of a free-space observation in a voxel that holds a surface."""
     free_after: int = Field(default=4, ge=1, le=200)
     """Number of free-space observations after which a block counts as free space."""
+    adaptive: bool = False
+    """Smaller voxels where the surface is curved or finely coloured and the sensor resolves it (thesis section 7.1)."""
+    adaptive_levels: int = Field(default=1, ge=1, le=2)
+    """How often the voxel size may be halved: once, or twice (adaptive only)."""
+    adaptive_bend: float = Field(default=0.1, gt=0)
+    """Curvature of the surface from which on voxels are halved, times the voxel size (adaptive only): 0.1 is a radius
+    of ten voxels."""
+    adaptive_texture: float = Field(default=0.2, gt=0)
+    """Bend of the intensities (0..1) between neighbouring voxels from which on they are halved (adaptive only)."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":

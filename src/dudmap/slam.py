@@ -24,6 +24,7 @@ from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.gpu.device import make_backend
+from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
@@ -482,6 +483,6 @@ class Slam:
 
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.config.device)
-        return TsdfVolume(
+        return make_volume(
             self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
         )

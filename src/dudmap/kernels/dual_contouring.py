@@ -1,0 +1,474 @@
+"""Surface of a map with several voxel sizes by dual contouring (Ju et al. 2002).
+
+Each cell that the surface crosses has one vertex, and each edge of the smallest cells whose ends have different signs a
+polygon of the vertices of the cells around it: four, or three where a larger cell takes the place of two. All cells see
+the same field (``octree_field.py``), so an even number of edges around each face of a cell changes its sign, and the
+surface is closed wherever the field is known, across levels too.
+
+A vertex minimises the squared distances to the tangent planes at the crossings of its cell. The gradients in a cell
+with a sharp edge mix the surfaces on both sides of it, and say little. There the planes come from crossings up to two
+cells away, weighed by how little the gradient changes along the edge of the lattice (compare the feature-sensitive
+extraction of Kobbelt et al. 2001); the vertex then lies on the edge, where these planes meet.
+"""
+
+import numpy as np
+
+from dudmap.kernels.octree_field import PAD, SPAN, fill, finest_level
+from dudmap.kernels.threads import kernel
+
+f32 = np.float32
+CELL_BITS = 18
+"""Bits of the number of a cell within its block: three times six, for 8 x 4 cells along an edge."""
+SMOOTH = f32(0.966)
+"""Cosine of 15 degrees: where a normal of a cell is farther than this from their mean, the cell may hold an edge."""
+OWN_DAMPING, FEATURE_DAMPING = f32(0.1), f32(0.02)
+"""Weight of the mean crossing relative to that of the planes; with two planes at a right angle, which give half of the
+weight to each direction, a vertex reaches 96 % of the way to their edge."""
+AGREEMENT = f32(0.01)
+"""One minus the cosine of the change of the gradient along a lattice edge at which the weight of its plane falls to
+1/e: 8 degrees."""
+MIN_PLANES = f32(4)
+"""Sum of the weights of the planes below which they are too few to place a vertex by."""
+OUTSIDE = f32(0.25)
+"""Cells that a vertex may lie outside of its cell; else the edge passes through another cell."""
+
+
+@kernel
+def _gradient(field, size, n, step, out):
+    """Gradient, times the lattice spacing, at point ``n``: central differences, one-sided beside unknown points."""
+    here = field[n]
+    for axis in range(3):
+        stride = step * (size * size if axis == 0 else (size if axis == 1 else 1))
+        high, low = field[n + stride], field[n - stride]
+        has_high, has_low = not np.isnan(high), not np.isnan(low)
+        if has_high and has_low:
+            out[axis] = f32(0.5) * (high - low)
+        elif has_high:
+            out[axis] = high - here
+        elif has_low:
+            out[axis] = here - low
+        else:
+            out[axis] = f32(0)
+    return np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
+
+
+@kernel
+def _plane(field, size, a, b, t, step, ga, gb, normal):
+    """Normal between points ``a`` and ``b``, and the cosine between the gradients there; 0 without a gradient."""
+    la, lb = _gradient(field, size, a, step, ga), _gradient(field, size, b, step, gb)
+    if la <= f32(0) or lb <= f32(0):
+        return f32(0)
+    agreement = (ga[0] * gb[0] + ga[1] * gb[1] + ga[2] * gb[2]) / (la * lb)
+    square = f32(1e-20)
+    for axis in range(3):
+        normal[axis] = ga[axis] + (gb[axis] - ga[axis]) * t
+        square += normal[axis] * normal[axis]
+    scale = f32(1) / np.sqrt(square)
+    for axis in range(3):
+        normal[axis] *= scale
+    return max(agreement, f32(1e-6))
+
+
+@kernel
+def _solve(A, b, damping, out):
+    """Solution of (A + damping I) x = b for a symmetric A = (xx, xy, xz, yy, yz, zz)."""
+    a00, a01, a02, a11, a12, a22 = A[0] + damping, A[1], A[2], A[3] + damping, A[4], A[5] + damping
+    c00, c01, c02 = a11 * a22 - a12 * a12, a02 * a12 - a01 * a22, a01 * a12 - a02 * a11
+    det = a00 * c00 + a01 * c01 + a02 * c02
+    c11, c12, c22 = a00 * a22 - a02 * a02, a01 * a02 - a00 * a12, a00 * a11 - a01 * a01
+    by = f32(1) / det
+    out[0] = (c00 * b[0] + c01 * b[1] + c02 * b[2]) * by
+    out[1] = (c01 * b[0] + c11 * b[1] + c12 * b[2]) * by
+    out[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) * by
+
+
+@kernel
+def _add_plane(A, b, weight, normal, offset):
+    """Add weight (n . x - offset)^2 to a quadratic form."""
+    k = 0
+    for i in range(3):
+        b[i] += weight * normal[i] * offset
+        for j in range(i, 3):
+            A[k] += weight * normal[i] * normal[j]
+            k += 1
+
+
+@kernel
+def _own_crossings(field, size, x, y, z, edge, work):
+    """Crossings on the surface of a cell, with their normals, into the rows of ``work``: point and normal.
+
+    Args:
+        field, size: Field of the lattice, and its points along an edge.
+        x, y, z: First point of the cell.
+        edge: Lattice steps along an edge of the cell.
+        work: (n, 6) float32 out.
+
+    Returns:
+        Number of crossings.
+    """
+    count = 0
+    ga, gb, normal = np.empty(3, f32), np.empty(3, f32), np.empty(3, f32)
+    for axis in range(3):
+        stride = size * size if axis == 0 else (size if axis == 1 else 1)
+        sb = size if axis == 0 else size * size
+        sc = size if axis == 2 else 1
+        first = (x * size + y) * size + z
+        for b in range(edge + 1):
+            for c in range(edge + 1):
+                if 0 < b < edge and 0 < c < edge:
+                    continue
+                for a in range(edge):
+                    p = first + a * stride + b * sb + c * sc
+                    fp, fq = field[p], field[p + stride]
+                    if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0):
+                        continue
+                    t = fp / (fp - fq)
+                    if _plane(field, size, p, p + stride, t, edge, ga, gb, normal) <= f32(0) or count == len(work):
+                        continue
+                    row = work[count]
+                    row[0], row[1], row[2] = f32(0), f32(0), f32(0)
+                    row[axis] = f32(a) + t
+                    row[1 if axis == 0 else 0] = f32(b)
+                    row[1 if axis == 2 else 2] = f32(c)
+                    for i in range(3):
+                        row[3 + i] = normal[i]
+                    count += 1
+    return count
+
+
+@kernel
+def _feature(field, size, x, y, z, edge, middle, out):
+    """Place of a vertex by the planes of crossings up to two cells away, relative to the cell; False if there is none.
+
+    Args:
+        field, size, x, y, z, edge: As of ``_own_crossings``.
+        middle: (3,) mean crossing of the cell, relative to it.
+        out: (3,) float32.
+    """
+    ga, gb, normal = np.empty(3, f32), np.empty(3, f32), np.empty(3, f32)
+    A, b = np.zeros(6, f32), np.zeros(3, f32)
+    total = f32(0)
+    offset = np.empty(3, f32)
+    reach = f32(1) / f32(8 * edge * edge)  # a Gaussian of two cells
+    for axis in range(3):
+        step = edge * (size * size if axis == 0 else (size if axis == 1 else 1))
+        for i in range(-2, 4):
+            for j in range(-2, 4):
+                for k in range(-2, 4):
+                    if (i if axis == 0 else (j if axis == 1 else k)) == 3:
+                        continue
+                    px, py, pz = x + i * edge, y + j * edge, z + k * edge
+                    ahead = (edge if axis == 0 else 0, edge if axis == 1 else 0, edge if axis == 2 else 0)
+                    last = max(px + ahead[0], py + ahead[1], pz + ahead[2]) + edge
+                    if min(px, py, pz) < edge or last >= size:
+                        continue
+                    p = (px * size + py) * size + pz
+                    fp, fq = field[p], field[p + step]
+                    if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0):
+                        continue
+                    t = fp / (fp - fq)
+                    agreement = _plane(field, size, p, p + step, t, edge, ga, gb, normal)
+                    offset[0], offset[1], offset[2] = f32(i * edge), f32(j * edge), f32(k * edge)
+                    offset[axis] += t * f32(edge)
+                    square, along = f32(0), f32(0)
+                    for m in range(3):
+                        d = offset[m] - middle[m]
+                        square += d * d
+                        along += d * normal[m]
+                    weight = np.exp((agreement - f32(1)) / AGREEMENT - square * reach)
+                    _add_plane(A, b, weight, normal, along)
+                    total += weight
+    if total < MIN_PLANES:
+        return False
+    _solve(A, b, FEATURE_DAMPING * total, out)
+    for m in range(3):
+        out[m] += middle[m]
+        if not (-OUTSIDE * edge <= out[m] <= (f32(1) + OUTSIDE) * edge):
+            return False
+    return True
+
+
+@kernel
+def _vertex(field, size, x, y, z, edge, work, out):
+    """Vertex of a cell: place relative to its first point in lattice steps, and normal, into ``out`` (6,).
+
+    Returns:
+        Whether the surface crosses the cell.
+    """
+    count = _own_crossings(field, size, x, y, z, edge, work)
+    if count == 0:
+        return False
+    middle, mean = np.zeros(3, f32), np.zeros(3, f32)
+    for n in range(count):
+        for i in range(3):
+            middle[i] += work[n, i]
+            mean[i] += work[n, 3 + i]
+    length = np.sqrt(mean[0] * mean[0] + mean[1] * mean[1] + mean[2] * mean[2]) + f32(1e-12)
+    for i in range(3):
+        middle[i] /= f32(count)
+        mean[i] /= length
+        out[3 + i] = mean[i]
+    A, b = np.zeros(6, f32), np.zeros(3, f32)
+    closest = f32(1)
+    for n in range(count):
+        normal = work[n, 3:]
+        along, cosine = f32(0), f32(0)
+        for i in range(3):
+            along += (work[n, i] - middle[i]) * normal[i]
+            cosine += normal[i] * mean[i]
+        closest = min(closest, cosine)
+        _add_plane(A, b, f32(1), normal, along)
+    place = out[:3]
+    if closest < SMOOTH and _feature(field, size, x, y, z, edge, middle, place):
+        return True
+    _solve(A, b, OWN_DAMPING * f32(count), place)
+    for i in range(3):
+        place[i] = min(max(place[i] + middle[i], f32(0)), f32(edge))
+    return True
+
+
+@kernel
+def _is_known(field, size, x, y, z, edge, jump):
+    """Whether all corners of a cell are known and the distance changes by no more than ``jump`` between them."""
+    low, high = f32(np.inf), f32(-np.inf)
+    for m in range(8):
+        value = field[((x + edge * (m >> 2)) * size + y + edge * ((m >> 1) & 1)) * size + z + edge * (m & 1)]
+        if np.isnan(value):
+            return False
+        low, high = min(low, value), max(high, value)
+    return high - low <= jump
+
+
+@kernel
+def _cell_key(x, y, z, top, rows):
+    """Number of the cell at lattice point (x, y, z): row of its block << CELL_BITS | its place there; -1 = no block."""
+    edge, pad = 8 << top, PAD << top
+    i, j, k = x - pad, y - pad, z - pad
+    bx, by, bz = (i + edge) // edge, (j + edge) // edge, (k + edge) // edge
+    row = rows[9 * bx + 3 * by + bz]
+    if row < 0:
+        return np.int64(-1)
+    i, j, k = i - (bx - 1) * edge, j - (by - 1) * edge, k - (bz - 1) * edge
+    finer = 2 - top
+    return (np.int64(row) << CELL_BITS) | (((i << finer) << 12) | ((j << finer) << 6) | (k << finer))
+
+
+@kernel
+def _mixed_color(near, children1, children2, colors0, colors1, colors2, top, x, y, z, edge, place, out):
+    """Colour (3,) uint8 at a place of a cell: mean of the corners that have one, weighed trilinearly."""
+    total = f32(0)
+    sums = np.zeros(3, f32)
+    width, pad = 8 << top, PAD << top
+    for m in range(8):
+        i, j, k = x + edge * (m >> 2) - pad, y + edge * ((m >> 1) & 1) - pad, z + edge * (m & 1) - pad
+        weight = f32(1e-3)
+        wx, wy, wz = place[0] / f32(edge), place[1] / f32(edge), place[2] / f32(edge)
+        weight += (wx if m >> 2 else f32(1) - wx) * (wy if (m >> 1) & 1 else f32(1) - wy) * (wz if m & 1 else f32(1) - wz)
+        bx, by, bz = (i + width) // width, (j + width) // width, (k + width) // width
+        slot = near[9 * bx + 3 * by + bz]
+        if slot < 0:
+            continue
+        i, j, k = i - (bx - 1) * width, j - (by - 1) * width, k - (bz - 1) * width
+        color = np.int32(0)
+        if top == 0 or ((i | j | k) & ((1 << top) - 1)) == 0:
+            color = colors0[slot, (((i >> top) << 3) + (j >> top)) * 8 + (k >> top)]
+        if top > 0 and slot < len(children1):
+            half = width >> 1
+            child = children1[slot, 4 * (i // half) + 2 * (j // half) + k // half]
+            if child >= 0:
+                i, j, k = i % half, j % half, k % half
+                shift = top - 1
+                if ((i | j | k) & ((1 << shift) - 1)) == 0:
+                    found = colors1[child, (((i >> shift) << 3) + (j >> shift)) * 8 + (k >> shift)]
+                    color = found if found != 0 else color
+                if top == 2 and child < len(children2):
+                    small = children2[child, 4 * (i >> 3) + 2 * (j >> 3) + (k >> 3)]
+                    if small >= 0:
+                        found = colors2[small, (((i & 7) << 3) + (j & 7)) * 8 + (k & 7)]
+                        color = found if found != 0 else color
+        if color == 0 or weight <= f32(0):
+            continue
+        total += weight
+        for channel in range(3):
+            sums[channel] += weight * f32((color >> (20 - 10 * channel)) & 1023)
+    for channel in range(3):
+        value = f32(0.25) * sums[channel] / max(total, f32(1e-6)) + f32(0.5)
+        out[channel] = np.uint8(min(value, f32(255)))
+
+
+@kernel
+def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, work, keys, places, colors, count):
+    """Vertices of the cells of a block; the new number of vertices. See ``contour_blocks``."""
+    children1, children2, colors0, colors1, colors2 = tree
+    cells, size, pad, width = SPAN << top, (SPAN << top) + 1, PAD << top, 8 << top
+    vertex = np.empty(6, f32)
+    for i in range(width):
+        for j in range(width):
+            for k in range(width):
+                x, y, z = i + pad, j + pad, k + pad
+                level = levels[(x * cells + y) * cells + z]
+                edge = 1 << (top - level)
+                if (i | j | k) & (edge - 1):
+                    continue
+                if not _is_known(field, size, x, y, z, edge, jump / f32(1 << level)):
+                    continue
+                if not _vertex(field, size, x, y, z, edge, work, vertex):
+                    continue
+                finer = 2 - top
+                keys[count] = (np.int64(row) << CELL_BITS) | (((i << finer) << 12) | ((j << finer) << 6) | (k << finer))
+                place = places[count]
+                for axis in range(3):
+                    first = (i if axis == 0 else (j if axis == 1 else k)) + width * np.int64(coords[axis])
+                    place[axis] = f32(spacing * (np.float64(first) + np.float64(vertex[axis])))
+                    place[3 + axis] = vertex[3 + axis]
+                _mixed_color(
+                    near, children1, children2, colors0, colors1, colors2, top, x, y, z, edge, vertex, colors[count]
+                )
+                count += 1
+    return count
+
+
+@kernel
+def _block_polygons(field, levels, rows, top, jump, polygons, count):
+    """Polygons around the edges that begin in a block; the new number of polygons. See ``contour_blocks``."""
+    cells, size, pad, width = SPAN << top, (SPAN << top) + 1, PAD << top, 8 << top
+    corner = np.empty((4, 3), np.int64)
+    ring = np.empty(4, np.int64)
+    for i in range(width):
+        for j in range(width):
+            for k in range(width):
+                x, y, z = i + pad, j + pad, k + pad
+                p = (x * size + y) * size + z
+                if np.isnan(field[p]):
+                    continue
+                for axis in range(3):
+                    finest = 0
+                    for m in range(4):  # counter-clockwise, seen from the end of the edge
+                        b, c = (-1 if m == 0 or m == 3 else 0), (-1 if m < 2 else 0)
+                        corner[m, axis] = x if axis == 0 else (y if axis == 1 else z)
+                        corner[m, (axis + 1) % 3] = (y if axis == 0 else (z if axis == 1 else x)) + b
+                        corner[m, (axis + 2) % 3] = (z if axis == 0 else (x if axis == 1 else y)) + c
+                        finest = max(finest, levels[(corner[m, 0] * cells + corner[m, 1]) * cells + corner[m, 2]])
+                    step = 1 << (top - finest)
+                    if (i | j | k) & (step - 1):
+                        continue
+                    other = field[p + step * (size * size if axis == 0 else (size if axis == 1 else 1))]
+                    if np.isnan(other) or (other < 0) == (field[p] < 0):
+                        continue
+                    complete = True
+                    for m in range(4):
+                        cx, cy, cz = corner[m, 0], corner[m, 1], corner[m, 2]
+                        level = levels[(cx * cells + cy) * cells + cz]
+                        edge = 1 << (top - level)
+                        cx, cy, cz = cx & ~(edge - 1), cy & ~(edge - 1), cz & ~(edge - 1)
+                        complete &= _is_known(field, size, cx, cy, cz, edge, jump / f32(1 << level))
+                        ring[m] = _cell_key(cx, cy, cz, top, rows)
+                        complete &= ring[m] >= 0
+                    if not complete:
+                        continue
+                    for m in range(4):
+                        polygons[count, m] = ring[m if field[p] < 0 else 3 - m]
+                    count += 1
+    return count
+
+
+@kernel
+def contour_blocks(
+    start, stop, slots, near, rows, meshed, coords, geometry0, geometry1, geometry2, children1, children2, colors0,
+    colors1, colors2, least, unit, voxel_size, jump,
+):  # fmt: skip
+    """Vertices and polygons of blocks ``start`` to ``stop`` of the coarsest level.
+
+    Args:
+        start, stop: Range of blocks.
+        slots: (n,) int32.
+        near: (n, 27) int32 slots of the blocks and their neighbours.
+        rows: (n, 27) int32 rows of ``slots`` that hold these neighbours; -1 = none.
+        meshed: (n,) bool, whether the polygons of a block are wanted; its vertices always are.
+        coords: (n, 3) int32 coordinates of the blocks.
+        geometry0, geometry1, geometry2, colors0, colors1, colors2: (slots, 512) int32 by level.
+        children1, children2: (slots, 8) int32.
+        least: Smallest trusted weight, at least 1.
+        unit: Metres per step of a stored distance.
+        voxel_size: Of the coarsest level, metres.
+        jump: Largest change of the distance within a coarsest cell, metres.
+
+    Returns:
+        Keys (v,) int64 of the vertices, ascending; places and normals (v, 6) float32, metres, world frame; colours (v,
+        3) uint8; keys (p, 4) int64 of the polygons, two of them equal in a triangle; their blocks (p,) int32.
+    """
+    top = 0
+    for row in range(start, stop):
+        top = max(top, finest_level(near[row], children1, children2))
+    sizes = (SPAN + 1, (SPAN << 1) + 1 if top > 0 else 1, (SPAN << 2) + 1 if top > 1 else 1)
+    buffers = (np.empty(sizes[0] ** 3, f32), np.empty(sizes[1] ** 3, f32), np.empty(sizes[2] ** 3, f32))
+    levels = np.empty((SPAN << top) ** 3, np.uint8)
+    work = np.empty((192, 6), f32)
+    tree = (children1, children2, colors0, colors1, colors2)
+    capacity = 1 << 12
+    keys, places = np.empty(capacity, np.int64), np.empty((capacity, 6), f32)
+    colors, polygons = np.empty((capacity, 3), np.uint8), np.empty((capacity, 4), np.int64)
+    owners = np.empty(capacity, np.int32)
+    num_vertices, num_polygons = 0, 0
+    for row in range(start, stop):
+        top = finest_level(near[row], children1, children2)
+        most = 512 << (3 * top)
+        if num_vertices + most > len(keys):
+            keys, places, colors = _longer(keys, num_vertices, most), _longer(places, num_vertices, most), _longer(colors, num_vertices, most)
+        if num_polygons + 3 * most > len(owners):
+            polygons, owners = _longer(polygons, num_polygons, 3 * most), _longer(owners, num_polygons, 3 * most)
+        fill(near[row], geometry0, geometry1, geometry2, children1, children2, least, unit, top, buffers, levels)
+        field = buffers[top]
+        spacing = voxel_size / (1 << top)
+        num_vertices = _block_vertices(
+            field, levels, near[row], row, top, jump, tree, coords[row], spacing, work, keys, places, colors, num_vertices
+        )
+        if meshed[row]:
+            before = num_polygons
+            num_polygons = _block_polygons(field, levels, rows[row], top, jump, polygons, num_polygons)
+            owners[before:num_polygons] = row
+    return (
+        keys[:num_vertices].copy(), places[:num_vertices].copy(), colors[:num_vertices].copy(),
+        polygons[:num_polygons].copy(), owners[:num_polygons].copy(),
+    )  # fmt: skip
+
+
+@kernel
+def _longer(array, used, more):
+    """Copy of an array with room for ``more`` rows after those in use."""
+    out = np.empty((2 * (used + more),) + array.shape[1:], array.dtype)
+    out[:used] = array[:used]
+    return out
+
+
+@kernel
+def split_polygons(polygons, vertices, faces):
+    """Triangles of polygons, cut along their shorter diagonal.
+
+    Args:
+        polygons: (p, 4) int32 vertices.
+        vertices: (v, 3) float32.
+        faces: (2 p, 3) int32 out.
+
+    Returns:
+        Number of triangles, and of those of each polygon (p,).
+    """
+    count = 0
+    each = np.zeros(len(polygons), np.int64)
+    for n in range(len(polygons)):
+        a, b, c, d = polygons[n, 0], polygons[n, 1], polygons[n, 2], polygons[n, 3]
+        ac, bd = f32(0), f32(0)
+        for axis in range(3):
+            ac += (vertices[a, axis] - vertices[c, axis]) ** 2
+            bd += (vertices[b, axis] - vertices[d, axis]) ** 2
+        before = count
+        for part in range(2):
+            if ac <= bd:
+                i, j, k = (a, b, c) if part == 0 else (a, c, d)
+            else:
+                i, j, k = (a, b, d) if part == 0 else (b, c, d)
+            if i != j and j != k and k != i:
+                faces[count, 0], faces[count, 1], faces[count, 2] = i, j, k
+                count += 1
+        each[n] = count - before
+    return count, each
