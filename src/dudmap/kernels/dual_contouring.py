@@ -20,17 +20,18 @@ f32 = np.float32
 CELL_BITS = 18
 """Bits of the number of a cell within its block: three times six, for 8 x 4 cells along an edge."""
 SMOOTH = f32(0.966)
-"""Cosine of 15 degrees: where a normal of a cell is farther than this from their mean, the cell may hold an edge."""
+"""Cosine of 15 degrees: where a normal of a cell is farther than this from their mean, or the gradients at the ends of a
+crossed lattice edge from each other, an edge of the surface may be near."""
 OWN_DAMPING, FEATURE_DAMPING = f32(0.1), f32(0.02)
 """Weight of the mean crossing relative to that of the planes; with two planes at a right angle, which give half of the
 weight to each direction, a vertex reaches 96 % of the way to their edge."""
 AGREEMENT = f32(0.01)
 """One minus the cosine of the change of the gradient along a lattice edge at which the weight of its plane falls to
 1/e: 8 degrees."""
-MIN_PLANES = f32(4)
+MIN_PLANES = f32(2)
 """Sum of the weights of the planes below which they are too few to place a vertex by."""
-OUTSIDE = f32(0.25)
-"""Cells that a vertex may lie outside of its cell; else the edge passes through another cell."""
+FIXED = f32(1e3)
+"""Weight that holds a coordinate of a vertex on a face of its cell, relative to that of the planes."""
 
 
 @kernel
@@ -95,13 +96,14 @@ def _add_plane(A, b, weight, normal, offset):
 
 @kernel
 def _own_crossings(field, size, x, y, z, edge, work):
-    """Crossings on the surface of a cell, with their normals, into the rows of ``work``: point and normal.
+    """Crossings on the surface of a cell, with their normals, into the rows of ``work``: point, normal, and cosine
+    between the gradients at the ends of the edge.
 
     Args:
         field, size: Field of the lattice, and its points along an edge.
         x, y, z: First point of the cell.
         edge: Lattice steps along an edge of the cell.
-        work: (n, 6) float32 out.
+        work: (n, 7) float32 out.
 
     Returns:
         Number of crossings.
@@ -123,7 +125,8 @@ def _own_crossings(field, size, x, y, z, edge, work):
                     if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0):
                         continue
                     t = fp / (fp - fq)
-                    if _plane(field, size, p, p + stride, t, edge, ga, gb, normal) <= f32(0) or count == len(work):
+                    agreement = _plane(field, size, p, p + stride, t, edge, ga, gb, normal)
+                    if agreement <= f32(0) or count == len(work):
                         continue
                     row = work[count]
                     row[0], row[1], row[2] = f32(0), f32(0), f32(0)
@@ -132,24 +135,27 @@ def _own_crossings(field, size, x, y, z, edge, work):
                     row[1 if axis == 2 else 2] = f32(c)
                     for i in range(3):
                         row[3 + i] = normal[i]
+                    row[6] = agreement
                     count += 1
     return count
 
 
 @kernel
-def _feature(field, size, x, y, z, edge, middle, out):
-    """Place of a vertex by the planes of crossings up to two cells away, relative to the cell; False if there is none.
+def _near_planes(field, size, x, y, z, edge, middle, planes):
+    """Planes of crossings up to two cells away: normal, offset from ``middle``, and weight, into rows of ``planes``.
 
     Args:
         field, size, x, y, z, edge: As of ``_own_crossings``.
         middle: (3,) mean crossing of the cell, relative to it.
-        out: (3,) float32.
+        planes: (n, 5) float32 out.
+
+    Returns:
+        Number of planes.
     """
     ga, gb, normal = np.empty(3, f32), np.empty(3, f32), np.empty(3, f32)
-    A, b = np.zeros(6, f32), np.zeros(3, f32)
-    total = f32(0)
     offset = np.empty(3, f32)
     reach = f32(1) / f32(8 * edge * edge)  # a Gaussian of two cells
+    count = 0
     for axis in range(3):
         step = edge * (size * size if axis == 0 else (size if axis == 1 else 1))
         for i in range(-2, 4):
@@ -164,7 +170,7 @@ def _feature(field, size, x, y, z, edge, middle, out):
                         continue
                     p = (px * size + py) * size + pz
                     fp, fq = field[p], field[p + step]
-                    if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0):
+                    if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0) or count == len(planes):
                         continue
                     t = fp / (fp - fq)
                     agreement = _plane(field, size, p, p + step, t, edge, ga, gb, normal)
@@ -175,21 +181,104 @@ def _feature(field, size, x, y, z, edge, middle, out):
                         d = offset[m] - middle[m]
                         square += d * d
                         along += d * normal[m]
-                    weight = np.exp((agreement - f32(1)) / AGREEMENT - square * reach)
-                    _add_plane(A, b, weight, normal, along)
-                    total += weight
-    if total < MIN_PLANES:
-        return False
-    _solve(A, b, FEATURE_DAMPING * total, out)
+                        planes[count, m] = normal[m]
+                    planes[count, 3] = along
+                    planes[count, 4] = np.exp((agreement - f32(1)) / AGREEMENT - square * reach)
+                    count += 1
+    return count
+
+
+@kernel
+def _meet(planes, count, scale, held, at, A, b, out):
+    """Where planes meet, relative to the point of their offsets; those farther than ``scale`` from ``out`` count less.
+
+    Args:
+        planes, count: As of ``_near_planes``.
+        scale: Lattice steps.
+        held, at: (3,) whether a coordinate is held, and where.
+        A, b: Work space.
+        out: (3,) float32 in and out.
+
+    Returns:
+        Sum of the weights.
+    """
+    A[:] = f32(0)
+    b[:] = f32(0)
+    total = f32(0)
+    by = f32(1) / scale
+    for n in range(count):
+        plane = planes[n]
+        r = (plane[0] * out[0] + plane[1] * out[1] + plane[2] * out[2] - plane[3]) * by
+        weight = plane[4] / (f32(1) + r * r)
+        _add_plane(A, b, weight, plane, plane[3])
+        total += weight
     for m in range(3):
-        out[m] += middle[m]
-        if not (-OUTSIDE * edge <= out[m] <= (f32(1) + OUTSIDE) * edge):
+        if held[m]:
+            A[0 if m == 0 else (3 if m == 1 else 5)] += FIXED * total
+            b[m] += FIXED * total * at[m]
+    if total > f32(0):
+        _solve(A, b, FEATURE_DAMPING * total, out)
+    return total
+
+
+@kernel
+def _feature(field, size, x, y, z, edge, middle, planes, out):
+    """Place of a vertex where the planes around meet, relative to the cell; False if there are too few.
+
+    The planes are reweighed by their distance from the vertex, so that one that passes by the cell has no say.
+
+    Args:
+        field, size, x, y, z, edge, middle, planes: As of ``_near_planes``.
+        out: (3,) float32.
+    """
+    count = _near_planes(field, size, x, y, z, edge, middle, planes)
+    A, b = np.empty(6, f32), np.empty(3, f32)
+    held, at = np.zeros(3, np.bool_), np.zeros(3, f32)
+    out[0] = out[1] = out[2] = f32(0)
+    scale = f32(edge)
+    for _ in range(4):
+        if _meet(planes, count, scale, held, at, A, b, out) < MIN_PLANES:
             return False
+        scale *= f32(0.5)
+    for m in range(3):
+        at[m] = out[m] + middle[m]
+    if _is_empty(field, size, x, y, z, edge, at):
+        out[:] = at
+        return True
+    for _ in range(3):  # within the cell: what lies outside is moved to its nearest face
+        worst, most = -1, f32(1e-3) * edge
+        for m in range(3):
+            beyond = max(-(out[m] + middle[m]), out[m] + middle[m] - edge)
+            if beyond > most and not held[m]:
+                worst, most = m, beyond
+        if worst < 0:
+            break
+        held[worst] = True
+        at[worst] = min(max(out[worst] + middle[worst], f32(0)), f32(edge)) - middle[worst]
+        _meet(planes, count, scale, held, at, A, b, out)
+    for m in range(3):
+        out[m] = min(max(out[m] + middle[m], f32(0)), f32(edge))
     return True
 
 
 @kernel
-def _vertex(field, size, x, y, z, edge, work, out):
+def _is_empty(field, size, x, y, z, edge, place):
+    """Whether a place lies in a cell beside that at (x, y, z) of which all corners have the same sign: an edge that
+    reaches into a cell between its corners, so that no vertex there can lie on it."""
+    i, j, k = np.int64(np.floor(place[0] / edge)), np.int64(np.floor(place[1] / edge)), np.int64(np.floor(place[2] / edge))
+    if max(abs(i), abs(j), abs(k)) != 1:
+        return False
+    negative = 0
+    for m in range(8):
+        n = ((x + edge * (i + (m >> 2))) * size + y + edge * (j + ((m >> 1) & 1))) * size + z + edge * (k + (m & 1))
+        if np.isnan(field[n]):
+            return False
+        negative += 1 if field[n] < 0 else 0
+    return negative == 0 or negative == 8
+
+
+@kernel
+def _vertex(field, size, x, y, z, edge, work, planes, out):
     """Vertex of a cell: place relative to its first point in lattice steps, and normal, into ``out`` (6,).
 
     Returns:
@@ -211,15 +300,17 @@ def _vertex(field, size, x, y, z, edge, work, out):
     A, b = np.zeros(6, f32), np.zeros(3, f32)
     closest = f32(1)
     for n in range(count):
-        normal = work[n, 3:]
+        normal = work[n, 3:6]
         along, cosine = f32(0), f32(0)
         for i in range(3):
             along += (work[n, i] - middle[i]) * normal[i]
             cosine += normal[i] * mean[i]
-        closest = min(closest, cosine)
+        closest = min(closest, min(cosine, work[n, 6]))
         _add_plane(A, b, f32(1), normal, along)
     place = out[:3]
-    if closest < SMOOTH and _feature(field, size, x, y, z, edge, middle, place):
+    if closest < SMOOTH:
+        if not _feature(field, size, x, y, z, edge, middle, planes, place):
+            place[:] = middle
         return True
     _solve(A, b, OWN_DAMPING * f32(count), place)
     for i in range(3):
@@ -301,7 +392,7 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
     """Vertices of the cells of a block; the new number of vertices. See ``contour_blocks``."""
     children1, children2, colors0, colors1, colors2 = tree
     cells, size, pad, width = SPAN << top, (SPAN << top) + 1, PAD << top, 8 << top
-    vertex = np.empty(6, f32)
+    vertex, planes = np.empty(6, f32), np.empty((540, 5), f32)
     for i in range(width):
         for j in range(width):
             for k in range(width):
@@ -312,7 +403,7 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
                     continue
                 if not _is_known(field, size, x, y, z, edge, jump / f32(1 << level)):
                     continue
-                if not _vertex(field, size, x, y, z, edge, work, vertex):
+                if not _vertex(field, size, x, y, z, edge, work, planes, vertex):
                     continue
                 finer = 2 - top
                 keys[count] = (np.int64(row) << CELL_BITS) | (((i << finer) << 12) | ((j << finer) << 6) | (k << finer))
@@ -403,7 +494,7 @@ def contour_blocks(
     sizes = (SPAN + 1, (SPAN << 1) + 1 if top > 0 else 1, (SPAN << 2) + 1 if top > 1 else 1)
     buffers = (np.empty(sizes[0] ** 3, f32), np.empty(sizes[1] ** 3, f32), np.empty(sizes[2] ** 3, f32))
     levels = np.empty((SPAN << top) ** 3, np.uint8)
-    work = np.empty((192, 6), f32)
+    work = np.empty((192, 7), f32)
     tree = (children1, children2, colors0, colors1, colors2)
     capacity = 1 << 12
     keys, places = np.empty(capacity, np.int64), np.empty((capacity, 6), f32)
