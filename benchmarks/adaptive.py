@@ -41,8 +41,8 @@ SYSTEMS = {
 }
 SPACING = 0.002
 """Distance between the sampled points of an edge, metres."""
-SEEN = 0.01
-"""Largest distance of a seen edge from the seen surface, metres."""
+BESIDE = 0.015
+"""Distance from an edge at which both of its faces must have been seen, metres."""
 
 
 class Fusion:
@@ -59,28 +59,34 @@ class Fusion:
 
 
 def edge_points(recording: SyntheticSequence) -> NDArray[np.float64]:
-    """Points (n, 3) on the edges of the boxes of a scene that border free space and were seen."""
-    points = []
+    """Points (n, 3) on the edges of the boxes of a scene of which both faces were seen."""
+    points, faces = [], []  # points, and beside each of them one on either face with its normal
     for primitive in recording.scene.primitives:
         if primitive.kind != BOX:
             continue
+        R, t = primitive.T_body_primitive[:3, :3], primitive.T_body_primitive[:3, 3]
         for axis in range(3):
-            others = [k for k in range(3) if k != axis]
-            half = primitive.half
-            line = np.arange(-half[axis], half[axis], SPACING)
+            a, b = (axis + 1) % 3, (axis + 2) % 3
+            half = np.asarray(primitive.half)
+            line = np.arange(-half[axis] + BESIDE, half[axis] - BESIDE, SPACING)
             for signs in ((-1, -1), (-1, 1), (1, -1), (1, 1)):
                 local = np.zeros((len(line), 3))
-                local[:, axis] = line
-                for k, sign in zip(others, signs, strict=True):
-                    local[:, k] = sign * half[k]
-                T = primitive.T_body_primitive
-                points.append(local @ T[:3, :3].T + T[:3, 3])
-    points = np.concatenate(points)
+                local[:, axis], local[:, a], local[:, b] = line, signs[0] * half[a], signs[1] * half[b]
+                points.append(local @ R.T + t)
+                pair = []
+                for k, other, sign, across in ((a, b, signs[0], signs[1]), (b, a, signs[1], signs[0])):
+                    beside = local.copy()
+                    beside[:, other] -= across * BESIDE
+                    normal = np.tile(sign * R[:, k], (len(line), 1))
+                    pair.append(np.concatenate([beside @ R.T + t, normal], axis=1))
+                faces.append(np.stack(pair, axis=1))
+    points, faces = np.concatenate(points), np.concatenate(faces)
     seen = recording.surface(observed=True)
-    near = cKDTree(seen.vertices.astype(np.float64)).query(points, distance_upper_bound=SEEN)[0] < SEEN
-    for primitive in recording.scene.primitives:
-        near[near] &= primitive.distance(points[near]) > -1e-4
-    return points[near]
+    scale = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+    tree = cKDTree(np.concatenate([seen.vertices, seen.normals], axis=1) * scale)
+    reach = recording.scene.detail
+    near = tree.query((faces * scale).reshape(-1, 6), distance_upper_bound=reach)[0].reshape(-1, 2) < reach
+    return points[near.all(axis=1)]
 
 
 def scores(mesh: Mesh, recording: SyntheticSequence, edges: NDArray[np.float64]) -> dict[str, float]:

@@ -138,10 +138,10 @@ class VolumeConfig(ConfigSection):
     """Smaller voxels where the surface is curved or finely coloured and the sensor resolves it (thesis section 7.1)."""
     adaptive_levels: int = Field(default=1, ge=1, le=2)
     """How often the voxel size may be halved: once, or twice (adaptive only)."""
-    adaptive_bend: float = Field(default=0.1, gt=0)
-    """Curvature of the surface from which on voxels are halved, times the voxel size (adaptive only): 0.1 is a radius
-    of ten voxels."""
-    adaptive_texture: float = Field(default=0.2, gt=0)
+    adaptive_bend: float = Field(default=0.4, gt=0)
+    """Curvature of the surface from which on voxels are halved, times the voxel size (adaptive only): 0.4 is a radius
+    of two and a half voxels, that of edges and thin things."""
+    adaptive_texture: float = Field(default=0.6, gt=0)
     """Bend of the intensities (0..1) between neighbouring voxels from which on they are halved (adaptive only)."""
 
     @model_validator(mode="after")

@@ -95,7 +95,41 @@ def _add_plane(A, b, weight, normal, offset):
 
 
 @kernel
-def _own_crossings(field, size, x, y, z, edge, work):
+def _is_known(field, size, x, y, z, edge, jump):
+    """Whether all corners of a cell are known and the distance changes by no more than ``jump`` between them."""
+    low, high = f32(np.inf), f32(-np.inf)
+    for m in range(8):
+        value = field[((x + edge * (m >> 2)) * size + y + edge * ((m >> 1) & 1)) * size + z + edge * (m & 1)]
+        if np.isnan(value):
+            return False
+        low, high = min(low, value), max(high, value)
+    return high - low <= jump
+
+
+@kernel
+def _known_leaf(field, levels, size, x, y, z, top, jump):
+    """Whether the cell that holds the cell of the finest lattice at (x, y, z) is known, see ``_is_known``."""
+    level = np.int64(levels[(x * (size - 1) + y) * (size - 1) + z])
+    edge = 1 << (top - level)
+    x, y, z = x & ~(edge - 1), y & ~(edge - 1), z & ~(edge - 1)
+    return _is_known(field, size, x, y, z, edge, jump / f32(1 << level))
+
+
+@kernel
+def _is_trusted(field, levels, size, x, y, z, axis, top, jump):
+    """Whether one of the four cells around the lattice edge from (x, y, z) along an axis is known."""
+    for m in range(4):
+        b, c = m >> 1, m & 1
+        i = x - (0 if axis == 0 else b)
+        j = y - (0 if axis == 1 else (b if axis == 0 else c))
+        k = z - (0 if axis == 2 else c)
+        if _known_leaf(field, levels, size, i, j, k, top, jump):
+            return True
+    return False
+
+
+@kernel
+def _own_crossings(field, levels, size, x, y, z, edge, border, top, jump, work):
     """Crossings on the surface of a cell, with their normals, into the rows of ``work``: point, normal, and cosine
     between the gradients at the ends of the edge.
 
@@ -103,6 +137,8 @@ def _own_crossings(field, size, x, y, z, edge, work):
         field, size: Field of the lattice, and its points along an edge.
         x, y, z: First point of the cell.
         edge: Lattice steps along an edge of the cell.
+        levels, top, jump: As of ``contour_blocks``.
+        border: Whether the cell is not known itself: then crossings count only beside a cell that is.
         work: (n, 7) float32 out.
 
     Returns:
@@ -124,6 +160,12 @@ def _own_crossings(field, size, x, y, z, edge, work):
                     fp, fq = field[p], field[p + stride]
                     if np.isnan(fp) or np.isnan(fq) or (fp < 0) == (fq < 0):
                         continue
+                    if border:
+                        i = x + (a if axis == 0 else b)
+                        j = y + (a if axis == 1 else (b if axis == 0 else c))
+                        k = z + (a if axis == 2 else c)
+                        if not _is_trusted(field, levels, size, i, j, k, axis, top, jump):
+                            continue
                     t = fp / (fp - fq)
                     agreement = _plane(field, size, p, p + stride, t, edge, ga, gb, normal)
                     if agreement <= f32(0) or count == len(work):
@@ -278,13 +320,16 @@ def _is_empty(field, size, x, y, z, edge, place):
 
 
 @kernel
-def _vertex(field, size, x, y, z, edge, work, planes, out):
+def _vertex(field, levels, size, x, y, z, edge, border, top, jump, work, planes, out):
     """Vertex of a cell: place relative to its first point in lattice steps, and normal, into ``out`` (6,).
+
+    In a cell at the border of what is known it is the mean of the crossings that known cells share with it, so that the
+    surface ends where the known cells end.
 
     Returns:
         Whether the surface crosses the cell.
     """
-    count = _own_crossings(field, size, x, y, z, edge, work)
+    count = _own_crossings(field, levels, size, x, y, z, edge, border, top, jump, work)
     if count == 0:
         return False
     middle, mean = np.zeros(3, f32), np.zeros(3, f32)
@@ -297,6 +342,9 @@ def _vertex(field, size, x, y, z, edge, work, planes, out):
         middle[i] /= f32(count)
         mean[i] /= length
         out[3 + i] = mean[i]
+    if border:
+        out[:3] = middle
+        return True
     A, b = np.zeros(6, f32), np.zeros(3, f32)
     closest = f32(1)
     for n in range(count):
@@ -316,18 +364,6 @@ def _vertex(field, size, x, y, z, edge, work, planes, out):
     for i in range(3):
         place[i] = min(max(place[i] + middle[i], f32(0)), f32(edge))
     return True
-
-
-@kernel
-def _is_known(field, size, x, y, z, edge, jump):
-    """Whether all corners of a cell are known and the distance changes by no more than ``jump`` between them."""
-    low, high = f32(np.inf), f32(-np.inf)
-    for m in range(8):
-        value = field[((x + edge * (m >> 2)) * size + y + edge * ((m >> 1) & 1)) * size + z + edge * (m & 1)]
-        if np.isnan(value):
-            return False
-        low, high = min(low, value), max(high, value)
-    return high - low <= jump
 
 
 @kernel
@@ -397,13 +433,12 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
         for j in range(width):
             for k in range(width):
                 x, y, z = i + pad, j + pad, k + pad
-                level = levels[(x * cells + y) * cells + z]
+                level = np.int64(levels[(x * cells + y) * cells + z])
                 edge = 1 << (top - level)
                 if (i | j | k) & (edge - 1):
                     continue
-                if not _is_known(field, size, x, y, z, edge, jump / f32(1 << level)):
-                    continue
-                if not _vertex(field, size, x, y, z, edge, work, planes, vertex):
+                border = not _is_known(field, size, x, y, z, edge, jump / f32(1 << level))
+                if not _vertex(field, levels, size, x, y, z, edge, border, top, jump, work, planes, vertex):
                     continue
                 finer = 2 - top
                 keys[count] = (np.int64(row) << CELL_BITS) | (((i << finer) << 12) | ((j << finer) << 6) | (k << finer))
@@ -446,17 +481,20 @@ def _block_polygons(field, levels, rows, top, jump, polygons, count):
                     other = field[p + step * (size * size if axis == 0 else (size if axis == 1 else 1))]
                     if np.isnan(other) or (other < 0) == (field[p] < 0):
                         continue
-                    complete = True
+                    if not _is_trusted(field, levels, size, x, y, z, axis, top, jump):
+                        continue
+                    missing, absent = 0, 0
                     for m in range(4):
                         cx, cy, cz = corner[m, 0], corner[m, 1], corner[m, 2]
-                        level = levels[(cx * cells + cy) * cells + cz]
-                        edge = 1 << (top - level)
-                        cx, cy, cz = cx & ~(edge - 1), cy & ~(edge - 1), cz & ~(edge - 1)
-                        complete &= _is_known(field, size, cx, cy, cz, edge, jump / f32(1 << level))
-                        ring[m] = _cell_key(cx, cy, cz, top, rows)
-                        complete &= ring[m] >= 0
-                    if not complete:
+                        edge = 1 << (top - np.int64(levels[(cx * cells + cy) * cells + cz]))
+                        ring[m] = _cell_key(cx & ~(edge - 1), cy & ~(edge - 1), cz & ~(edge - 1), top, rows)
+                        if ring[m] < 0:
+                            missing += 1
+                            absent = m
+                    if missing > 1:
                         continue
+                    if missing == 1:  # no block there: the triangle of the other three
+                        ring[absent] = ring[(absent + 1) & 3]
                     for m in range(4):
                         polygons[count, m] = ring[m if field[p] < 0 else 3 - m]
                     count += 1
