@@ -5,9 +5,9 @@
     python benchmarks/adaptive.py synthetic box --true-poses --meshes OUT
 
 Each frame is processed by all systems in turn, so that whatever else the machine does falls on all of them; times are
-medians over the frames, relative to uniform voxels of 1 cm. Accuracy and completeness are the mean distances to the true
-surface and from the part of it that was seen; "edges" is the mean distance of the true edges of boxes that were seen from
-the mesh. Trajectories are aligned with the truth before meshes are compared. Memory is that of the map
+medians over the frames, relative to uniform voxels of 1 cm. Accuracy and completeness are the mean distances to the
+true surface and from the part of it that was seen; "edges" is the mean distance of the true edges of boxes that were
+seen from the mesh. Trajectories are aligned with the truth before meshes are compared. Memory is that of the map
 (``TsdfVolume.num_bytes``).
 """
 
@@ -48,7 +48,7 @@ BESIDE = 0.015
 class Fusion:
     """Fuses frames at their true poses, in place of a system that finds them."""
 
-    def __init__(self, camera: Any, config: Config) -> None:  # noqa: ANN401
+    def __init__(self, camera: Any, config: Config) -> None:
         self.preprocess = Preprocessor(camera, config.preprocess)
         self.volume = make_volume(self.preprocess.camera, config.volume, config.sensor, config.preprocess.depth_max)
 
@@ -112,7 +112,7 @@ def table(rows: dict[str, dict[str, float]]) -> str:
 
 
 def measure(
-    recording: Any,  # noqa: ANN401
+    recording: Any,
     frames: Iterable[int],
     settings: list[str],
     true_poses: bool,
@@ -161,7 +161,7 @@ def measure(
     return rows
 
 
-def _trajectory(system: Slam, recording: Any) -> dict[str, float]:  # noqa: ANN401
+def _trajectory(system: Slam, recording: Any) -> dict[str, float]:
     if recording.ground_truth is None:
         return {}
     return {"ATE": 1000 * ate(system.trajectory, recording.ground_truth).rmse}

@@ -353,6 +353,11 @@ class Config(ConfigSection):
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
 
+    @property
+    def compute_device(self) -> str:
+        """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes."""
+        return "cpu" if self.volume.adaptive and self.device == "auto" else self.device
+
     @classmethod
     def load(cls, path: str | Path) -> "Config":
         """Configuration of a TOML file; parameters it does not set keep the value of its preset.

@@ -92,7 +92,7 @@ class Slam:
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        backend = make_backend(config.device)
+        backend = make_backend(config.compute_device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
         self.first_camera = camera
@@ -482,7 +482,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        config, backend = self.config, make_backend(self.config.device)
+        config, backend = self.config, make_backend(self.config.compute_device)
         return make_volume(
             self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
         )

@@ -1,4 +1,4 @@
-"""Loops over blocks of one level of the map: where it is too coarse for the surface, and what a finer level begins with.
+"""Loops over blocks of one level of the map: where it is too coarse for the surface, and with what a finer one begins.
 
 A block is read with two voxels around it, from its 27 neighbours (``mapping/fine_blocks.py``).
 """
@@ -17,8 +17,8 @@ NEAR = np.float32(1)
 SATURATED = np.float32(0.85)
 """Share of the truncation band beyond which a distance may be cut off, and says nothing of the shape."""
 PRIOR = 8
-"""Largest weight that a voxel inherits: two frontal readings at one metre. What is inherited is the coarse surface, which
-the next readings should replace."""
+"""Largest weight that a voxel inherits: two frontal readings at one metre. What is inherited is the coarse surface,
+which the next readings should replace."""
 
 
 @kernel
@@ -44,9 +44,9 @@ def padded(voxels, near, words):
 def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
     """How much the distance and the intensity bend near the surface in each octant of blocks.
 
-    With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis a;
-    on a surface of curvature k the sum over the axes is about k times the voxel size, and linear interpolation between
-    voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice.
+    With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
+    a; on a surface of curvature k the sum over the axes is about k times the voxel size, and linear interpolation
+    between voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice.
 
     Args:
         start, stop: Range of blocks.
@@ -134,7 +134,11 @@ def prolong(start, stop, geometry, colors, near, octants, slots, fine_geometry, 
         octant, slot = octants[row], slots[row]
         for n in range(512):
             i, j, k = n >> 6, (n >> 3) & 7, n & 7
-            x, y, z = PAD + 4 * (octant >> 2) + (i >> 1), PAD + 4 * ((octant >> 1) & 1) + (j >> 1), PAD + 4 * (octant & 1) + (k >> 1)
+            x, y, z = (
+                PAD + 4 * (octant >> 2) + (i >> 1),
+                PAD + 4 * ((octant >> 1) & 1) + (j >> 1),
+                PAD + 4 * (octant & 1) + (k >> 1),
+            )
             steps, shade, shades = np.float32(0), np.float32(0), 0
             red, green, blue, painted = np.float32(0), np.float32(0), np.float32(0), 0
             weight, count = PRIOR, 0

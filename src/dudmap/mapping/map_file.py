@@ -125,7 +125,5 @@ def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:
         number = len(levels) + 1
         coords = data[f"slot_coords{number}"]
         free, entries = np.zeros(len(coords), np.uint8), np.arange(len(coords), dtype=np.int32)
-        levels.append(
-            VoxelBlocks.restored(coords, free, entries, data[f"geometry{number}"], data[f"colors{number}"])
-        )
+        levels.append(VoxelBlocks.restored(coords, free, entries, data[f"geometry{number}"], data[f"colors{number}"]))
     return levels

@@ -46,7 +46,12 @@ class Refinement:
         self.voxel_size, self.sdf_unit = voxel_size, sdf_unit
 
     def update(
-        self, level: FineBlocks, parents: VoxelBlocks, slots: NDArray[np.int32], depths: NDArray[np.float64], number: int
+        self,
+        level: FineBlocks,
+        parents: VoxelBlocks,
+        slots: NDArray[np.int32],
+        depths: NDArray[np.float64],
+        number: int,
     ) -> NDArray[np.int32]:
         """Examine blocks of the coarser level that a frame was fused into.
 

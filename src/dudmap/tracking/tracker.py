@@ -243,10 +243,7 @@ class Tracker:
             sigma_at_one_metre=sensor.sigma(1.0),
             noise_weighting=float(config.noise_weighting),
         )
-        equations = volume.backend.linearize(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
-            volume.window.T_grid_camera(T_world_camera), parameters,
-        )  # fmt: skip
+        equations = volume.linearize(level.depth, level.intensity, weights, level.camera, T_world_camera, parameters)
         return LinearSystem(*equations)
 
     def _judge(
