@@ -81,7 +81,7 @@ def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, sur
                         outside |= f > np.float32(-0.25)
                         if abs(f) > NEAR or i == 4 or j == 4 or k == 4:
                             continue
-                        square, known = zero, False
+                        square, axes = zero, 0
                         shade, seen = zero, False
                         for axis in range(3):
                             step = SIZE * SIZE if axis == 0 else (SIZE if axis == 1 else 1)
@@ -90,14 +90,14 @@ def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, sur
                             if (a & 0xFF00 != 0) and (b & 0xFF00 != 0) and fa < saturated and fb < saturated:
                                 d = (fa - f - f + fb) * np.float32(0.25)
                                 square += d * d
-                                known = True
+                                axes += 1
                             a, b = flat[n + step] & 0xFF, flat[n - step] & 0xFF
                             if a != 0 and b != 0 and word & 0xFF != 0:
                                 d = np.float32(a + b - 2 * (word & 0xFF)) / np.float32(255)
                                 shade += d * d
                                 seen = True
-                        if known:
-                            total += square
+                        if axes > 0:  # beside the end of a finer level not all axes are known
+                            total += square * np.float32(3) / np.float32(axes)
                             count += 1
                         if seen:
                             shades += shade

@@ -98,6 +98,15 @@ class FineBlocks:
         self.children[found[known], self.octants_of(slots[known])] = slots[known]
         return known
 
+    def copied(self) -> "FineBlocks":
+        """Copy for another thread to read; blocks are neither opened nor dropped there."""
+        out, n = FineBlocks(self.voxel_size), self.blocks.num_slots
+        for name in ("geometry", "colors", "slot_coords", "entry_of"):
+            setattr(out.blocks, name, getattr(self.blocks, name)[:n].copy())
+        out.blocks.num_slots = n
+        out.children, out.parents = self.children.copy(), self.parents[:n].copy()
+        return out
+
     def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
         """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""
         coords = self.blocks.slot_coords

@@ -54,6 +54,7 @@ class VolumeMirror:
         for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "fused"):
             setattr(target, name, getattr(source, name).copy())
         target.num_entries, target.num_slots = source.num_entries, source.num_slots
+        self.volume.levels = [level.copied() for level in self._source.levels]
         self.volume._frame_number += 1
         target.written[slots] = self.volume._frame_number
         self._copied[slots] = self._source.num_integrated
