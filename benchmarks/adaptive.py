@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dudmap import Config, Slam
 from dudmap.evaluation.reconstruction import compare_surfaces
@@ -83,7 +83,7 @@ def edge_points(recording: SyntheticSequence) -> NDArray[np.float64]:
     points, faces = np.concatenate(points), np.concatenate(faces)
     seen = recording.surface(observed=True)
     scale = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
-    tree = cKDTree(np.concatenate([seen.vertices, seen.normals], axis=1) * scale)
+    tree = KDTree(np.concatenate([seen.vertices, seen.normals], axis=1) * scale)
     reach = recording.scene.detail
     near = tree.query((faces * scale).reshape(-1, 6), distance_upper_bound=reach)[0].reshape(-1, 2) < reach
     return points[near.all(axis=1)]
@@ -92,7 +92,7 @@ def edge_points(recording: SyntheticSequence) -> NDArray[np.float64]:
 def scores(mesh: Mesh, recording: SyntheticSequence, edges: NDArray[np.float64]) -> dict[str, float]:
     """Distances of a mesh in the world of the truth, millimetres."""
     result = compare_surfaces(mesh, recording.surface(), observed=recording.surface(observed=True), samples=100_000)
-    to_edges = Surface(mesh, "the mesh").distances(edges)
+    to_edges = Surface(mesh, "the mesh").distances(edges.astype(np.float32))
     return {
         "accuracy": 1000 * result.accuracy.mean,
         "accuracy p95": 1000 * result.accuracy.p95,
@@ -126,12 +126,12 @@ def measure(
     times: dict[str, list[float]] = {name: [] for name in systems}
     lost = dict.fromkeys(systems, 0)
     for number in frames:
-        frame, T_true = recording[number], None
+        frame, T_true = recording[number], np.eye(4)
         if true_poses:
             T_true = recording.ground_truth.interpolate(float(recording.timestamps[number]))
         for name, system in systems.items():
             start = time.perf_counter()
-            result = system.process(frame, T_true) if true_poses else system.process(frame)
+            result = system.process(frame) if isinstance(system, Slam) else system.process(frame, T_true)
             times[name].append(1000 * (time.perf_counter() - start))
             lost[name] += result is not None and result.T_world_camera is None
     rows = {}
@@ -148,10 +148,10 @@ def measure(
             "mesh ms": 1000 * seconds,
             "triangles/1000": len(mesh.faces) / 1000,
         }
-        if not true_poses:
+        if isinstance(system, Slam):
             row |= {"lost": lost[name]} | _trajectory(system, recording)
         if edges is not None:
-            if not true_poses:
+            if isinstance(system, Slam):
                 mesh = moved(mesh, _alignment(system, recording))
             row |= scores(mesh, recording, edges)
         if meshes is not None:

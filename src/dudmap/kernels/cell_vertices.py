@@ -113,15 +113,18 @@ def _known_leaf(field, levels, size, x, y, z, top, jump):
 
 @kernel
 def is_trusted(field, levels, size, x, y, z, axis, top, jump):
-    """Whether one of the four cells around the lattice edge from (x, y, z) along an axis is known."""
+    """Whether two of the four cells around the lattice edge from (x, y, z) along an axis are known.
+
+    One alone is the ragged end of what has been seen, where readings are worst.
+    """
+    known = 0
     for m in range(4):
         b, c = m >> 1, m & 1
         i = x - (0 if axis == 0 else b)
         j = y - (0 if axis == 1 else (b if axis == 0 else c))
         k = z - (0 if axis == 2 else c)
-        if _known_leaf(field, levels, size, i, j, k, top, jump):
-            return True
-    return False
+        known += 1 if _known_leaf(field, levels, size, i, j, k, top, jump) else 0
+    return known > 1
 
 
 @kernel

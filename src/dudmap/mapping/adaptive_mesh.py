@@ -68,15 +68,17 @@ def _contours(
     row_of[slots] = np.arange(len(slots), dtype=np.int32)
     rows = row_of[near]  # -1 is the last element
     fine = [level.blocks for level in levels]
-    geometry = [blocks.geometry, *(level.geometry for level in fine), NO_VOXELS, NO_VOXELS][:3]
-    colors = [blocks.colors, *(level.colors for level in fine), NO_VOXELS, NO_VOXELS][:3]
-    children = [*(level.children for level in levels), NO_CHILDREN, NO_CHILDREN][:2]
+    geometry, colors = blocks.geometry, blocks.colors
+    geometry1, geometry2 = [*(level.geometry for level in fine), NO_VOXELS, NO_VOXELS][:2]
+    colors1, colors2 = [*(level.colors for level in fine), NO_VOXELS, NO_VOXELS][:2]
+    children1, children2 = [*(level.children for level in levels), NO_CHILDREN, NO_CHILDREN][:2]
     coords = np.ascontiguousarray(blocks.slot_coords[slots])
     least = max(int(parameters.min_weight), 1)
     parts = run_bands(
         lambda start, stop: contour_blocks(
-            start, stop, slots, near, rows, meshed, coords, *geometry, *children, *colors, least,
-            np.float32(parameters.sdf_unit), float(parameters.voxel_size), np.float32(parameters.max_jump),
+            start, stop, slots, near, rows, meshed, coords, geometry, geometry1, geometry2, children1, children2,
+            colors, colors1, colors2, least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
+            np.float32(parameters.max_jump),
         ),
         bands(len(slots), BAND),
     )  # fmt: skip

@@ -5,6 +5,8 @@ from the surface are theirs. Blocks of half, and within them of a quarter of the
 surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -62,7 +64,7 @@ class AdaptiveVolume(TsdfVolume):
         MapError: As of ``TsdfVolume``.
     """
 
-    levels: list[FineBlocks]
+    levels: Sequence[FineBlocks]
 
     def __init__(
         self,
