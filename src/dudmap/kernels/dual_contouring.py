@@ -9,7 +9,7 @@ changes its sign, and the surface is closed wherever the field is known, across 
 import numpy as np
 
 from dudmap.kernels.cell_vertices import is_known, is_trusted, place_vertex
-from dudmap.kernels.octree_field import PAD, SPAN, fill, finest_level
+from dudmap.kernels.octree_field import PAD, SPAN, fill, finest_level, may_hold_surface
 from dudmap.kernels.threads import kernel
 
 f32 = np.float32
@@ -77,6 +77,27 @@ def _mixed_color(near, children1, children2, colors0, colors1, colors2, top, x, 
 
 
 @kernel
+def _changes_sign(field, size, x, y, z):
+    """Whether corners of a finest cell have different signs; unknown ones have none."""
+    negative, positive = False, False
+    n = (x * size + y) * size + z
+    for m in range(8):
+        value = field[n + (m >> 2) * size * size + ((m >> 1) & 1) * size + (m & 1)]
+        negative |= value < 0
+        positive |= value >= 0
+    return negative & positive
+
+
+@kernel
+def _may_cross(field, size, p, stride, top):
+    """Whether the surface crosses a lattice edge from point ``p``, of any of the cells' sizes."""
+    crosses = False
+    for level in range(top + 1):
+        crosses |= (field[p + (stride << level)] < 0) != (field[p] < 0)
+    return crosses
+
+
+@kernel
 def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, work, keys, places, colors, count):
     """Vertices of the cells of a block; the new number of vertices. See ``contour_blocks``."""
     children1, children2, colors0, colors1, colors2 = tree
@@ -89,6 +110,8 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
                 level = np.int64(levels[(x * cells + y) * cells + z])
                 edge = 1 << (top - level)
                 if (i | j | k) & (edge - 1):
+                    continue
+                if edge == 1 and not _changes_sign(field, size, x, y, z):
                     continue
                 border = not is_known(field, size, x, y, z, edge, jump / f32(1 << level))
                 if not place_vertex(field, levels, size, x, y, z, edge, border, top, jump, work, planes, vertex):
@@ -121,6 +144,9 @@ def _block_polygons(field, levels, rows, top, jump, polygons, count):
                 if np.isnan(field[p]):
                     continue
                 for axis in range(3):
+                    stride = size * size if axis == 0 else (size if axis == 1 else 1)
+                    if not _may_cross(field, size, p, stride, top):
+                        continue
                     finest = 0
                     for m in range(4):  # counter-clockwise, seen from the end of the edge
                         b, c = (-1 if m == 0 or m == 3 else 0), (-1 if m < 2 else 0)
@@ -131,7 +157,7 @@ def _block_polygons(field, levels, rows, top, jump, polygons, count):
                     step = 1 << (top - finest)
                     if (i | j | k) & (step - 1):
                         continue
-                    other = field[p + step * (size * size if axis == 0 else (size if axis == 1 else 1))]
+                    other = field[p + step * stride]
                     if np.isnan(other) or (other < 0) == (field[p] < 0):
                         continue
                     if not is_trusted(field, levels, size, x, y, z, axis, top, jump):
@@ -193,6 +219,8 @@ def contour_blocks(
     owners = np.empty(capacity, np.int32)
     num_vertices, num_polygons = 0, 0
     for row in range(start, stop):
+        if not may_hold_surface(near[row], geometry0, children1, least):
+            continue
         top = finest_level(near[row], children1, children2)
         most = 512 << (3 * top)
         if num_vertices + most > len(keys):

@@ -36,6 +36,30 @@ def finest_level(near, children1, children2):
 
 
 @kernel
+def may_hold_surface(near, geometry0, children1, least):
+    """Whether a block of the coarsest level has finer voxels, or observed ones of both signs, up to one voxel beyond
+    its upper sides; else there is no surface in its cells."""
+    negative, positive = False, False
+    for m in range(8):
+        dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
+        slot = near[13 + 9 * dx + 3 * dy + dz]
+        if slot < 0:
+            continue
+        if slot < len(children1):
+            for octant in range(8):
+                if children1[slot, octant] >= 0:
+                    return True
+        for i in range(1 if dx else 8):
+            for j in range(1 if dy else 8):
+                for k in range(1 if dz else 8):
+                    word = geometry0[slot, (i * 8 + j) * 8 + k]
+                    known = ((word >> 8) & 0xFF) >= least
+                    negative |= known & (word < 0)
+                    positive |= known & (word >= 0)
+    return negative & positive
+
+
+@kernel
 def _put(geometry, slot, x, y, z, size, least, unit, field):
     """Write the observed distances, metres, of a block whose first voxel is at (x, y, z) into a lattice."""
     for i in range(max(0, -x), min(8, size - x)):
