@@ -16,7 +16,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --for
 # than a few processes gain nothing
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all check docs package processors fuzz fuzz-guided audit licences lock clean
+.PHONY: demo test test-all check docs package processors soak fuzz fuzz-guided audit licences lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -55,7 +55,12 @@ LOADERS ?=
 fuzz: .venv/developed
 	$(BIN)/python tests/fuzz/campaign.py --seconds $(SECONDS) --loaders "$(LOADERS)"
 
-# the same for one loader, guided by coverage: make fuzz-guided LOADER=sens
+# 20,000 frames, 22 minutes at 15 Hz, see docs/reliability.md: make soak FRAMES=20000
+FRAMES ?= 20000
+soak: .venv/developed
+	$(BIN)/python benchmarks/soak.py --frames $(FRAMES)
+
+# the same as fuzz for one loader, guided by coverage: make fuzz-guided LOADER=sens
 LOADER ?= sens
 fuzz-guided: .venv/developed
 	$(PIP) install --quiet atheris

@@ -93,9 +93,9 @@ def _opening(point) -> bool:
     return point[0] < HALF + 0.1 and point[1] < CORRIDOR + 0.4
 
 
-def floor_solids(floor: int) -> list[Primitive]:
+def floor_solids(floor: int, layout: int = 0) -> list[Primitive]:
     """All solids of a floor in the frame of the building, without its slabs and lift."""
-    rng, z = np.random.default_rng([floor, 77]), floor * STOREY
+    rng, z = np.random.default_rng([floor, 77 + layout]), floor * STOREY
     wall, core = Material("wallpaper", (0.5, 0.5)), Material("plaster", (0.5, 0.5), tint=(0.95, 0.92, 0.8))
     middle = z + CEILING / 2
     out = [
@@ -156,9 +156,9 @@ def shared_solids() -> list[Primitive]:
     return out
 
 
-def building(floors: range = range(FLOORS)) -> Scene:
-    """The building with the furniture of some floors."""
-    solids = shared_solids() + [part for floor in floors for part in floor_solids(floor)]
+def building(floors: range = range(FLOORS), layout: int = 0) -> Scene:
+    """The building with the furniture of some floors; each ``layout`` has other pictures and other furniture."""
+    solids = shared_solids() + [part for floor in floors for part in floor_solids(floor, layout)]
     # light that passes walls and slabs, so that a floor looks the same in all recordings
     lights = (Light((20.0, -15.0, 60.0), 0.45, 0.0), Light((-15.0, 30.0, -40.0), 0.25, 0.0))
     return Scene(
@@ -212,13 +212,13 @@ def _walker(walk: Walk, Ts: NDArray[np.float64], duration: float, rng: np.random
     return person_on(path, Figure(rng, int(rng.integers(0, 5))), (walk.floor + (walk.kind == "lift")) * STOREY)
 
 
-def recording(walk: Walk, frames: int = 64, seed: int = 0) -> SyntheticSequence:
-    """The recording of a walk, in the frame of the building; people, path and noise depend on walk and seed."""
-    rng = np.random.default_rng([seed, walk.floor, walk.place, ("ring", "entry", "lift").index(walk.kind)])
+def recording(walk: Walk, layout: int = 0, frames: int = 64) -> SyntheticSequence:
+    """The recording of a walk, in the frame of the building; people, path and noise depend on walk and layout."""
+    rng = np.random.default_rng([layout, walk.floor, walk.place, ("ring", "entry", "lift").index(walk.kind)])
     times = np.arange(frames) / FPS
     Ts = _poses(walk, times, rng)
     floors = range(walk.floor, walk.floor + 1 + (walk.kind == "lift"))
     return SyntheticSequence(
-        building(floors), [_walker(walk, Ts, times[-1], rng)], Trajectory(times, Ts), CAMERA,
+        building(floors, layout), [_walker(walk, Ts, times[-1], rng)], Trajectory(times, Ts), CAMERA,
         noise="kinect", seed=int(rng.integers(1 << 30)), fps=FPS,
     )  # fmt: skip

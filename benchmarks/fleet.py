@@ -1,6 +1,6 @@
 """Merging of many runs through one building: accuracy, false joins, time and memory.
 
-python benchmarks/fleet.py [--runs 8|64] [--folder DIR] [--workers 1 2] [--separate 200] [--out FILE.json]
+python benchmarks/fleet.py [--runs 8|64] [--layout 0] [--folder DIR] [--workers 1 2] [--separate 200] [--out FILE.json]
 
 The recordings (benchmarks/building.py) are rendered and run once and kept in the folder. The merge is repeated for each
 number of workers. Pairs without overlap are those whose true surfaces share less than 1 % of their cells of 10 cm; so
@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 sys.path.insert(0, str(Path(__file__).parent))
-from building import building, recording, walks
+from building import CEILING, FLOORS, STOREY, Walk, building, recording, walks
 
 from dudmap.config import Config
 from dudmap.fleet.merge import FleetReport, merge_fleet
@@ -41,8 +41,8 @@ GHOST = 0.05
 class TrueRun:
     """A run folder with what is true of it, in the frame of the building."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
+    def __init__(self, folder: Path, walk: Walk) -> None:
+        self.folder, self.walk = folder, walk
         estimate, truth = Trajectory.load(folder / "trajectory.txt"), Trajectory.load(folder / "groundtruth.txt")
         self.estimated = estimate.Ts_world_camera
         start, end = truth.timestamps[[0, -1]]
@@ -79,12 +79,12 @@ def chosen(points):
     return points[np.random.default_rng(0).permutation(len(points))[:VERTICES]]
 
 
-def prepare(count: int, folder: Path) -> list[Path]:
+def prepare(count: int, layout: int, folder: Path) -> list[Path]:
     """Run the system over the recordings that are not done yet."""
     config = Config().override(["volume.voxel_size=0.02", "relocalization.keyframe_gap=5"])
     for walk in walks(count):
         if not (folder / walk.name / "metrics.json").is_file():
-            found = run(recording(walk), config, folder / walk.name, progress=False, ahead=0).metrics
+            found = run(recording(walk, layout), config, folder / walk.name, progress=False, ahead=0).metrics
             print(walk.name, {key: found.get(key) for key in ("tracked", "lost", "ate_rmse_m")}, flush=True)
     return [folder / walk.name for walk in walks(count)]
 
@@ -115,9 +115,9 @@ def is_false(error: tuple[float, float]) -> bool:
     return error[0] > FALSE_DISTANCE or error[1] > FALSE_ANGLE_DEG
 
 
-def scored(report: FleetReport, runs: list[TrueRun]) -> dict[str, object]:
+def scored(report: FleetReport, runs: list[TrueRun], layout: int) -> dict[str, object]:
     """All figures of a merge."""
-    part, graph, scene = report.graph.components[0], report.graph, building()
+    part, graph, scene = report.graph.components[0], report.graph, building(layout=layout)
     errors = {(join.a, join.b): pose_errors(join, runs) for join in graph.kept}
     accepted = [(one, Join(one.a, one.b, one.pair.T_a_b)) for one in report.pairs if one.pair.T_a_b is not None]
     right = np.array([error for error in errors.values() if not is_false(error)]).reshape(-1, 2)
@@ -130,8 +130,8 @@ def scored(report: FleetReport, runs: list[TrueRun]) -> dict[str, object]:
     for entry in report.tree["ranges"]:
         volume = TsdfVolume.load(report.out / entry["file"])
         world.append(volume.extract_mesh().vertices.astype(np.float64))
-    points = chosen(moved(T_building_world, np.concatenate(world)))
-    union = surface_figures(scene, points)
+    vertices = chosen(np.concatenate(world))
+    union = surface_figures(scene, moved(T_building_world, vertices))
     alone = {key: float(np.mean([one[key] for one in single])) for key in ("accuracy_mm", "ghost_share")}
     everything = itertools.combinations(range(len(runs)), 2)
     overlapping = [(a, b) for a, b in everything if runs[a].overlap(runs[b]) > MUCH_OVERLAP]
@@ -147,9 +147,28 @@ def scored(report: FleetReport, runs: list[TrueRun]) -> dict[str, object]:
         "joins_within_1cm_02deg": int(np.sum((right[:, 0] < 0.01) & (right[:, 1] < 0.2))),
         "ate_rmse_mm": round(1000 * float(np.sqrt(np.mean(ate**2))), 2),
         "single": alone, "union": union, "union_over_single": union["accuracy_mm"] / alone["accuracy_mm"],
+        "union_over_single_by_floor": by_floor(scene, vertices, report, runs),
         **{key: report.tree[key] for key in ("workers", "registration_s", "total_s", "cpu_s", "peak_rss_mb", "tiles")},
         "parts": len(report.tree["ranges"]), "map_blocks": report.tree["map_blocks"],
     }  # fmt: skip
+
+
+def by_floor(scene, vertices, report: FleetReport, runs: list[TrueRun]) -> dict[str, float]:
+    """Accuracy of the union over that of the single runs for each floor by itself, aligned by its own runs: without the
+    drift of the rides that connect the floors."""
+    out = {}
+    for floor in range(FLOORS):
+        own = [run for run in report.graph.components[0] if runs[run].walk.floor == floor]
+        own = [run for run in own if runs[run].walk.kind != "lift"]
+        if len(own) < 2:
+            continue
+        placed = np.concatenate([report.graph.Ts[run] @ runs[run].estimated for run in own])
+        points = moved(aligned(np.concatenate([runs[run].true for run in own]), placed), vertices)
+        inside = (points[:, 2] > floor * STOREY - 0.1) & (points[:, 2] < floor * STOREY + CEILING + 0.1)
+        single = [surface_figures(scene, moved(runs[run].T_building_run, runs[run].vertices)) for run in own]
+        alone = float(np.mean([one["accuracy_mm"] for one in single]))
+        out[str(floor)] = round(surface_figures(scene, points[inside])["accuracy_mm"] / alone, 3)
+    return out
 
 
 def separate_pairs(folders: list[Path], runs: list[TrueRun], report: FleetReport, count: int, workers: int) -> dict:
@@ -170,13 +189,14 @@ def main() -> None:
     """Print all figures as JSON."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--runs", type=int, default=64, help="number of runs: 8 on two floors, else of 64")
+    parser.add_argument("--layout", type=int, default=0, help="number of the building; each has a folder of its own")
     parser.add_argument("--folder", type=Path, default=Path("runs/fleet"), help="where runs and worlds are kept")
     parser.add_argument("--workers", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--separate", type=int, default=200, help="pairs without overlap to compare at least")
     parser.add_argument("--out", type=Path, help="write all figures as JSON")
     options = parser.parse_args()
-    folders = prepare(options.runs, options.folder)
-    runs = [TrueRun(folder) for folder in folders]
+    folders = prepare(options.runs, options.layout, options.folder)
+    runs = [TrueRun(folder, walk) for folder, walk in zip(folders, walks(options.runs), strict=True)]
     rows: dict[str, object] = {}
     report = None
     for workers in options.workers:
@@ -184,7 +204,7 @@ def main() -> None:
         report = merge_fleet(
             folders, world, workers=workers, note=lambda text: print(text, file=sys.stderr, flush=True)
         )
-        rows[f"{workers} workers"] = scored(report, runs)
+        rows[f"{workers} workers"] = scored(report, runs, options.layout)
         print(json.dumps(rows[f"{workers} workers"], indent=1), *report.sentences, sep="\n", flush=True)
     assert report is not None
     rows["without overlap"] = separate_pairs(folders, runs, report, options.separate, options.workers[-1])

@@ -353,6 +353,12 @@ class Config(ConfigSection):
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
 
+    @model_validator(mode="after")
+    def _computable(self) -> "Config":
+        if self.volume.adaptive and self.device not in ("auto", "cpu"):
+            raise ValueError(f"volume.adaptive is computed on the CPU, not on {self.device}; set device to cpu or auto")
+        return self
+
     @property
     def compute_device(self) -> str:
         """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes."""

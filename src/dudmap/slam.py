@@ -92,7 +92,8 @@ class Slam:
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        backend = make_backend(config.compute_device)
+        self.device = config.compute_device
+        backend = make_backend(self.device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
         self.first_camera = camera
@@ -199,17 +200,18 @@ class Slam:
         save_system(self, Path(path))
 
     @classmethod
-    def resume(cls, path: str | Path) -> "Slam":
+    def resume(cls, path: str | Path, device: str | None = None) -> "Slam":
         """A system in the state that ``save`` wrote: the frames that follow give the same results, bit for bit.
 
-        The file stays open and must stay as it is while the system lives: stored frames are read from it.
+        With another ``device`` than that of the run the results differ by roundings. The file stays open and must stay
+        as it is while the system lives: stored frames are read from it.
 
         Raises:
             StateError: The file is missing, damaged, or was written by another version.
         """
         from dudmap.state.system import resume_system
 
-        return resume_system(Path(path))
+        return resume_system(Path(path), device)
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
@@ -482,7 +484,7 @@ class Slam:
         )  # fmt: skip
 
     def _make_volume(self) -> TsdfVolume:
-        config, backend = self.config, make_backend(self.config.compute_device)
+        config, backend = self.config, make_backend(self.device)
         return make_volume(
             self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
         )

@@ -1,6 +1,6 @@
 """``make fuzz``: many hostile inputs for all loaders, each loader in a child of limited memory.
 
-Usage: python tests/fuzz/campaign.py [--seconds 60] [--loaders "bag,map"] [--seed 0] [--memory 2.0] [--out fuzz.json]
+Usage: python tests/fuzz/campaign.py [--inputs 100000] [--seconds 60] [--loaders "bag,map"] [--out fuzz.jsonl]
 
 Input number n of a loader is the same on every machine; ``--only LOADER:n`` repeats one, and ``--keep LOADER:n FOLDER``
 writes it, to be added to tests/fuzz/corpus.
@@ -29,8 +29,8 @@ COUNT = struct.Struct("<QQ")
 """In memory shared with the child: number of inputs that were read, and number of the present one."""
 
 
-def child(name, first, seconds, share, memory, report):
-    """Read inputs from number ``first`` on for some seconds; findings go to the file ``report``."""
+def child(name, first, inputs, seconds, share, memory, report):
+    """Read so many inputs from number ``first`` on, or for some seconds; findings go to the file ``report``."""
     sys.stderr = open(os.devnull, "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
     folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
@@ -43,7 +43,7 @@ def child(name, first, seconds, share, memory, report):
         used = int(status.partition("VmSize:")[2].split()[0]) * 1024
         resource.setrlimit(resource.RLIMIT_AS, (used + int(memory * 2**30),) * 2)
         number, end = first, time.time() + seconds
-        while time.time() < end:
+        while number < first + inputs and time.time() < end:
             share[: COUNT.size] = COUNT.pack(number - first, number)
             try:
                 subject.trial(number)
@@ -64,17 +64,17 @@ def child(name, first, seconds, share, memory, report):
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def fuzz(name, seconds, seed, memory, report):
+def fuzz(name, inputs, seconds, seed, memory, report):
     """Inputs that were read, and deaths of the process."""
     share, number, count, deaths, left = mmap.mmap(-1, COUNT.size), seed, 0, 0, seconds
-    while left > 0:
+    while left > 0 and count < inputs:
         begin = time.time()
         share[: COUNT.size] = COUNT.pack(0, number)
         pid = os.fork()
         if pid == 0:
             code = 1
             try:
-                child(name, number, left, share, memory, report)
+                child(name, number, inputs - count, left, share, memory, report)
                 code = 0
             except BaseException:
                 with report.open("a") as file:
@@ -102,7 +102,8 @@ def chosen(text):
 
 def main():
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--seconds", type=float, default=60, help="for each loader")
+    parser.add_argument("--inputs", type=int, default=100_000, help="for each loader")
+    parser.add_argument("--seconds", type=float, default=60, help="that a loader is given at most")
     parser.add_argument("--loaders", default="", help="parts of names, commas between them; default: all")
     parser.add_argument("--seed", type=int, default=0, help="number of the first input")
     parser.add_argument("--memory", type=float, default=2.0, help="GiB that a loader may take")
@@ -131,7 +132,9 @@ def main():
     total = 0
     for name in chosen(arguments.loaders):
         before = len(arguments.out.read_text().splitlines())
-        count, deaths = fuzz(name, arguments.seconds, arguments.seed, arguments.memory, arguments.out.resolve())
+        count, deaths = fuzz(
+            name, arguments.inputs, arguments.seconds, arguments.seed, arguments.memory, arguments.out.resolve()
+        )  # fmt: skip
         found = len(arguments.out.read_text().splitlines()) - before
         total += found
         print(f"| {name} | {count} | {deaths} | {found} |", flush=True)

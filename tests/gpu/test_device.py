@@ -1,12 +1,15 @@
 """Which device is taken, and what is said where it does not work; without Warp and without a GPU."""
 
 import sys
+from types import SimpleNamespace
 
 import pytest
+from typer.testing import CliRunner
 
+from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import ConfigError, MissingExtraError
-from dudmap.gpu import device
+from dudmap.gpu import device, faults
 from dudmap.kernels.cpu import CpuBackend
 
 
@@ -14,13 +17,15 @@ from dudmap.kernels.cpu import CpuBackend
 def machine(monkeypatch):
     """A machine with a driver, GPUs and Warp, or without."""
 
-    def make(driver=(13, 0), gpus=2, warp=True, supported=2):
+    def make(driver=(13, 0), failure="", gpus=2, warp=True, supported=(0, 1)):
         monkeypatch.setattr(device, "driver_version", lambda: driver)
+        monkeypatch.setattr(device, "driver_failure", lambda: failure)
         monkeypatch.setattr(device, "num_gpus", lambda: gpus)
         monkeypatch.setattr(device, "_has_warp", lambda: warp)
+        monkeypatch.setattr(device, "warp_failure", lambda: "")
         if not warp:
             monkeypatch.setitem(sys.modules, "warp", None)
-        monkeypatch.setattr(device, "supported_gpus", lambda: supported)
+        monkeypatch.setattr(device, "supported_gpus", lambda: list(supported))
         device.resolve.cache_clear()
 
     yield make
@@ -30,7 +35,14 @@ def machine(monkeypatch):
 def test_automatic_choice(machine):
     machine()
     assert device.resolve("auto") == "cuda:0"
-    for without in ({"driver": None}, {"driver": (12, 8)}, {"gpus": 0}, {"warp": False}, {"supported": 0}):
+    for without in (
+        {"driver": None},
+        {"driver": (12, 8)},
+        {"failure": "it does not start"},
+        {"gpus": 0},
+        {"warp": False},
+        {"supported": ()},
+    ):
         machine(**without)
         assert device.resolve("auto") == "cpu"
         assert isinstance(device.make_backend("auto"), CpuBackend)
@@ -44,6 +56,72 @@ def test_gpus_by_number(machine):
         device.resolve("cuda:2")
 
 
+def test_one_gpu(machine):
+    machine(gpus=1, supported=(0,))
+    assert device.resolve("cuda:0") == "cuda:0"
+    with pytest.raises(ConfigError, match=r"there is no device cuda:1; this machine has cuda:0$"):
+        device.resolve("cuda:1")
+
+
+def test_the_command_line_refuses_before_the_recording_is_opened(machine, tmp_path):
+    machine(driver=(12, 8))
+    done = CliRunner().invoke(app, ["run", str(tmp_path / "nothing"), "--device", "cuda"])
+    assert done.exit_code == 1
+    assert "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later" in done.stderr
+
+
+def test_an_old_gpu_beside_a_new_one(machine):
+    """The first that Warp supports is taken, and the old one is refused by its name."""
+    machine(supported=(1,))
+    assert device.resolve("auto") == device.resolve("cuda") == "cuda:1"
+    with pytest.raises(ConfigError, match="device cuda:0 is too old for Warp; this machine has cuda:1"):
+        device.resolve("cuda:0")
+
+
+def test_a_driver_that_does_not_start(monkeypatch):
+    driver = SimpleNamespace(cuInit=lambda flags: 803)
+    monkeypatch.setattr(device, "_driver", lambda: driver)
+    assert "error 803: restart the machine" in device.driver_failure.__wrapped__()
+    driver.cuInit = lambda flags: 999
+    assert "error 999: see nvidia-smi" in device.driver_failure.__wrapped__()
+    driver.cuInit = lambda flags: 100
+    assert device.driver_failure.__wrapped__() == ""
+
+
+def test_a_warp_that_does_not_start(monkeypatch):
+    def broken():
+        raise OSError("warp.so: cannot open\nshared object file")
+
+    monkeypatch.setattr(device, "_load_warp", broken)
+    assert device.warp_failure.__wrapped__() == "Warp does not start (warp.so: cannot open shared object file)"
+
+
+def test_a_gpu_that_does_nothing(machine, monkeypatch):
+    """Another program fills its memory: ``auto`` says so and takes the CPU, and who asked for it is refused."""
+    machine()
+    monkeypatch.setattr(device, "_load_warp", lambda: None)
+    monkeypatch.setattr(device, "start_failure", lambda name: f"Failed to acquire primary context for device {name}")
+    with pytest.raises(ConfigError, match=r"device cuda cannot be used: Failed to acquire .*; take --device cpu"):
+        device.make_backend("cuda")
+    try:
+        with pytest.warns(faults.DeviceWarning, match=r"cuda:0 failed \(Failed to acquire"):
+            assert isinstance(device.make_backend("auto"), CpuBackend)
+    finally:
+        faults.forget()
+
+
+def test_a_device_that_has_failed_is_not_used_again(machine):
+    machine()
+    with pytest.warns(faults.DeviceWarning, match="cuda:0 failed"):
+        faults.lose(RuntimeError("CUDA error 700"), "cuda:0")
+    try:
+        assert isinstance(device.make_backend("auto"), CpuBackend)
+        assert isinstance(device.make_backend("cuda:0"), CpuBackend)
+        assert faults.lost_devices() == {"cuda:0"}
+    finally:
+        faults.forget()
+
+
 @pytest.mark.parametrize(
     ("without", "reason"),
     [
@@ -51,7 +129,8 @@ def test_gpus_by_number(machine):
         ({"driver": (12, 8)}, "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later"),
         ({"gpus": 0}, "finds no GPU"),
         ({"warp": False}, r'pip install "dudmap\[gpu\]"'),
-        ({"supported": 0}, "compute capability 7.5 or later"),
+        ({"failure": "the driver does not start"}, "cannot be used: the driver does not start; take --device cpu"),
+        ({"supported": ()}, "compute capability 7.5 or later"),
     ],
 )
 def test_what_is_missing_is_said(machine, without, reason):

@@ -57,6 +57,8 @@ def test_growing_keeps_what_either_side_wrote(mirror):
     write_on_device(mirror, ROWS, 70)
     mirror.fill(np.array([0]), 8)
     mirror.grow(6, -1)
+    assert len(resident(mirror, "cpu").numpy()) == 4  # spare rows take no memory there
+    mirror.use(6)
     assert (resident(mirror, "cpu").numpy()[:, 0] == [8, 70, 6, 70, -1, -1]).all()
     assert (mirror.host[:, 0] == [8, 70, 6, 70, -1, -1]).all()
 

@@ -14,10 +14,11 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.merging.agreement import agreement
 from dudmap.merging.block_sums import BlockSums, block_sums, fused
 from dudmap.merging.map_fusion import fuse_maps
 from dudmap.merging.map_merging import compare_maps
-from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
+from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map, surface_points
 from dudmap.pipeline.merge import merge_runs
 from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
@@ -169,6 +170,33 @@ def test_look_alikes_are_refused(room, change, reason):
     pair = compare_maps(room.saved, true_map(record("room", 2, change=change)).saved)
     assert pair.T_a_b is None
     assert any(part in pair.reason for part in reason.split("|"))
+
+
+def striped_wall(picture):
+    """Map of a wall of 9.6 x 2.4 m with stripes, with or without a picture of 40 x 40 cm, and points on it."""
+    volume = TsdfVolume(SMALL, VolumeConfig(voxel_size=0.04))
+    v, u = np.mgrid[: SMALL.height, : SMALL.width]
+    for shift in (0.0, 3.2, 6.4):
+        x, y = (u - SMALL.cx) * 3 / SMALL.fx + shift, (v - SMALL.cy) * 3 / SMALL.fy
+        grey = 120 + 40 * np.sin(2 * np.pi * x / 0.8)
+        if picture:
+            grey = np.where((np.abs(x - 3.2) < 0.2) & (np.abs(y) < 0.2), 220, grey)
+        color = np.repeat(grey[..., None], 3, axis=2).astype(np.uint8)
+        for _ in range(6):
+            volume.integrate(Frame(0.0, np.full(SMALL.shape, 3.0, np.float32), color), shifted(shift))
+    return volume, surface_points(volume, np.zeros((1, 3)), 20_000)
+
+
+def test_among_many_maps_one_other_picture_makes_a_place_another_one():
+    (plain, of_plain), (same, of_same), (other, of_other) = striped_wall(False), striped_wall(False), striped_wall(True)
+    found = agreement(plain, same, of_plain, of_same, np.eye(4))
+    assert found.other_color == 0
+    assert found.rejection_reason(many=True) == ""
+    found = agreement(plain, other, of_plain, of_other, np.eye(4))
+    assert found.color_share > 0.98
+    assert 0.1 < found.other_color < 0.36  # 0.16 m2, in whole cells of 25 cm
+    assert found.rejection_reason() == ""
+    assert "m2 have another colour" in found.rejection_reason(many=True)
 
 
 def run_folder(folder, found, times):

@@ -1,6 +1,7 @@
 """The database: keys, whole checkpoints or none, readers beside a writer, damage, writes that fail."""
 
 import sqlite3
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -213,6 +214,24 @@ def test_a_damaged_database_is_refused_in_one_sentence_or_read_as_it_was(tmp_pat
                 found["volume"].blocks.geometry)])  # fmt: skip
     assert len(sentences) > 75
     assert not any("\n" in sentence for sentence in sentences)
+
+
+@pytest.mark.parametrize("column", ["meta.value", "chunks.content", "state.tree", "blocks.slot", "blocks.voxels"])
+@pytest.mark.parametrize("value", [None, "text"])
+def test_a_value_of_another_type_is_damage(tmp_path, column, value):
+    grown = Grown(tmp_path / "state.db")
+    grown.grow()
+    grown.store()
+    grown.database.close()
+    table, _, name = column.partition(".")
+    with closing(sqlite3.connect(tmp_path / "state.db")) as connection, connection:
+        kept = connection.execute(f"SELECT sql FROM sqlite_master WHERE name = '{table}'").fetchone()[0]
+        connection.execute("PRAGMA writable_schema = 1")  # a constraint of the table is no protection
+        connection.execute("UPDATE sqlite_master SET sql = ? WHERE name = ?", (kept.replace(" NOT NULL", ""), table))
+    with closing(sqlite3.connect(tmp_path / "state.db")) as connection, connection:
+        connection.execute(f"UPDATE {table} SET {name} = ?", (value,))
+    with pytest.raises(StateError, match="is damaged"):
+        read(tmp_path / "state.db")
 
 
 def test_what_is_no_state_is_named(tmp_path):

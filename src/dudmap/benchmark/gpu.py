@@ -1,30 +1,35 @@
 """Time per frame and per kernel on a GPU and on the CPU, by image size and voxel size."""
 
 import statistics
+import tempfile
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from dudmap.benchmark.interleaved import median_ms, run_open3d, save_frames
 from dudmap.benchmark.table import grid
 from dudmap.benchmark.timing import WARM_UP
 from dudmap.config import Config
-from dudmap.errors import ConfigError, MapError
+from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.gpu import faults
 from dudmap.gpu.device import obstacle, resolve
 from dudmap.sequences import Sequence, open_sequence
 from dudmap.synthetic import sequence as synthetic_sequence
 from dudmap.synthetic.recording import DEFAULT_CAMERA
 
-BYTES_PER_PIXEL = {
-    "limit_depth": 8, "fill_holes": 8, "bilateral_line": 8, "intensities": 7, "halve": 10, "reading_weights": 5,
-    "pack_pixels": 16, "tile_ranges": 4,
+BYTES_PER_THREAD = {
+    "limit_depth": 8, "drop_mixed": 8, "fill_holes": 8, "bilateral_line": 8, "intensities": 7, "halve": 40,
+    "tile_ranges": 268, "reading_weights": 5, "pack_pixels": 16, "integrate": 8, "linearize": 288, "sample": 17,
+    "first_spins": 8, "mean_field_sweep": 20, "probabilities": 8, "trace": 19, "classify": 9, "find_vertices": 10,
+    "scatter": 8, "gather": 8,
 }  # fmt: skip
-"""Bytes that a kernel over the whole image must read and write at least, per pixel: each array once."""
-BYTES_PER_VOXEL = 8
-"""The same for the fusion: the geometry word of each voxel, read and written."""
+"""Bytes that each thread of a kernel must read and write at least: its elements of each image and each sum once, and
+the words of the voxels that belong to it alone; not those of the map that neighbouring pixels share."""
 COPY_BYTES = 1 << 28
 """Size of the array whose copy measures the bandwidth of the device."""
 
@@ -96,22 +101,31 @@ def devices(wanted: str) -> list[str]:
 
 
 def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
-    """Process the first ``frames`` frames; a map that does not fit gives a row that says so."""
+    """Process the first ``frames`` frames; a device that cannot do all of it gives a row that says so."""
+    if faults.is_lost(device):
+        return DeviceRun(name, voxel, device, error=f"{device} has failed before")
+    failures: list[str] = []
+    with faults.told_to(failures.append):
+        row = _measured(name, recording, frames, voxel, device)
+    return DeviceRun(name, voxel, device, error=failures[0]) if failures else row
+
+
+def _measured(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
     from dudmap.slam import Slam
 
     assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
     try:
         slam = Slam(recording.camera, Config().override(assignments))
-        times, stages, kernels, fused = [], [], [], []
+        times, stages, kernels, moved = [], [], [], []
         for index in range(min(frames, len(recording))):
             frame = recording[index]
-            with _kernel_times(device) as measured:
+            with _kernel_times(device) as (measured, threads):
                 start = time.perf_counter()
                 result = slam.process(frame)
                 times.append(1000 * (time.perf_counter() - start))
             stages.append(result.timings)
             kernels.append(measured)
-            fused.append(np.count_nonzero(slam.volume.blocks.written == slam.volume.num_integrated))
+            moved.append({key: count * BYTES_PER_THREAD.get(key, 0) for key, count in threads.items()})
         pose = slam.trajectory.Ts_world_camera[-1]
         slam.volume.extract_mesh(1)
         mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
@@ -121,8 +135,7 @@ def measure(name: str, recording: Sequence, frames: int, voxel: float, device: s
         return DeviceRun(name, voxel, device, error=str(error))
     warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
     per_kernel = _medians(kernels[warm])
-    pixels = recording.camera.width * recording.camera.height
-    shares = _shares(per_kernel, pixels, statistics.median(fused[warm]) * 512, device)
+    shares = _shares(per_kernel, _medians(moved[warm]), device)
     return DeviceRun(
         name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
         slam.volume.num_bytes / 1e6, _peak_megabytes(device), per_kernel, shares,
@@ -140,25 +153,42 @@ def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
     return {key: statistics.median(row.get(key, 0.0) for row in rows) for key in keys}
 
 
-class _kernel_times:  # noqa: N801 - a context manager, named like a function
-    """Dictionary of the milliseconds that each kernel takes within the block, by events of the device."""
+@contextmanager
+def _kernel_times(device: str) -> Iterator[tuple[dict[str, float], dict[str, int]]]:
+    """Milliseconds that each kernel takes within the block, by events of the device, and its number of threads."""
+    times, threads = {}, {}
+    if not device.startswith("cuda"):
+        yield times, threads
+        return
+    import warp as wp  # pyright: ignore[reportMissingImports]
 
-    def __init__(self, device: str) -> None:
-        self.on_gpu = device.startswith("cuda")
-        self.times: dict[str, float] = {}
+    wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
+    with counted_launches(threads):
+        yield times, threads
+    add_up(wp.timing_end(), times)
 
-    def __enter__(self) -> dict[str, float]:
-        if self.on_gpu:
-            import warp as wp  # pyright: ignore[reportMissingImports]
 
-            wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
-        return self.times
+@contextmanager
+def counted_launches(threads: dict[str, int]) -> Iterator[None]:
+    """Add the threads of every launch within the block to those of its kernel."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
 
-    def __exit__(self, *_: object) -> None:
-        if self.on_gpu:
-            import warp as wp  # pyright: ignore[reportMissingImports]
+    launch, repeat = wp.launch, wp.Launch.launch
 
-            add_up(wp.timing_end(), self.times)
+    def counted(kernel: Any, dim: Any, *arguments: Any, **named: Any) -> Any:  # noqa: ANN401
+        if not named.get("record_cmd"):
+            threads[kernel.key] = threads.get(kernel.key, 0) + int(np.prod(dim))
+        return launch(kernel, dim, *arguments, **named)
+
+    def repeated(command: Any, *arguments: Any) -> None:  # noqa: ANN401
+        threads[command.kernel.key] = threads.get(command.kernel.key, 0) + command.bounds.size
+        repeat(command, *arguments)
+
+    wp.launch, wp.Launch.launch = counted, repeated  # pyright: ignore[reportAttributeAccessIssue]
+    try:
+        yield
+    finally:
+        wp.launch, wp.Launch.launch = launch, repeat
 
 
 def add_up(results: Iterable[Any], times: dict[str, float]) -> None:
@@ -170,15 +200,37 @@ def add_up(results: Iterable[Any], times: dict[str, float]) -> None:
         times[name] = times.get(name, 0.0) + result.elapsed
 
 
-def _shares(kernels: dict[str, float], pixels: float, voxels: float, device: str) -> dict[str, float]:
-    """Share of the measured bandwidth of each memory-bound kernel that ran."""
+def _shares(kernels: dict[str, float], moved: dict[str, float], device: str) -> dict[str, float]:
+    """Share of the measured bandwidth that each kernel reaches with the bytes that it must move per frame."""
     if not device.startswith("cuda"):
         return {}
     bandwidth = measured_bandwidth(device)
-    # the filter runs along both axes of the image, in two launches
-    needed = {name: each * pixels * (2 if name == "bilateral_line" else 1) for name, each in BYTES_PER_PIXEL.items()}
-    needed["integrate"] = BYTES_PER_VOXEL * voxels
-    return {name: needed[name] / (1e-3 * ms) / bandwidth for name, ms in kernels.items() if name in needed and ms > 0}
+    return {name: moved[name] / (1e-3 * ms) / bandwidth for name, ms in kernels.items() if moved.get(name) and ms > 0}
+
+
+def measure_open3d(
+    python: str, name: str, recording: Sequence, frames: int, voxels: Iterable[float], device: str
+) -> list[DeviceRun]:
+    """Time per frame of Open3D's dense SLAM (``t.pipelines.slam``) with each voxel size, in a program of its own.
+
+    Args:
+        python: Interpreter with open3d.
+        name: Of the recording.
+        recording: The recording.
+        frames: Number of frames.
+        voxels: Voxel sizes, metres.
+        device: Device in Open3D: "CUDA:0" or "CPU:0".
+    """
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="dudmap-") as folder:
+        save_frames(recording, frames, Path(folder))
+        for voxel in voxels:
+            try:
+                row = run_open3d(python, Path(folder), voxel, device)
+                rows.append(DeviceRun(name, voxel, f"Open3D {row['version']}, {device}", median_ms([row])))
+            except DudmapError as error:
+                rows.append(DeviceRun(name, voxel, f"Open3D, {device}", error=str(error)))
+    return rows
 
 
 def measured_bandwidth(device: str) -> float:

@@ -77,19 +77,19 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
     """
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = Path(temporary)
-        truth, stamps = _save_frames(entry.open(), frames, folder)
+        truth, stamps = save_frames(entry.open(), frames, folder)
         ours: list[Row] = []
         theirs: list[Row] = []
         for _ in range(rounds):
             ours.append(_succeeded(in_own_process(_run_ours, folder)))
-            theirs.append(_run_open3d(python, folder))
+            theirs.append(run_open3d(python, folder, Config().volume.voxel_size))
     return Comparison(
-        _median_ms(ours), _median_ms(theirs),
+        median_ms(ours), median_ms(theirs),
         _ate(ours[-1], stamps, truth), _ate(theirs[-1], stamps, truth), len(stamps), str(theirs[-1]["version"]),
     )  # fmt: skip
 
 
-def _save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
+def save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
     """Write the arrays that open3d_slam.py reads; returns the ground truth and the timestamps (n,)."""
     camera = sequence.camera
     count = min(frames, len(sequence))
@@ -128,10 +128,20 @@ def _run_ours(folder: Path) -> Row:
     return {"ms": ms, "poses": poses}
 
 
-def _run_open3d(python: str, folder: Path) -> Row:
+def run_open3d(python: str, folder: Path, voxel_size: float, device: str = "CPU:0") -> Row:
+    """Open3D's dense SLAM on the frames that ``save_frames`` wrote: version, ms per frame, poses.
+
+    Args:
+        python: Interpreter with open3d.
+        folder: Folder of the frames.
+        voxel_size: Metres.
+        device: Device in Open3D, such as "CUDA:0".
+
+    Raises:
+        DudmapError: The run failed.
+    """
     program = Path(__file__).with_name("open3d_slam.py").read_text(encoding="utf-8")
-    config = Config()
-    arguments = [str(folder), str(config.volume.voxel_size), str(config.preprocess.depth_max)]
+    arguments = [str(folder), str(voxel_size), str(Config().preprocess.depth_max), device]
     done = subprocess.run([python, "-c", program, *arguments], cwd=folder, capture_output=True, text=True, check=False)
     if done.returncode:
         raise DudmapError(f"Open3D's dense SLAM failed: {_last_line(done.stderr)}")
@@ -144,7 +154,8 @@ def _succeeded(row: Row) -> Row:
     return row
 
 
-def _median_ms(rows: list[Row]) -> float:
+def median_ms(rows: list[Row]) -> float:
+    """Median of the times per frame of runs, without the first frames of each, milliseconds."""
     return float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows]))
 
 

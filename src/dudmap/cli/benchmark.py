@@ -9,6 +9,7 @@ from typing import Annotated, Any
 import typer
 
 from dudmap.benchmark.suites import SUITES
+from dudmap.cli.benchmark_gpu import gpu
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.progress import counted
 
@@ -63,6 +64,7 @@ def suite_command(
     _answer(tree, text, out, as_json=as_json)
 
 
+app.command()(gpu)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
 
@@ -366,47 +368,4 @@ def speed(
     (out / "speed.md").write_text(text, encoding="utf-8")
     content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
     (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    _answer(content, text, out, as_json=as_json)
-
-
-@app.command()
-def gpu(
-    device: Annotated[str, typer.Option("--device", help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames of each run.")] = 120,
-    voxels: Annotated[
-        str, typer.Option("--voxels", help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")
-    ] = "2,1,0.5,0.25",
-    sizes: Annotated[
-        str, typer.Option("--sizes", help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
-    ] = "640x480,1280x720",
-    recording: Annotated[
-        list[Path] | None, typer.Option("--recording", help="Also measure this recording; repeatable.")
-    ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Output folder for gpu.md and gpu.json.")] = Path(
-        "runs/benchmark/gpu"
-    ),
-    quick: QuickOption = False,
-    as_json: JsonOption = False,
-) -> None:
-    """Measure a GPU and the CPU beside it: time by stage and kernel, memory, and share of the memory bandwidth.
-
-    Without a GPU, only the CPU is measured, and the table says why.
-    """
-    from dudmap.benchmark import gpu as measurements
-    from dudmap.pipeline.environment import machine, versions
-
-    rows = []
-    steps, shapes = measurements.numbers(voxels, sizes)
-    if quick:
-        steps, shapes, frames = steps[:1], [(320, 240)], min(frames, 12)
-    for name, each in measurements.recordings(shapes, frames, recording or []):
-        for step in steps:
-            for one in measurements.devices(device):
-                typer.echo(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
-                rows.append(measurements.measure(name, each, frames, step, one))
-    text = measurements.table(rows)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "gpu.md").write_text(text, encoding="utf-8")
-    content = {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
-    (out / "gpu.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
     _answer(content, text, out, as_json=as_json)

@@ -118,7 +118,9 @@ def run(
     ] = None,
     resume: Annotated[
         Path | None,
-        typer.Option("--resume", help="Go on with the interrupted run in this folder; alone.", metavar="RUN"),
+        typer.Option(
+            "--resume", help="Go on with the interrupted run in this folder; alone or with --device.", metavar="RUN"
+        ),
     ] = None,
     checkpoint_every: Annotated[
         float | None,
@@ -146,6 +148,7 @@ def run(
     moving object.
     """
     from dudmap.geometry.calibration import Calibration
+    from dudmap.gpu.device import resolve
     from dudmap.pipeline.inspection import inspect
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.pipeline.storing import Storing
@@ -155,13 +158,14 @@ def run(
         if sequence is not None or out is not None:
             raise typer.BadParameter("--resume goes on with a run as it was ordered; leave out the recording and --out")
         page = (host, port, token) if view else None
-        _resume(resume, page=page, rerun=rerun, log=log, quiet=quiet, as_json=as_json)
+        _resume(resume, device, page=page, rerun=rerun, log=log, quiet=quiet, as_json=as_json)
         return
     if sequence is None:
         raise typer.BadParameter("name a recording, or a run folder to go on with (--resume RUN)")
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
     parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
+    resolve(parameters.device)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, topics=topics)
     for warning in inspect(recording).warnings:
@@ -203,6 +207,7 @@ def memory_size(text: str) -> int:
 
 def _resume(
     folder: Path,
+    device: str | None,
     *,
     page: tuple[str, int, str | None] | None,
     rerun: Path | None,
@@ -214,7 +219,7 @@ def _resume(
     from dudmap.pipeline.resume import resume, wants_report
 
     with observers(report=wants_report(folder), page=page, rerun=rerun, log=log) as watching:
-        done = resume(folder, progress=not quiet, observers=watching)
+        done = resume(folder, device=device, progress=not quiet, observers=watching)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 

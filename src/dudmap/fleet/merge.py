@@ -16,7 +16,8 @@ from dudmap.errors import DudmapError, MapError
 from dudmap.extras import need
 from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, RangeJob, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
-from dudmap.fleet.registration import RegisteredPair, proposed_pairs, register_pairs
+from dudmap.fleet.registration import RegisteredPair
+from dudmap.fleet.rounds import registered_runs
 from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
 from dudmap.mapping import morton
@@ -24,7 +25,7 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging.block_sums import MAX_COUNT, VOXELS
 from dudmap.merging.map_fusion import FusedRange, joined
 from dudmap.merging.map_samples import sample_map
-from dudmap.merging.run_graph import Join, RunGraph, solve
+from dudmap.merging.run_graph import RunGraph
 from dudmap.pipeline.merge import run_trajectories
 
 WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
@@ -79,11 +80,7 @@ def merge_fleet(
     _load_kernels(like)
     started = time.perf_counter()
     with Workers(workers) as crew:
-        proposed = proposed_pairs(folders, crew)
-        note(f"{len(proposed)} of {len(folders) * (len(folders) - 1) // 2} pairs of runs are compared")
-        pairs = register_pairs(folders, proposed, crew)
-        joins = [Join(one.a, one.b, one.pair.T_a_b) for one in pairs if one.pair.T_a_b is not None]
-        graph = solve(len(folders), joins)
+        pairs, graph = registered_runs(folders, crew, note)
         worlds = [part for part in graph.components if len(part) > 1]
         if not worlds:
             raise MapError(f"no two of the {len(folders)} runs are joined, nothing is written: {_why_not(pairs)}")

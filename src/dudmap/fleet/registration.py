@@ -1,6 +1,6 @@
 """Relative poses of runs: candidate pairs by place recognition, then features, surfaces and checks of every pair."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from dudmap.fleet.inputs import MapHeader
 from dudmap.fleet.open_maps import keyframes_of, surface_of
 from dudmap.fleet.workers import Workers
-from dudmap.merging.agreement import MANY_COLOR_SHARE
 from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided, suggested_poses
-from dudmap.merging.place_index import PARTNERS, TRAINING, candidate_pairs, described, learnt_words
+from dudmap.merging.place_index import PARTNERS, TRAINING, described, learnt_words, similarity
+from dudmap.merging.relative_pose import Hypothesis
+from dudmap.merging.run_graph import Join, drift_covariance
 from dudmap.places.saved_map import MAP_FILE
 
 ALL_PAIRS = PARTNERS
@@ -27,28 +28,49 @@ class RegisteredPair:
     b: int
     pair: MapPair
 
+    @property
+    def join(self) -> Join | None:
+        """The accepted relative pose, if there is one."""
+        T, alignment, agreement = self.pair.T_a_b, self.pair.alignment, self.pair.agreement
+        if T is None or alignment is None or agreement is None:
+            return None
+        return Join(self.a, self.b, T, drift_covariance(T, alignment.center, agreement.overlap))
 
-def proposed_pairs(runs: Sequence[Path], workers: Workers) -> list[tuple[int, int]]:
-    """Pairs (a, b), a < b, of runs that are to be compared.
+
+def similar_runs(runs: Sequence[Path], workers: Workers) -> NDArray[np.float32]:
+    """Similarity (n, n) of the places of the runs, see ``similarity``; 1 for few runs, which are all to be compared.
 
     Raises:
-        ConfigError: faiss is not installed.
+        MissingExtraError: faiss is not installed.
         MapError: A keyframe file is damaged.
     """
     n = len(runs)
     if n <= ALL_PAIRS:
-        return [(a, b) for a in range(n) for b in range(a + 1, n)]
+        return 1 - np.eye(n, dtype=np.float32)
     share = [(path, -(-TRAINING // n)) for path in runs]
     words = learnt_words(np.concatenate(list(workers.map(_sample, share))))
-    return candidate_pairs(list(workers.map(_described, [(path, words) for path in runs])))
+    return similarity(list(workers.map(_described, [(path, words) for path in runs])))
 
 
-def register_pairs(runs: Sequence[Path], pairs: Sequence[tuple[int, int]], workers: Workers) -> list[RegisteredPair]:
-    """Relative pose of each pair of runs, or why they are not to be joined."""
+def register_pairs(
+    runs: Sequence[Path],
+    pairs: Sequence[tuple[int, int]],
+    workers: Workers,
+    guesses: Mapping[tuple[int, int], NDArray[np.float64]] | None = None,
+) -> list[RegisteredPair]:
+    """Relative pose of each pair of runs, or why they are not to be joined.
+
+    Args:
+        runs: All run folders.
+        pairs: Pairs (a, b) of them.
+        workers: Who compares them.
+        guesses: Relative poses ``T_a_b`` (4, 4) of some pairs, which are tried before those of the features.
+    """
     groups: dict[int, list[int]] = {}
     for a, b in pairs:
         groups.setdefault(a, []).append(b)
-    jobs = [(runs[a], [runs[b] for b in others]) for a, others in groups.items()]
+    known = guesses or {}
+    jobs = [(runs[a], [(runs[b], known.get((a, b))) for b in others]) for a, others in groups.items()]
     found = workers.map(_compare, jobs)
     return [
         RegisteredPair(a, b, pair)
@@ -70,15 +92,19 @@ def _described(job: tuple[Path, NDArray[np.float32]]) -> NDArray[np.float32]:
     return described(keyframes_of(job[0]), job[1])
 
 
-def _compare(job: tuple[Path, list[Path]]) -> list[MapPair]:
+def _compare(job: tuple[Path, list[tuple[Path, NDArray[np.float64] | None]]]) -> list[MapPair]:
     """Decisions on a run and others."""
     a, others = job
     header = MapHeader.read(a / MAP_FILE, blocks=False)
-    return [_compare_two(a, b, header) for b in others]
+    return [_compare_two(a, b, guess, header) for b, guess in others]
 
 
-def _compare_two(a: Path, b: Path, header: MapHeader) -> MapPair:
-    found = suggested_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor)
+def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: MapHeader) -> MapPair:
+    if guess is not None:
+        pair = decided(surface_of(a), surface_of(b), [Hypothesis(guess, 0, 0)], many=True)
+        if pair.agreement is not None:
+            return pair
+    found = suggested_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor, many=True)
     if not found:
         return MapPair(None, NOT_RECOGNISED)
-    return decided(surface_of(a), surface_of(b), found, MANY_COLOR_SHARE)
+    return decided(surface_of(a), surface_of(b), found, many=True)

@@ -17,9 +17,10 @@ from numpy.typing import NDArray
 from dudmap.gpu.kernels import fusion, images, surface
 from dudmap.gpu.kernels.formulas import Motion
 from dudmap.gpu.kernels.structs import Camera, Lattice, struct
-from dudmap.gpu.memory import Images, OnDevice, resident, wrote
+from dudmap.gpu.linearization import Linearization
+from dudmap.gpu.memory import Images, resident, users_of, wrote
 from dudmap.gpu.meshing import extract_surface
-from dudmap.kernels import meshing, raycasting, registration, visibility
+from dudmap.kernels import meshing, raycasting, visibility
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
@@ -40,10 +41,6 @@ from dudmap.kernels.parameters import (
     VoxelGrid,
 )
 
-GROUPS = 64
-"""Partial sums that are left after the first level of a sum."""
-PER_THREAD = 8
-"""Pixels that one thread adds up in a linearisation."""
 _IMAGES: dict[str, Images] = {}
 
 
@@ -72,9 +69,7 @@ class WarpBackend:
         if p.fill_holes:
             image = self._run(images.fill_holes, shape, image, p.alpha, p.hole_noise)
         if p.smooth:
-            spatial = np.exp(-(np.arange(p.radius + 1) ** 2) / (2 * p.sigma_px**2)).astype(np.float32)
-            spatial.flags.writeable = False
-            weights = wp.array(spatial, device=self.device)
+            weights = wp.array(p.spatial_weights, device=self.device)
             image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 1, 0)
             image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 0, 1)
         return self._images.down(image)
@@ -167,12 +162,13 @@ class WarpBackend:
         images_ = self._up(view.depth), self._up(color), self._up(weights)
         self._launch(fusion.pack_pixels, (height, width), *images_, p, pixels)
         occupied = wp.zeros(len(visible), dtype=wp.int32, device=self.device)
+        written = candidates[visible.numpy()]
+        # Nothing may fail for lack of memory from here on: the CPU would fuse the frame a second time.
         self._launch(
             fusion.integrate, (len(visible), BLOCK**3), visible, slots, repeats, float(count), coords, t, camera,
             height, width, pixels, resident(grid.geometry, self.device), resident(grid.colors, self.device), p,
             occupied,
         )  # fmt: skip
-        written = candidates[visible.numpy()]
         wrote(grid.geometry, self.device, written)
         wrote(grid.colors, self.device, written)
         return FusedBlocks(written, occupied.numpy().copy())
@@ -211,24 +207,19 @@ class WarpBackend:
         T_grid_camera: NDArray[np.float32],
         parameters: RegistrationParameters,
     ) -> NormalEquations:
-        """See ``Backend.linearize``; the residuals stay on the device until one of their images is asked for."""
-        threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
-        partial = self._empty((registration.NUM_SUMS, threads))
-        residuals = self._empty((2, *depth.shape))
-        self._launch(
-            surface.linearize, threads, self._up(depth), self._up(intensity), self._up(weights), _camera(intrinsics),
-            _motion(T_grid_camera), self._lattice(grid), float(grid.voxel_size), float(grid.sdf_unit),
-            struct(parameters), PER_THREAD, residuals, partial,
-        )  # fmt: skip
-        parts = self._empty((registration.NUM_SUMS, GROUPS), wp.float64)
-        self._launch(surface.add_up, parts.shape, partial, GROUPS, parts)
-        sums = self._empty(registration.NUM_SUMS, wp.float64)
-        self._launch(surface.finish, registration.NUM_SUMS, parts, sums)
-        total = sums.numpy().copy()
-        return NormalEquations(
-            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
-            float(total[30]), float(total[31]), OnDevice(residuals),
-        )  # fmt: skip
+        """See ``Backend.linearize``; the images can no longer be written to."""
+        for image in (depth, intensity, weights):
+            image.flags.writeable = False
+        images, lattice = (self._up(depth), self._up(intensity), self._up(weights)), self._lattice(grid)
+        key = "linearize", depth.shape, *intrinsics.tolist(), grid.voxel_size, grid.sdf_unit
+        users = users_of(grid.geometry)
+        recorded = users.get(key)
+        if recorded is None or recorded.lattice.cells is not lattice.cells:
+            recorded = users[key] = Linearization(
+                self.device, images, _camera(intrinsics), lattice, parameters, float(grid.voxel_size),
+                float(grid.sdf_unit),
+            )  # fmt: skip
+        return recorded(images, parameters, T_grid_camera)
 
     def sample(
         self,

@@ -9,10 +9,11 @@ import os
 import sys
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 from dudmap.errors import ConfigError
 from dudmap.extras import need
+from dudmap.gpu import faults
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 
@@ -25,10 +26,14 @@ OLDEST_RELEASE = 580
 """First driver that supports it."""
 OLDEST_GPU = 75
 """Oldest compute capability, times ten, that CUDA 13 compiles for."""
+NO_DEVICE = 100
+"""Error of the driver where it finds no GPU."""
+MISMATCH = 803
+"""Error of the driver where its parts are of different versions."""
 
 
 def make_backend(device: str) -> Backend:
-    """A new back end on a device.
+    """A new back end on a device, or on the CPU if the device has failed in this process.
 
     Args:
         device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
@@ -38,12 +43,18 @@ def make_backend(device: str) -> Backend:
         ConfigError: There is no such device, or it does not work.
     """
     name = resolve(device)
-    if name == "cpu":
+    in_warp = "cpu" if name == "warp-cpu" else name
+    if name == "cpu" or faults.is_lost(in_warp):
         return CpuBackend()
     _load_warp()
-    from dudmap.gpu.backend import WarpBackend
+    if failure := start_failure(in_warp):
+        if device != "auto":
+            raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
+        faults.lose(RuntimeError(failure), in_warp)
+        return CpuBackend()
+    from dudmap.gpu.fallback import FallbackBackend
 
-    return WarpBackend("cpu" if name == "warp-cpu" else name)
+    return cast("Backend", FallbackBackend(in_warp))
 
 
 @cache
@@ -60,16 +71,17 @@ def resolve(device: str) -> str:
         return device
     found = obstacle()
     if device == "auto":
-        return "cpu" if found else "cuda:0"
+        return "cpu" if found else f"cuda:{supported_gpus()[0]}"
     if device.partition(":")[0] != "cuda":
         raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
     _need_warp(device)
     if found:
         raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or mend this")
-    number = int(device.partition(":")[2] or 0)
-    if number >= num_gpus():
-        known = ", ".join(f"cuda:{n}" for n in range(num_gpus()))
-        raise ConfigError(f"there is no device {device}; this machine has {known}")
+    number = int(device.partition(":")[2] or supported_gpus()[0])
+    if number not in supported_gpus():
+        known = ", ".join(f"cuda:{n}" for n in supported_gpus())
+        lack = f"there is no device {device}" if number >= num_gpus() else f"device {device} is too old for Warp"
+        raise ConfigError(f"{lack}; this machine has {known}")
     return f"cuda:{number}"
 
 
@@ -83,12 +95,29 @@ def obstacle() -> str:
             f"the NVIDIA driver supports CUDA {version[0]}.{version[1]}, but Warp needs {OLDEST_DRIVER[0]}."
             f"{OLDEST_DRIVER[1]}, that is driver {OLDEST_RELEASE} or later"
         )
+    if failure := driver_failure():
+        return failure
     if num_gpus() == 0:
         return "the NVIDIA driver finds no GPU"
     if not _has_warp():
         return 'Warp is not installed (pip install "dudmap[gpu]")'
-    if supported_gpus() == 0:
+    if failure := warp_failure():
+        return failure
+    if not supported_gpus():
         return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    return ""
+
+
+@cache
+def start_failure(device: str) -> str:
+    """Why a device, by its name in Warp, does nothing, such as one whose memory other programs fill; empty where it
+    does."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    try:
+        wp.zeros(1, dtype=wp.int32, device=device).numpy()
+    except (RuntimeError, OSError) as error:
+        return " ".join(str(error).split())
     return ""
 
 
@@ -110,6 +139,17 @@ def driver_version() -> tuple[int, int] | None:
 
 
 @cache
+def driver_failure() -> str:
+    """Why the driver does not start, as part of a sentence; empty where it does or is missing."""
+    library = _driver()
+    code = 0 if library is None else library.cuInit(0)
+    if code in (0, NO_DEVICE):
+        return ""
+    hint = "restart the machine after an update of the driver" if code == MISMATCH else "see nvidia-smi"
+    return f"the NVIDIA driver does not start (error {code}: {hint})"
+
+
+@cache
 def num_gpus() -> int:
     """GPUs that the driver finds."""
     library, count = _driver(), ctypes.c_int(0)
@@ -118,12 +158,23 @@ def num_gpus() -> int:
     return count.value
 
 
-def supported_gpus() -> int:
-    """GPUs that Warp finds and supports."""
+@cache
+def warp_failure() -> str:
+    """Why Warp, which is installed, does not start, as part of a sentence; empty where it does."""
+    try:
+        _load_warp()
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"Warp does not start ({' '.join(str(error).split())})"
+    return ""
+
+
+@cache
+def supported_gpus() -> list[int]:
+    """Numbers of the GPUs that Warp finds and supports."""
     _load_warp()
     import warp as wp  # pyright: ignore[reportMissingImports]
 
-    return sum(gpu.arch >= OLDEST_GPU for gpu in wp.get_cuda_devices())
+    return [gpu.ordinal for gpu in wp.get_cuda_devices() if gpu.arch >= OLDEST_GPU]
 
 
 def _has_warp() -> bool:

@@ -10,7 +10,8 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
-from dudmap.errors import MapError
+from dudmap.gpu import faults
+from dudmap.gpu.faults import DeviceFullError
 from dudmap.gpu.kernels import rows as kernels
 from dudmap.kernels.mirror import Mirror
 
@@ -22,53 +23,85 @@ WARP_TYPES = {
 
 SPARE = 1.2
 """Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
+GROWTH = 1.15
+"""Rows on the device in units of those in use, when it follows the host: what is spare on the host takes no memory, but
+on a device it does."""
+USED = 0.8
+"""Share of the rows to use where no more fit: the rest is for blocks that come into view before others can leave."""
+PIECE = 4096
+"""Rows that are moved at once; their buffers belong to the copy, so that a full device can still be read."""
 
 
 def free_memory(device: str) -> int | None:
     """Free bytes of a device; None on the CPU, where the system answers for it."""
-    return wp.get_device(device).free_memory if device.startswith("cuda") else None
+    if not device.startswith("cuda"):
+        return None
+    wp.synchronize_device(device)  # gives freed memory back
+    return wp.get_device(device).free_memory
+
+
+def has_room(num_bytes: int, device: str) -> bool:
+    """Whether an array of the map fits."""
+    free = free_memory(device)
+    return free is None or SPARE * num_bytes <= free
 
 
 def check_room(num_bytes: int, device: str) -> None:
     """Check that an array of the map fits.
 
     Raises:
-        MapError: It does not.
+        DeviceFullError: It does not.
     """
-    free = free_memory(device)
-    if free is not None and SPARE * num_bytes > free:
+    if not has_room(num_bytes, device):
+        free = free_memory(device) or 0
         factor = (SPARE * num_bytes / max(free, 1)) ** 0.5  # the blocks lie along surfaces
-        raise MapError(
-            f"the map needs {num_bytes / 1e6:.0f} MB more on {device}, which has {free / 1e6:.0f} MB left; set "
-            f"volume.voxel_size to at least {factor:.1f} times its value, or take --device cpu"
+        raise DeviceFullError(
+            f"the map needs {num_bytes / 1e6:.0f} MB more on {device}, which has {free / 1e6:.0f} MB left, so that it "
+            f"goes on on the CPU; it would fit with volume.voxel_size at least {factor:.1f} times its value"
         )
 
 
 class RowCopy:
     """Copy of an int32 array (rows,) or (rows, width) on a device.
 
+    A device that fails keeps what it wrote since the last ``pull``; the host's array then stays as it is.
+
     Args:
         host: The array in the host's memory.
+        used: Number of rows in use, from the first on.
         device: Name of the device.
+
+    Attributes:
+        array: The array on the device.
+        users: What refers to that array and is forgotten when another takes its place.
+
+    Raises:
+        DeviceFullError: It does not fit; as of ``current``.
     """
 
-    def __init__(self, host: NDArray[np.int32], device: str) -> None:
-        check_room(host.nbytes, device)
-        self.device = device
-        self.array = wp.array(host, dtype=wp.int32, device=device)
-        self._host = host
+    def __init__(self, host: NDArray[np.int32], used: int, device: str) -> None:
+        self.device, self._used = device, used
+        self.users: dict[Any, Any] = {}
+        self._host, self._width = host, int(np.prod(host.shape[1:], dtype=np.int64))
         self._stale: list[NDArray] = []  # rows that the host wrote
         self._all_stale = False
         self._written: list[NDArray] = []  # rows that the device wrote
+        self._value = 0  # of rows that neither side has written
+        self._upload()
+        self._numbers = wp.empty(PIECE, dtype=wp.int32, device=device)
+        self._buffer = wp.empty((PIECE, self._width), dtype=wp.int32, device=device)
 
     @property
     def current(self) -> Any:  # noqa: ANN401 - an array of Warp
         """The device's array with everything that the host wrote."""
+        if len(self.array) < self._used:
+            self._enlarge()
         if self._all_stale:
-            wp.copy(self.array, wp.array(self._host, dtype=wp.int32, device="cpu", copy=False))
+            wp.copy(self.array, wp.array(self._host[: len(self.array)], dtype=wp.int32, device="cpu", copy=False))
         elif self._stale:
             rows = np.unique(np.concatenate(self._stale)).astype(np.int32)
-            self._move(kernels.scatter, rows, wp.array(self._wide(self._host)[rows], device=self.device), self._rows())
+            source = wp.array(self._wide(self._host)[rows], device=self.device)
+            self._move(kernels.scatter, wp.array(rows, device=self.device), source, self._rows(), len(rows))
         self._stale, self._all_stale = [], False
         return self.array
 
@@ -85,30 +118,82 @@ class RowCopy:
 
     def pull(self, host: NDArray[np.int32]) -> None:
         """See ``mirror.DeviceCopy``."""
-        if not self._written:
+        written, self._written = self._written, []
+        if not written or self._all_stale:
             return
-        _ = self.current  # rows that the host wrote since then are not to be overwritten
-        rows = np.unique(np.concatenate(self._written)).astype(np.int32)
-        self._written = []
-        buffer = wp.empty((len(rows), self._rows().shape[1]), dtype=wp.int32, device=self.device)
-        self._move(kernels.gather, rows, self._rows(), buffer)
-        self._wide(host)[rows] = buffer.numpy()
+        rows = np.unique(np.concatenate(written))
+        if self._stale:  # the host wrote them after the device
+            rows = np.setdiff1d(rows, np.concatenate(self._stale))
+        try:
+            for begin in range(0, 0 if faults.is_lost(self.device) else len(rows), PIECE):
+                self._pull(rows[begin : begin + PIECE].astype(np.int32), self._wide(host))
+        except Exception as error:
+            faults.lose(error, self.device)
+        if faults.is_lost(self.device):
+            faults.tell(f"the map lacks what {self.device} had written since it was last read")
+
+    def _pull(self, rows: NDArray[np.int32], host: NDArray[np.int32]) -> None:
+        wp.copy(self._numbers, wp.array(rows, dtype=wp.int32, device="cpu", copy=False), count=len(rows))
+        self._move(kernels.gather, self._numbers, self._rows(), self._buffer, len(rows))
+        host[rows] = self._buffer[: len(rows)].numpy()
 
     def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.int32]:
         """See ``mirror.DeviceCopy``."""
-        places = wp.array(np.stack([rows, columns], axis=1).astype(np.int32), device=self.device)
-        out = wp.empty(len(rows), dtype=wp.int32, device=self.device)
-        if len(rows):
-            wp.launch(kernels.take, dim=len(rows), inputs=[places, self.current], outputs=[out], device=self.device)
-        return out.numpy().copy()
+        if len(rows) and not faults.is_lost(self.device):
+            try:
+                places = wp.array(np.stack([rows, columns], axis=1).astype(np.int32), device=self.device)
+                out = wp.empty(len(rows), dtype=wp.int32, device=self.device)
+                wp.launch(kernels.take, dim=len(rows), inputs=[places, self.current], outputs=[out], device=self.device)
+                return out.numpy().copy()
+            except Exception as error:
+                faults.handle(error, self.device, "reading the map")
+        self.pull(self._host)
+        return self._wide(self._host)[rows, columns]
+
+    def max_rows(self) -> int | None:
+        """See ``mirror.DeviceCopy``; it is told that the map has reached the bound."""
+        free, own = free_memory(self.device), 2 * len(self.array) * self._row_bytes()  # geometry and colours
+        if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
+            return None
+        rows = int(USED * len(self.array))
+        faults.tell(
+            f"{self.device} has room for {rows} blocks of the map; those farthest from the camera wait on disk, "
+            "as with --max-memory"
+        )
+        return rows
 
     def grow(self, host: NDArray[np.int32], value: int) -> None:
         """See ``mirror.DeviceCopy``."""
-        before = self.current
-        check_room(host.nbytes, self.device)
-        self._host = host
-        self.array = wp.full(host.shape, value, dtype=wp.int32, device=self.device)
-        wp.copy(self.array, before, count=before.size)
+        self._host, self._value = host, value
+
+    def use(self, num_rows: int) -> None:
+        """See ``mirror.DeviceCopy``; the device follows at the next use, where a lack of memory can be answered."""
+        self._used = num_rows
+
+    def _enlarge(self) -> None:
+        """Follow the host's array to more rows: on the device where both arrays fit, else by the host."""
+        self.users.clear()
+        rows = self._wanted_rows()
+        if has_room(rows * self._row_bytes(), self.device):
+            before, shape = self.array, (rows, *self._host.shape[1:])
+            self.array = wp.full(shape, self._value, dtype=wp.int32, device=self.device)
+            wp.copy(self.array, before, count=before.size)
+        else:
+            self.pull(self._host)
+            self.array = wp.empty((0, *self._host.shape[1:]), dtype=wp.int32, device=self.device)
+            self._upload()
+
+    def _upload(self) -> None:
+        rows = self._wanted_rows()
+        check_room(rows * self._row_bytes(), self.device)
+        self.array = wp.array(self._host[:rows], dtype=wp.int32, device=self.device)
+        self._stale, self._all_stale = [], False
+
+    def _wanted_rows(self) -> int:
+        return min(int(GROWTH * self._used) + 1, len(self._host))
+
+    def _row_bytes(self) -> int:
+        return self._width * self._host.itemsize
 
     def _rows(self) -> Any:  # noqa: ANN401
         return self.array if self.array.ndim == 2 else self.array.reshape((-1, 1))
@@ -117,11 +202,10 @@ class RowCopy:
     def _wide(array: NDArray) -> NDArray:
         return array if array.ndim == 2 else array.reshape(-1, 1)
 
-    def _move(self, kernel: Any, rows: NDArray[np.int32], source: Any, target: Any) -> None:  # noqa: ANN401
-        if len(rows):
-            index = wp.array(rows, dtype=wp.int32, device=self.device)
-            width = source.shape[1]
-            wp.launch(kernel, dim=(len(rows), width), inputs=[index, source], outputs=[target], device=self.device)
+    def _move(self, kernel: Any, rows: Any, source: Any, target: Any, count: int) -> None:  # noqa: ANN401
+        if count:
+            dim = count, self._width
+            wp.launch(kernel, dim=dim, inputs=[rows, source], outputs=[target], device=self.device)
 
 
 def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: ANN401 - an array of Warp
@@ -129,6 +213,11 @@ def resident(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: AN
     if not isinstance(array, Mirror):
         return wp.array(np.ascontiguousarray(array), dtype=wp.int32, device=device)
     return _copy(array, device).current
+
+
+def users_of(array: Mirror | NDArray[np.int32]) -> dict[Any, Any]:
+    """See ``RowCopy.users``; none are kept of an array in the host's memory."""
+    return array.copy.users if isinstance(array, Mirror) and isinstance(array.copy, RowCopy) else {}
 
 
 def wrote(array: Mirror | NDArray[np.int32], device: str, rows: NDArray[np.int32]) -> None:
@@ -143,7 +232,7 @@ def wrote(array: Mirror | NDArray[np.int32], device: str, rows: NDArray[np.int32
 
 def _copy(mirror: Mirror, device: str) -> RowCopy:
     if not (isinstance(mirror.copy, RowCopy) and mirror.copy.device == device):
-        mirror.copy = RowCopy(mirror.host, device)
+        mirror.copy = RowCopy(mirror.host, mirror.used, device)
     return mirror.copy
 
 

@@ -87,9 +87,9 @@ class CpuBackend:
             smooth[:] = limited
         if p.smooth:
             padded = self._padded_buffer(depth.shape, p.radius)
-            spatial = np.exp(-(np.arange(p.radius + 1) ** 2) / (2 * p.sigma_px**2)).astype(np.float32)
+            weights = p.spatial_weights
             filtering.pad(0, depth.shape[0], smooth, p.radius, padded)
-            run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, spatial, smooth), ranges)
+            run_bands(lambda start, stop: filtering.bilateral(start, stop, padded, alpha, weights, smooth), ranges)
         return smooth
 
     def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
@@ -322,11 +322,7 @@ class CpuBackend:
             ),
             ranges, list(sums),
         )  # fmt: skip
-        total = sums.sum(axis=0)
-        return NormalEquations(
-            total[registration.SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]),
-            float(total[30]), float(total[31]), residuals,
-        )  # fmt: skip
+        return registration.normal_equations(sums.sum(axis=0), residuals)
 
     def sample(
         self,

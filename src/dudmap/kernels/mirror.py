@@ -21,6 +21,14 @@ class DeviceCopy(Protocol):
         """Elements (n,) in the host's memory."""
         ...
 
+    def use(self, num_rows: int) -> None:
+        """So many rows are in use from now on; the device needs no others."""
+        ...
+
+    def max_rows(self) -> int | None:
+        """Largest number of rows to use, where the device has no room for many more; None = no bound."""
+        ...
+
     def grow(self, host: NDArray, value: int) -> None:
         """Follow the host's array to more rows, the new ones holding ``value``."""
         ...
@@ -35,11 +43,12 @@ class Mirror:
         array: The array in the host's memory.
 
     Attributes:
+        used: Number of rows in use, all unless ``use`` says otherwise; the others are spare.
         copy: Copy on a device; None = none.
     """
 
     def __init__(self, array: NDArray) -> None:
-        self._array = array
+        self._array, self.used = array, len(array)
         self.copy: DeviceCopy | None = None
 
     @property
@@ -58,10 +67,26 @@ class Mirror:
         """Elements (n,) at rows and columns (n,), without bringing whole rows over."""
         return self._array[rows, columns] if self.copy is None else self.copy.take(rows, columns)
 
+    def use(self, num_rows: int) -> None:
+        """Take note of the number of rows in use."""
+        self.used = num_rows
+        if self.copy is not None:
+            self.copy.use(num_rows)
+
+    @property
+    def max_rows(self) -> int | None:
+        """Largest number of rows to use, where a device has no room for many more; None = no bound."""
+        return None if self.copy is None else self.copy.max_rows()
+
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
         """Rows (n,), or all of them, have been written in the host's memory."""
         if self.copy is not None:
             self.copy.host_wrote(rows)
+
+    def detach(self) -> None:
+        """Give up the copy; the array takes over what the device wrote."""
+        _ = self.host
+        self.copy = None
 
     def fill(self, rows: NDArray[np.integer], value: int) -> None:
         """Overwrite rows (n,)."""

@@ -172,6 +172,11 @@ class FilterParameters(NamedTuple):
     sigma_px: float
     radius: int
 
+    @property
+    def spatial_weights(self) -> NDArray[np.float32]:
+        """Weights (radius + 1,) of the bilateral filter by the distance from its centre, pixels."""
+        return np.exp(-(np.arange(self.radius + 1) ** 2) / (2 * self.sigma_px**2)).astype(np.float32)
+
 
 class VoxelGrid(NamedTuple):
     """The blocks of the map around the view.

@@ -6,8 +6,10 @@ and the last on every CPU.
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.kernels.neighbors import load_row
+from dudmap.kernels.parameters import ImageStack, NormalEquations
 from dudmap.kernels.pixel import elements, rotate
 from dudmap.kernels.residual import normal_terms, trilinear, weigh
 from dudmap.kernels.threads import kernel
@@ -195,3 +197,11 @@ def linearize_rows(
         sums[29] += readings
         sums[30] += total_weight
         sums[31] += chi
+
+
+def normal_equations(sums: NDArray[np.float64], residuals: ImageStack) -> NormalEquations:
+    """The normal equations of the sums (NUM_SUMS,) of all pixels."""
+    cost, num_inliers, readings, weight, chi_square = sums[27:].tolist()
+    return NormalEquations(
+        sums[SYMMETRIC], sums[21:27], cost, int(num_inliers), readings, weight, chi_square, residuals
+    )

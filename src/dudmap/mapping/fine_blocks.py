@@ -103,7 +103,7 @@ class FineBlocks:
         out, n = FineBlocks(self.voxel_size), self.blocks.num_slots
         for name in ("geometry", "colors", "slot_coords", "entry_of"):
             setattr(out.blocks, name, getattr(self.blocks, name)[:n].copy())
-        out.blocks.num_slots = n
+        out.blocks.use_slots(n)
         out.children, out.parents = self.children.copy(), self.parents[:n].copy()
         return out
 

@@ -364,6 +364,8 @@ class TsdfVolume:
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
         """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
+        if self.pager is None and (room := self.blocks.colors_mirror.max_rows):
+            self.pager = BlockPager(room)
         if self.pager is not None:
             self.pager.focus(self.blocks, low, high, self._frame_number)
 

@@ -53,7 +53,8 @@ class VolumeMirror:
         target.write(slots, source.geometry[slots], source.colors[slots])
         for name in ("table", "coords", "slot_of", "free_count", "entry_of", "slot_coords", "fused"):
             setattr(target, name, getattr(source, name).copy())
-        target.num_entries, target.num_slots = source.num_entries, source.num_slots
+        target.num_entries = source.num_entries
+        target.use_slots(source.num_slots)
         self.volume.levels = [level.copied() for level in self._source.levels]
         self.volume._frame_number += 1
         target.written[slots] = self.volume._frame_number

@@ -77,7 +77,7 @@ class VoxelBlocks:
         self.slot_coords = np.zeros((slots, 3), dtype=np.int32)
         self.written = np.zeros(slots, dtype=np.int32)
         self.fused = np.zeros(slots, dtype=np.uint8)
-        self.num_slots = 0
+        self.use_slots(0)
         self._released = np.empty(0, dtype=np.int32)
 
     @property
@@ -181,13 +181,19 @@ class VoxelBlocks:
             self.written = grown(self.written, capacity, 0)
             self.fused = grown(self.fused, capacity, 0)
         slots = np.concatenate([reused, np.arange(self.num_slots, needed, dtype=np.int32)])
-        self.num_slots = needed
+        self.use_slots(needed)
         self.entry_of[slots] = entries
         self.slot_coords[slots] = self.coords[entries]
         self.written[slots] = frame_number
         self.fused[slots] = 0
         self.slot_of[entries] = slots
         return slots
+
+    def use_slots(self, num_slots: int) -> None:
+        """Take the slots below a number for used, on a device, too."""
+        self.num_slots = num_slots
+        self.geometry_mirror.use(num_slots)
+        self.colors_mirror.use(num_slots)
 
     def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
         """Release and empty slots; their entries (n,) int32 get at least so many observations of emptiness."""

@@ -31,9 +31,11 @@ floors of a building with other plants and boxes 0.006 to 0.024."""
 MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
 """Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
 have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
-MANY_COLOR_SHARE = 0.985
-"""The same share for pairs among many runs, most of which do not show one place: floors of a rendered building with the
-same walls and doors and other pictures have up to 0.978, two maps of one floor 0.994 to 1.0."""
+MAX_OTHER_COLOR, MAX_OTHER_SHARE = 0.1, 0.003
+"""Largest surface whose colours may disagree, square metres, for pairs among many runs, most of which do not show one
+place; or this share of the common surface, if that is more. Look-alikes differ by single things, a picture of
+30 x 30 cm, however much else is the same: a share alone lets them pass where much is seen. Floors of a rendered
+building with the same walls and doors and other pictures have 0.35 m2 and more, maps of one floor up to 0.05 m2."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +49,7 @@ class Agreement:
             counted where a camera came near enough for that to be certain.
         color_correlation: Correlation of the intensities of the common surface.
         color_share: Share of the cells of the common surface whose mean colours agree.
+        other_color: Common surface in the other cells, square metres.
     """
 
     area: float
@@ -54,18 +57,30 @@ class Agreement:
     denied: float
     color_correlation: float
     color_share: float
+    other_color: float
 
-    def rejection_reason(self, min_color_share: float = MIN_COLOR_SHARE) -> str:
-        """Sentence on the first check that fails, empty if the maps can be joined."""
-        if self.area < MIN_AREA or self.overlap < MIN_OVERLAP:
+    @property
+    def enough(self) -> bool:
+        """Whether both maps hold enough of one surface to be compared."""
+        return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
+
+    def rejection_reason(self, many: bool = False) -> str:
+        """Sentence on the first check that fails, empty if the maps can be joined; ``many``: a pair among many runs."""
+        if not self.enough:
             return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
         if self.denied > MAX_DENIED:
             return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
-        if self.color_correlation < MIN_CORRELATION or self.color_share < min_color_share:
+        return self.color_reason(many)
+
+    def color_reason(self, many: bool) -> str:
+        """Sentence on how the colours disagree, empty if they agree."""
+        if self.color_correlation < MIN_CORRELATION or self.color_share < MIN_COLOR_SHARE:
             return (
                 f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
                 f"{self.color_share:.1%} of the common surface has the same colour"
             )
+        if many and self.other_color > max(MAX_OTHER_COLOR, MAX_OTHER_SHARE * self.area):
+            return f"the colours disagree: {self.other_color:.2f} of {self.area:.1f} m2 have another colour"
         return ""
 
 
@@ -87,9 +102,9 @@ def agreement(
     points = np.concatenate([transformed(T_a_b, of_b.points[common_b]), of_a.points[common_a]])
     colors_a = np.concatenate([color_a, of_a.color[common_a]]).astype(np.float64)
     colors_b = np.concatenate([of_b.color[common_b], color_b]).astype(np.float64)
-    return Agreement(
-        float(area), float(area / max(smaller, 1e-9)), float(denied), *_color_agreement(points, colors_a, colors_b)
-    )
+    areas = np.repeat([of_b.area_each / 2, of_a.area_each / 2], [common_b.sum(), common_a.sum()])
+    colors = _color_agreement(points, colors_a, colors_b, areas)
+    return Agreement(float(area), float(area / max(smaller, 1e-9)), float(denied), *colors)
 
 
 def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
@@ -114,22 +129,28 @@ def _compared(
 
 
 def _color_agreement(
-    points: NDArray[np.float64], colors_a: NDArray[np.float64], colors_b: NDArray[np.float64]
-) -> tuple[float, float]:
-    """Correlation of the intensities of points (n, 3), and share of their cells with agreeing mean colours."""
+    points: NDArray[np.float64],
+    colors_a: NDArray[np.float64],
+    colors_b: NDArray[np.float64],
+    areas: NDArray[np.float64],
+) -> tuple[float, float, float]:
+    """Correlation of the intensities of points (n, 3), share of their cells with agreeing mean colours, and area of the
+    points in the others."""
     known = (colors_a.max(axis=1) > 0) & (colors_b.max(axis=1) > 0)
     if np.count_nonzero(known) < MIN_COLORED:
-        return 0.0, 0.0
-    points, colors_a, colors_b = points[known], colors_a[known], colors_b[known]
+        return 0.0, 0.0, 0.0
+    points, colors_a, colors_b, areas = points[known], colors_a[known], colors_b[known], areas[known]
     grey_a, grey_b = colors_a.mean(axis=1), colors_b.mean(axis=1)
     plain = min(grey_a.std(), grey_b.std()) < 1e-6
     correlation = 0.0 if plain else float(np.corrcoef(grey_a, grey_b)[0, 1])
     gain = np.median(colors_a, axis=0) / np.maximum(np.median(colors_b, axis=0), 1)
     cells = np.floor(points / CELL).astype(np.int64)
     _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
     enough = counts >= MIN_CELL_POINTS
     if not enough.any():
-        return correlation, 0.0
-    sums = np.stack([np.bincount(cell.reshape(-1), channel) for channel in (colors_a - gain * colors_b).T], axis=1)
+        return correlation, 0.0, 0.0
+    sums = np.stack([np.bincount(cell, channel) for channel in (colors_a - gain * colors_b).T], axis=1)
     agreeing = np.abs(sums[enough] / counts[enough, None]).max(axis=1) < MAX_COLOR_DIFFERENCE
-    return correlation, float(np.mean(agreeing))
+    other = np.bincount(cell, areas)[enough][~agreeing].sum()
+    return correlation, float(np.mean(agreeing)), float(other)

@@ -11,7 +11,7 @@ from dudmap.config import SensorConfig
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.agreement import MIN_COLOR_SHARE, Agreement, agreement
+from dudmap.merging.agreement import Agreement, agreement
 from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
@@ -45,6 +45,15 @@ class MapPair:
     hypothesis: Hypothesis | None = None
     alignment: SdfAlignment | None = None
     agreement: Agreement | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the surfaces lie on each other and have other colours, as two places of many that look alike.
+
+        Free space alone does not count: somebody who stayed in one map, or a bent map, also makes it disagree.
+        """
+        found = self.agreement
+        return self.T_a_b is None and found is not None and found.enough and bool(found.color_reason(many=True))
 
     def tree(self) -> dict[str, Any]:
         """The figures, for a JSON file."""
@@ -93,21 +102,25 @@ def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
 
 
 def suggested_poses(
-    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig
+    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig, many: bool = False
 ) -> list[Hypothesis]:
-    """Relative poses that enough features of two maps with these keyframes suggest, best first."""
+    """Relative poses that enough features of two maps with these keyframes suggest, best first.
+
+    For two of many maps a single recognised keyframe is enough: the features of a look-alike may outnumber those of the
+    place itself, and the checks of ``decided`` are stricter then.
+    """
     found = relative_poses(a, b, camera, sensor=sensor)
+    if many:
+        return found
     return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
 
-def decided(
-    a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], min_color_share: float = MIN_COLOR_SHARE
-) -> MapPair:
+def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False) -> MapPair:
     """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
-    is taken."""
+    is taken. ``many``: The maps are two of many, most of which do not show one place."""
     first = MapPair(None, "")
     for hypothesis in found:
-        pair = _checked(a, b, hypothesis, min_color_share)
+        pair = _checked(a, b, hypothesis, many)
         if pair.T_a_b is not None:
             return pair
         first = first if first.reason else pair
@@ -120,7 +133,7 @@ def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap
     return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
 
 
-def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, min_color_share: float) -> MapPair:
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -> MapPair:
     """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
@@ -133,5 +146,5 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, min_color_sha
     if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
         return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
     checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
-    reason = checked.rejection_reason(min_color_share)
+    reason = checked.rejection_reason(many)
     return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

@@ -15,7 +15,7 @@ from dudmap.places.place_recognition import Keyframe, KeyframeDatabase
 SAME_DISTANCE, SAME_ANGLE_DEG = 0.1, 4.0
 """Two pairs of keyframes vote for the same relative pose if it differs by less than this (m, deg) where the camera of
 one of them was. The pose of one pair of keyframes is good to some centimetres and a degree (``POSITION_ERROR``)."""
-MAX_HYPOTHESES = 3
+MAX_HYPOTHESES = 5
 """Relative poses that are returned at most."""
 
 

@@ -20,6 +20,11 @@ COLOR_WEIGHT = 0.1325
 """Weight of the squared intensity difference (0..1) against the squared distance (m): thesis table 6.2."""
 COLOR_HUBER = 0.07
 """Huber threshold of the intensity difference, as in the tracker."""
+SCALE = 0.5
+"""Residual at which the Geman-McClure weight of a distance has fallen to a quarter, voxels: about the standard
+deviation of a surface. What only one of the maps has seen from the front lies up to a truncation distance off."""
+SHRINKING = 0.5
+"""Factor by which that residual becomes smaller from step to step, from the truncation distance on."""
 MIN_POINTS = 500
 """Points on the other map's surface below which the pose is not determined."""
 MIN_STIFFNESS = 0.02
@@ -34,9 +39,10 @@ class SdfAlignment:
     Attributes:
         T_a_b: (4, 4) world of b to world of a.
         converged: Whether the last step was short and enough points lie on the surface of the other map.
-        residual: Root mean square distance of the points within the truncation band, metres.
+        residual: Root mean square distance of the points, weighted as in the refinement, metres.
         stiffness: Least opposed direction over most opposed one, 0..1; see ``MIN_STIFFNESS``.
         exposure: Gain and offset that bring the intensities of b to those of a.
+        center: (3,) middle of the common surface in the world of a, metres.
     """
 
     T_a_b: NDArray[np.float64]
@@ -44,12 +50,16 @@ class SdfAlignment:
     residual: float
     stiffness: float
     exposure: tuple[float, float]
+    center: NDArray[np.float64]
 
 
 def align_maps(
     a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
 ) -> SdfAlignment:
-    """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities, with Huber weights.
+    """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
+
+    Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a scale ``c`` that shrinks from step to step (as in
+    graduated non-convexity, Yang et al. 2020), intensities Huber weights.
 
     Args:
         a, b: The maps.
@@ -57,27 +67,29 @@ def align_maps(
         T_a_b: Initial pose, closer than the truncation distance.
     """
     exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
-    center = np.zeros(3)
+    center, scale = np.zeros(3), a.truncation
     for _ in range(MAX_ITERATIONS):
         rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
         if len(rows.distance) < MIN_POINTS:
-            return SdfAlignment(T_a_b, False, residual, 0.0, exposure)
-        huber = a.voxel_size
-        H, g = _normal_equations(rows.J_distance, rows.distance, huber, 1.0)
-        H_c, g_c = _normal_equations(rows.J_shade, rows.shade, COLOR_HUBER, COLOR_WEIGHT)
+            return SdfAlignment(T_a_b, False, residual, 0.0, exposure, center)
+        scale = max(SCALE * a.voxel_size, SHRINKING * scale)
+        weights = 1 / np.square(1 + np.square(rows.distance / scale))
+        H, g = _normal_equations(rows.J_distance, rows.distance, weights)
+        lit = COLOR_WEIGHT * np.minimum(1.0, COLOR_HUBER / np.maximum(np.abs(rows.shade), 1e-12))
+        H_c, g_c = _normal_equations(rows.J_shade, rows.shade, lit)
         center = rows.points.mean(axis=0)
         stiffness = _stiffness(H + H_c, center, rows.points)
-        residual = float(np.sqrt(np.mean(np.square(rows.distance))))
+        residual = float(np.sqrt(np.average(np.square(rows.distance), weights=weights)))
         H += H_c + 1e-9 * np.trace(H) * np.eye(6)
         step = -np.linalg.solve(H, g + g_c)
         T_a_b = se3.exp(step) @ T_a_b
         T_a_b[:3, :3] = se3.nearest_rotation(T_a_b[:3, :3])
         exposure = _exposure(rows.shade_a, rows.shade_b)
         at_points = np.linalg.norm(step[:3] + np.cross(step[3:], center))
-        if at_points < STOP and np.linalg.norm(step[3:]) < STOP:
+        if scale <= SCALE * a.voxel_size and at_points < STOP and np.linalg.norm(step[3:]) < STOP:
             converged = True
             break
-    return SdfAlignment(T_a_b, converged, residual, stiffness, exposure)
+    return SdfAlignment(T_a_b, converged, residual, stiffness, exposure, center)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,10 +146,9 @@ def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> 
 
 
 def _normal_equations(
-    J: NDArray[np.float64], residual: NDArray[np.float64], huber: float, weight: float
+    J: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Matrix (6, 6) and gradient (6,) of the Huber cost of residuals (n,) with derivatives (n, 6)."""
-    weights = weight * np.minimum(1.0, huber / np.maximum(np.abs(residual), 1e-12))
+    """Matrix (6, 6) and gradient (6,) of the weighted squares of residuals (n,) with derivatives (n, 6)."""
     weighted = J * weights[:, None]
     return weighted.T @ J, weighted.T @ residual
 

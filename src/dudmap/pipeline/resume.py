@@ -11,6 +11,7 @@ from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run import Job
 from dudmap.pipeline.run_folder import RunReport, locked
 from dudmap.pipeline.storing import RunStore, check_recording, restored, stored_options
+from dudmap.state.system import on_device
 
 if TYPE_CHECKING:
     from dudmap.pipeline.observer import RunObserver
@@ -22,6 +23,7 @@ def resume(
     out: str | Path,
     sequence: "Sequence | None" = None,
     *,
+    device: str | None = None,
     progress: bool = True,
     observers: "tuple[RunObserver, ...]" = (),
 ) -> RunReport:
@@ -33,6 +35,7 @@ def resume(
     Args:
         out: The run folder.
         sequence: The recording; None opens the one that the run began with.
+        device: Device to go on on, if it is to be another one: results then differ by roundings.
         progress: Show a progress bar on a terminal.
         observers: As for ``run``.
 
@@ -54,7 +57,7 @@ def resume(
             if sequence is None:
                 sequence = open_recording(options["recording"])
             check_recording(sequence, meta, out)
-            config = Config.model_validate_json(options["config"])
+            config = on_device(Config.model_validate_json(options["config"]), device)
             display = RunProgress(options["count"] * options["passes"], bar=progress)
             try:
                 store = RunStore(out, options["every"], display.note)

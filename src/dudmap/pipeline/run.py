@@ -1,19 +1,21 @@
 """Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
-from collections.abc import Callable
-from contextlib import closing
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError
+from dudmap.gpu import faults
 from dudmap.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
-from dudmap.pipeline.storing import RunState, RunStore, Storing
+from dudmap.pipeline.storing import RunState, RunStore, Storing, restored
+from dudmap.state.database import StateReader
 
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
@@ -176,12 +178,14 @@ class Job:
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
         out, display, stopped, defect = self.out, self.display, "", False
-        with display:
+        with ExitStack() as files, display, faults.told_to(display.note):
             try:
                 if self.live:
                     display.working("loading kernels")
                     load_kernels(self._system(state, None), self.sequence, self.count)
-                self._process(state, store)
+                while not self._process(state, store):
+                    assert store is not None
+                    state, store = files.enter_context(self._from_checkpoint(state, store))
                 if len(state.slam.maps) > 1:
                     display.note(_unmerged_submaps(state.slam))
                 if state.record.dropped:
@@ -206,8 +210,13 @@ class Job:
             raise DatasetError(f"none of the {self.count} frames could be read; the first: {record.unreadable[0]}")
         return report
 
-    def _process(self, state: RunState, store: RunStore | None) -> None:
-        """Process the frames of all passes that are left."""
+    def _process(self, state: RunState, store: RunStore | None) -> bool:
+        """Process the frames of all passes that are left.
+
+        Returns:
+            Whether all of them were processed; else a device failed, and the state lacks what it had not given back.
+        """
+        lost = faults.lost_devices()
         for number in range(state.number, self.passes):
             if number > state.number:
                 state.finished = state.slam, state.record
@@ -237,9 +246,25 @@ class Job:
                     )
                     state.next = frame.number + 1
                     if store is not None:
+                        if faults.lost_devices() != lost:
+                            return False
                         store.frame(state, frame.read.frame)
         if store is not None:
             store.end(state)
+        return True
+
+    @contextmanager
+    def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
+        """Where the run stood at its last checkpoint, from which it goes on on the CPU."""
+        from dudmap.slam import Slam
+
+        store.close(finished=False)
+        with closing(StateReader(store.database.path)) as reader:
+            store = store.reopened()
+            systems = (Slam(self.sequence.camera, self.config, max_blocks=state.slam.max_blocks) for _ in range(2))
+            old, state = state, restored(reader, store, *systems)
+            self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")
+            yield state, store
 
     def _system(self, state: RunState, first_pass: "Slam | None") -> "Slam":
         """A new system for this recording."""

@@ -101,7 +101,7 @@ class RunStore:
         except sqlite3.Error as error:
             raise DudmapError(f"the state of the run cannot be stored in {out / DATABASE}: {error}") from error
         self.checkpoints = Checkpoints(self.database, every, notice)
-        self._out = out
+        self._out, self._every, self._notice = out, every, notice
 
     def begin(self, state: RunState, sequence: "Sequence", options: dict[str, Any]) -> None:
         """Store what the run is, and the state before the first frame.
@@ -126,6 +126,10 @@ class RunStore:
         """All frames are processed, and the results will be written: store the last state unless the run was short."""
         if not self.checkpoints.is_short:
             self.checkpoints.take(state.tree(), {"pass": state.number, "next": state.next, "frame": ""}, wait=True)
+
+    def reopened(self) -> "RunStore":
+        """The same after ``close``, to go on from what is stored."""
+        return RunStore(self._out, self._every, self._notice)
 
     def close(self, *, finished: bool) -> None:
         """Close the database, and remove it where the run is finished, so that only its results remain."""
@@ -180,7 +184,7 @@ def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") 
         StateError: The database is damaged.
     """
     current = {"slam": slam, "record": RunRecord(), "finished_slam": other, "finished_record": RunRecord()}
-    return RunState.of_tree(restore(reader, current, store.database))
+    return RunState.of_tree(restore(reader, current, store.database, slam.device))
 
 
 def _position(state: RunState, frame: "Frame | Exception") -> dict[str, Any]:

@@ -188,7 +188,7 @@ def restore_map(
     ):
         raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
     blocks = VoxelBlocks()
-    blocks.num_entries, blocks.num_slots = n, m
+    blocks.num_entries = n
     blocks.coords, blocks.free_count, blocks.slot_of = index["coords"], index["free_count"], index["slot_of"]
     blocks.entry_of, blocks.slot_coords = index["entry_of"], index["slot_coords"]
     blocks.written, blocks.fused, blocks._released = index["written"], index["fused"], index["released"]
@@ -197,6 +197,7 @@ def restore_map(
         setattr(blocks, name, grown(getattr(blocks, name), capacity, 0))
     blocks.entry_of = grown(blocks.entry_of, capacity, -1)
     blocks.geometry, blocks.colors = (np.zeros((capacity, BLOCK**3), np.int32) for _ in range(2))
+    blocks.use_slots(m)
     blocks.geometry[slots], blocks.colors[slots] = voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :]
     blocks.table = np.full(index["table"], hashing.EMPTY, dtype=np.int32)
     hashing.rebuild(blocks.table, blocks.coords, n)

@@ -10,6 +10,7 @@ from typing import Any
 
 from dudmap.atomic_file import bring_to_disk
 from dudmap.errors import StateError
+from dudmap.gpu import faults
 from dudmap.state.database import StateDatabase
 from dudmap.state.system import take_snapshot
 from dudmap.state.tree import NotSettledError, Snapshot
@@ -46,6 +47,7 @@ class Checkpoints:
         self._cost, self._last_cost = 0.0, 0.0  # seconds, of all checkpoints and of the last
         self._files: list[Path] = []
         self._failing = False
+        self._lost = faults.lost_devices()
 
     @property
     def is_due(self) -> bool:
@@ -86,6 +88,8 @@ class Checkpoints:
         except StateError as error:  # a defect of this program, which is no reason to end the run
             self._last = start
             self._warn(error)
+            return
+        if faults.lost_devices() != self._lost:  # the snapshot may lack what the device wrote
             return
         files, self._files = self._files, []
         self._last_cost, self._last = time.perf_counter() - start, start

@@ -216,7 +216,7 @@ class StateReader:
             if zlib.crc32(packed) != crc:
                 raise ValueError("its checksum is wrong")
             described = json.loads(zlib.decompress(packed))
-            chunks = {key.hex(): content for key, content in self._rows("SELECT key, content FROM chunks")}
+            chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
             arrays = [_array(about, chunks) for about in described["arrays"]]
             texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
             return described["tree"], arrays, [[json.loads(line) for line in text.splitlines()] for text in texts]
@@ -234,8 +234,9 @@ class StateReader:
         start = map_number << MAP_SHIFT
         select = "SELECT key, slot, crc, voxels FROM blocks WHERE key BETWEEN ? AND ? ORDER BY key"
         rows = list(self._rows(select, start | first, start | last))
-        for key, _, crc, content in rows:
-            if len(content) != 4 * VOXELS or zlib.crc32(content) != crc:
+        for key, slot, crc, content in rows:
+            whole = isinstance(slot, int) and isinstance(content, bytes) and len(content) == 4 * VOXELS
+            if not whole or zlib.crc32(content) != crc:
                 raise StateError(
                     f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
                 )
@@ -257,7 +258,7 @@ class StateReader:
             if not rows or _checksum(rows[0][1:]) != rows[0][0]:
                 raise ValueError("it is missing or not as it was written")
             return records_of(rows[0][1:])
-        except ValueError as error:
+        except (ValueError, TypeError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
 
     def frame(self, store: int, number: int) -> EncodedFrame:
@@ -268,7 +269,7 @@ class StateReader:
         """
         select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
         rows = list(self._rows(select, store, number))
-        if not rows:
+        if not rows or not all(isinstance(content, bytes) for content in rows[0]):
             raise StateError(f"the state of the run in {self.path} is damaged: stored frame {number} is missing")
         depth, color, mask = rows[0]
         return depth, color, mask
@@ -341,5 +342,5 @@ def _checked(key: str, content: bytes) -> bytes:
 def _parsed(text: str, path: Path) -> Any:  # noqa: ANN401
     try:
         return json.loads(text)
-    except ValueError as error:
+    except (ValueError, TypeError, RecursionError) as error:
         raise StateError(f"the state of the run in {path} is damaged: {error}") from error

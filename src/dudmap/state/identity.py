@@ -25,7 +25,7 @@ def code_fingerprint() -> str:
     """
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     root = files("dudmap")
-    for part in (*PACKAGES, "state", "pipeline.storing"):
+    for part in (*PACKAGES, "gpu", "gpu.kernels", "state", "pipeline.storing"):
         place = root.joinpath(*part.split("."))
         found = place.iterdir() if place.is_dir() else [root.joinpath(*f"{part.replace('.', '/')}.py".split("/"))]
         for file in sorted(found, key=lambda one: one.name):

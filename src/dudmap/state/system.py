@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.errors import StateError
 from dudmap.geometry.camera import Camera
+from dudmap.gpu.device import make_backend
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.environment import versions
 from dudmap.places.frame_store import FrameStore
@@ -36,13 +37,14 @@ def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) 
     return TreeWriter(database.maps, database.frames, wait=wait).take(value)
 
 
-def restore(reader: StateReader, current: object, database: StateDatabase | None = None) -> Any:  # noqa: ANN401
+def restore(reader: StateReader, current: object, database: StateDatabase | None = None, device: str = "cpu") -> Any:  # noqa: ANN401
     """The value that was stored last.
 
     Args:
         reader: The database, which stays open as long as the system lives: it reads stored frames when it needs them.
         current: A new value of the same kind; see ``TreeReader.restore``.
         database: Takes note of what it holds already, where the run goes on in the same database.
+        device: Device of the maps that ``current`` lacks.
 
     Raises:
         StateError: The database is damaged or of another version, or holds no state yet.
@@ -64,7 +66,8 @@ def restore(reader: StateReader, current: object, database: StateDatabase | None
         if database is not None:
             database.frames.add(store, number)
 
-    value = TreeReader(arrays, records, load_map, load_frames).restore(tree, current)
+    reading = TreeReader(arrays, records, load_map, load_frames, lambda: make_backend(device))
+    value = reading.restore(tree, current)
     reader.release()
     return value
 
@@ -88,7 +91,7 @@ def save_system(slam: "Slam", path: Path) -> None:
         raise StateError(f"the state cannot be written to {path}: {error}") from error
 
 
-def resume_system(path: Path) -> "Slam":
+def resume_system(path: Path, device: str | None) -> "Slam":
     """See ``Slam.resume``."""
     from dudmap.slam import Slam
 
@@ -96,7 +99,14 @@ def resume_system(path: Path) -> "Slam":
     meta = reader.meta()
     check_code(meta, path)
     camera = meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])}
-    return restore(reader, Slam(Camera(**camera), Config.model_validate_json(meta["config"])))
+    config = on_device(Config.model_validate_json(meta["config"]), device)
+    slam = Slam(Camera(**camera), config)
+    return restore(reader, slam, device=slam.device)
+
+
+def on_device(config: Config, device: str | None) -> Config:
+    """The configuration with another device; None keeps that of the run."""
+    return config if device is None else config.override([f"device={device}"])
 
 
 def check_code(meta: dict[str, Any], path: Path) -> None:

@@ -21,6 +21,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from dudmap.errors import StateError
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.state import wiring
@@ -91,6 +93,8 @@ class TreeWriter:
             return {"same": self._seen[id(value)][0]}
         number = len(self._seen)
         self._seen[id(value)] = number, value
+        if type(value).__name__ in wiring.BACKENDS:
+            return {"backend": number}
         if isinstance(value, np.ndarray):
             return {"array": self._array(value, place, constant=constant), "id": number}
         if isinstance(value, BaseModel):
@@ -184,6 +188,7 @@ class TreeReader:
         records: Lists of plain values by number.
         load_map: Fills a map, given its number in the database and what the tree says of its blocks.
         load_frames: Connects a frame store with the stored frames of a number.
+        make_backend: Makes a back end where the given system has none in that place.
     """
 
     def __init__(
@@ -192,9 +197,10 @@ class TreeReader:
         records: Sequence[list[Any]],
         load_map: Callable[[TsdfVolume, int, dict[str, Any]], None],
         load_frames: Callable[[FrameStore, int], None],
+        make_backend: Callable[[], Backend] = CpuBackend,
     ) -> None:
         self._arrays, self._records = arrays, records
-        self._load_map, self._load_frames = load_map, load_frames
+        self._load_map, self._load_frames, self._make_backend = load_map, load_frames, make_backend
         self._made: dict[int, Any] = {}
         self._taken: set[int] = set()  # identities of the objects of the given system that are in use
 
@@ -218,6 +224,9 @@ class TreeReader:
             return node
         if "same" in node:
             return self._made[node["same"]]
+        if "backend" in node:
+            usable = type(current).__name__ in wiring.BACKENDS and id(current) not in self._taken
+            return self._use(node["backend"], current if usable else self._make_backend())
         if "scalar" in node:
             return np.dtype(node["scalar"]).type(node["value"])
         if "object" in node:
@@ -226,6 +235,12 @@ class TreeReader:
         if value is None:
             return self._mutable(node, current)
         self._made[node["id"]] = value
+        return value
+
+    def _use(self, number: int, value: Any) -> Any:  # noqa: ANN401
+        """Note that an object stands for a number of the tree and for no other."""
+        self._made[number] = value
+        self._taken.add(id(value))
         return value
 
     def _leaf(self, node: dict[str, Node]) -> Any:  # noqa: ANN401
@@ -290,9 +305,7 @@ class TreeReader:
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
         cls = _class(node["object"])
         usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
-        value = current if usable else object.__new__(cls)
-        self._made[node["id"]] = value
-        self._taken.add(id(value))
+        value = self._use(node["id"], current if usable else object.__new__(cls))
         rebuilt = wiring.rebuilt(cls)
         content = node["attributes"]
         if usable:
@@ -322,8 +335,6 @@ def _defaults(cls: type) -> dict[str, Any]:
     """Values of the attributes that are not stored, of an object that is made without its constructor."""
     made: dict[str, dict[str, Any]] = {
         "BlockPager": {"_store": None, "_executor": None},
-        "CpuBackend": {"_padded": np.empty((0, 0), np.float32), "_limited": np.empty((0, 0), np.float32),
-                       "_pixels": np.empty((0, 2), np.int32)},
         "FrameStore": {"registered": None, "_file": None, "_encoder": None, "_pending": deque()},
         "LoopCloser": {"_executor": None},
         "Observation": {"_halvings": [], "_recorded_halvings": []},

@@ -20,14 +20,16 @@ REBUILT = {
         "_archived",
         "_archive",
     ),
-    "CpuBackend": ("_padded", "_limited", "_pixels"),  # buffers that every call fills anew
     "FrameStore": ("registered", "_offsets", "_file", "_encoder", "_pending", "archived"),  # the frames have a table
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
+    "Slam": ("device",),  # a run may be continued on another one
     "TsdfVolume": ("blocks", "window", "map_id"),  # the blocks have a table; the number is one of this process
 }
 """Attributes by class that a new object makes itself, so that they are not part of the state."""
+BACKENDS = frozenset({"CpuBackend", "FallbackBackend"})
+"""Classes of back ends, which hold nothing that is part of the state: a new one may be of another device."""
 EVALUATED = {"FrameView": ("segmentation",)}
 """Attributes that are functions without arguments, of which the result is stored."""
 CONSTANT = frozenset({"PlacedFeatures", "Preprocessor"})

@@ -6,52 +6,20 @@ import warp as wp
 
 from dudmap.kernels import parameters
 
-
-@wp.struct
-class SensorNoise:
-    """See ``parameters.SensorNoise``."""
-
-    base: wp.float32
-    scale: wp.float32
+_STRUCTS: dict[type, Any] = {}
 
 
-@wp.struct
-class TruncationBand:
-    """See ``parameters.TruncationBand``."""
-
-    front: wp.float32
-    behind: wp.float32
-    sigmas: wp.float32
-    limit: wp.float32
-    noise: SensorNoise
+def _struct_of(kind: type) -> Any:
+    """Structure of Warp with the fields of a named tuple of numbers and of such tuples."""
+    fields = {name: _STRUCTS.get(one, wp.float32) for name, one in kind.__annotations__.items()}
+    _STRUCTS[kind] = wp.struct(type(kind.__name__, (), {"__annotations__": fields, "__module__": __name__}))
+    return _STRUCTS[kind]
 
 
-@wp.struct
-class FusionParameters:
-    """See ``parameters.FusionParameters``."""
-
-    band: TruncationBand
-    voxel_size: wp.float32
-    sdf_unit: wp.float32
-    depth_unit: wp.float32
-    max_weight: wp.float32
-    max_readings: wp.float32
-    carve_rate: wp.float32
-    depth_min: wp.float32
-    depth_max: wp.float32
-
-
-@wp.struct
-class RegistrationParameters:
-    """See ``parameters.RegistrationParameters``."""
-
-    band: TruncationBand
-    huber: wp.float32
-    tukey: wp.float32
-    color_weight: wp.float32
-    color_huber: wp.float32
-    sigma_at_one_metre: wp.float32
-    noise_weighting: wp.float32
+SensorNoise = _struct_of(parameters.SensorNoise)
+TruncationBand = _struct_of(parameters.TruncationBand)
+FusionParameters = _struct_of(parameters.FusionParameters)
+RegistrationParameters = _struct_of(parameters.RegistrationParameters)
 
 
 @wp.struct
@@ -79,14 +47,6 @@ class Lattice:
     nx: wp.int32
     ny: wp.int32
     nz: wp.int32
-
-
-_STRUCTS: dict[type, Any] = {
-    parameters.SensorNoise: SensorNoise,
-    parameters.TruncationBand: TruncationBand,
-    parameters.FusionParameters: FusionParameters,
-    parameters.RegistrationParameters: RegistrationParameters,
-}
 
 
 def struct(values: tuple) -> Any:

@@ -1,0 +1,63 @@
+"""``dudmap benchmark gpu``: time, memory and bandwidth of a GPU and of the CPU beside it."""
+
+import json
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from dudmap.cli.output import JsonOption, answer
+
+
+def gpu(
+    device: Annotated[str, typer.Option("--device", help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
+    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames of each run.")] = 120,
+    voxels: Annotated[
+        str, typer.Option("--voxels", help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")
+    ] = "2,1,0.5,0.25",
+    sizes: Annotated[
+        str, typer.Option("--sizes", help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
+    ] = "640x480,1280x720",
+    recording: Annotated[
+        list[Path] | None, typer.Option("--recording", help="Also measure this recording; repeatable.")
+    ] = None,
+    open3d: Annotated[
+        Path | None,
+        typer.Option(
+            "--open3d", metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."
+        ),
+    ] = None,
+    out: Annotated[Path, typer.Option("--out", help="Output folder for gpu.md and gpu.json.")] = Path(
+        "runs/benchmark/gpu"
+    ),
+    quick: Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")] = False,
+    as_json: JsonOption = False,
+) -> None:
+    """Measure a GPU and the CPU beside it: time by stage and kernel, memory, and share of the memory bandwidth.
+
+    Without a GPU, only the CPU is measured, and the table says why.
+    """
+    from dudmap.benchmark import gpu as measurements
+    from dudmap.benchmark.interleaved import find_open3d
+    from dudmap.pipeline.environment import machine, versions
+
+    rows, python = [], find_open3d(open3d)
+    steps, shapes = measurements.numbers(voxels, sizes)
+    if quick:
+        steps, shapes, frames = steps[:1], [(320, 240)], min(frames, 12)
+    for name, each in measurements.recordings(shapes, frames, recording or []):
+        for step in steps:
+            for one in measurements.devices(device):
+                typer.echo(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
+                rows.append(measurements.measure(name, each, frames, step, one))
+        if python is not None:
+            other = measurements.devices(device)[0].upper()
+            typer.echo(f"measuring {name}, Open3D's dense SLAM", err=True)
+            rows += measurements.measure_open3d(python, name, each, frames, steps, "CPU:0" if other == "CPU" else other)
+    text = measurements.table(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    (out / "gpu.md").write_text(text, encoding="utf-8")
+    content = {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
+    (out / "gpu.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)

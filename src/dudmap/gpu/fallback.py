@@ -1,0 +1,115 @@
+"""A device with the CPU behind it: what the device cannot do is done there, and the run goes on."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.gpu import faults
+from dudmap.gpu.backend import WarpBackend
+from dudmap.gpu.memory import OnDevice
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.parameters import DepthView, FusedBlocks, ImageStack, NormalEquations, VoxelGrid
+
+KEPT_EVERY = 100
+"""Fused frames after which the host takes over what the device has written, some ten megabytes for the blocks in view:
+so many are missing in the map at most if the device is lost. It does so more often at the start, after 1, 2, 4, 8, ...
+frames, so that at least half of a small map is there."""
+
+
+class FallbackBackend:
+    """``Backend`` on a device, each operation of which the CPU takes over when the device fails.
+
+    A device that is lost is left for good: the map then is as the host has it. One that has too little memory for an
+    operation is left for this once, and one that cannot hold the map is left by this map.
+
+    Args:
+        device: Name of the device in Warp.
+    """
+
+    def __init__(self, device: str) -> None:
+        self.device = device
+        self._on_device, self._on_cpu = WarpBackend(device), CpuBackend()
+        self._is_full = False
+        self._num_fused = self._num_kept = 0
+
+    def perform(self, name: str, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
+        """Result of an operation of ``Backend``."""
+        if not (self._is_full or faults.is_lost(self.device)):
+            try:
+                result = getattr(self._on_device, name)(*arguments)
+                if isinstance(result, NormalEquations):
+                    return result._replace(residuals=_Residuals(self, result.residuals, arguments))
+                if isinstance(result, FusedBlocks):
+                    self._keep(arguments[0])
+                return result
+            except Exception as error:
+                faults.handle(error, self.device, f"the operation {name}")
+                if isinstance(error, faults.DeviceFullError):
+                    self._leave(arguments)
+        return self.perform_on_cpu(name, arguments)
+
+    def perform_on_cpu(self, name: str, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
+        """The same by the CPU, whatever the device can do."""
+        found = [self._viewed(value) if isinstance(value, DepthView) else value for value in arguments]
+        result = getattr(self._on_cpu, name)(*found)
+        if isinstance(result, FusedBlocks):
+            for array in _mirrors(arguments[:1]):
+                if array is not arguments[0].window:
+                    array.wrote(result.slots)
+        return result
+
+    def _viewed(self, view: DepthView) -> DepthView:
+        """The view with tiles in the host's memory."""
+        return self._on_cpu.view(view.depth, view.intrinsics, view.T_grid_camera, view.T_camera_world)
+
+    def _leave(self, arguments: tuple[Any, ...]) -> None:
+        """Bring the map to the host, which has all of it from now on."""
+        self._is_full = True
+        for array in _mirrors(arguments):
+            array.detach()
+
+    def _keep(self, grid: VoxelGrid) -> None:
+        """Bring the voxels to the host now and then."""
+        self._num_fused += 1
+        if self._num_fused - self._num_kept >= min(max(self._num_kept, 1), KEPT_EVERY):
+            self._num_kept = self._num_fused
+            grid.on_host()
+
+
+class _Residuals:
+    """Residual images of a linearisation on a device, which the CPU computes anew if the device fails meanwhile."""
+
+    def __init__(self, backend: FallbackBackend, images: ImageStack, arguments: tuple[Any, ...]) -> None:
+        self._backend, self._images, self._arguments = backend, images, arguments
+
+    def __getitem__(self, number: int) -> NDArray[np.float32]:
+        if isinstance(self._images, OnDevice):
+            try:
+                return self._images[number]
+            except Exception as error:
+                faults.handle(error, self._backend.device, "the residuals")
+            self._images = self._backend.perform_on_cpu("linearize", self._arguments).residuals
+        return self._images[number]
+
+
+def _mirrors(arguments: tuple[Any, ...]) -> list[Mirror]:
+    """Arrays of the map among the arguments of an operation, which may have a copy on a device."""
+    values = [value for one in arguments for value in (one if isinstance(one, VoxelGrid) else (one,))]
+    return [value for value in values if isinstance(value, Mirror)]
+
+
+def _operation(name: str) -> Callable[..., Any]:
+    def operation(self: FallbackBackend, *arguments: Any) -> Any:  # noqa: ANN401
+        return self.perform(name, arguments)
+
+    operation.__doc__ = f"See ``Backend.{name}``."
+    return operation
+
+
+for _name in vars(Backend):
+    if not _name.startswith("_"):
+        setattr(FallbackBackend, _name, _operation(_name))
