@@ -12,7 +12,7 @@ from dudmap.kernels.finest import corners_at, finest_at, least_weight
 from dudmap.kernels.neighbors import load_row
 from dudmap.kernels.parameters import MapSample, NormalEquations, RegistrationParameters, VoxelGrid, single
 from dudmap.kernels.pixel import elements, ray, rotate, transform
-from dudmap.kernels.registration import NUM_SUMS, SYMMETRIC
+from dudmap.kernels.registration import NUM_SUMS, normal_equations
 from dudmap.kernels.residual import normal_terms, trilinear, weigh
 from dudmap.kernels.threads import bands, kernel, run_bands
 from dudmap.kernels.voxel import intensity_of, sdf_steps
@@ -313,11 +313,7 @@ def linearize(
         ),
         ranges, list(sums),
     )  # fmt: skip
-    total = sums.sum(axis=0)
-    return NormalEquations(
-        total[SYMMETRIC], total[21:27], float(total[27]), int(total[28]), float(total[29]), float(total[30]),
-        float(total[31]), residuals,
-    )  # fmt: skip
+    return normal_equations(sums.sum(axis=0), residuals)
 
 
 def refine_sample(
