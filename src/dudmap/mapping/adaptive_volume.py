@@ -15,17 +15,9 @@ from dudmap.errors import ConfigError, MapError
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh, joined
 from dudmap.kernels.adaptive_raycasting import raycast
-from dudmap.kernels.adaptive_registration import linearize, refine_sample
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.parameters import (
-    DepthView,
-    MapSample,
-    NormalEquations,
-    RaycastParameters,
-    RaycastResult,
-    RegistrationParameters,
-)
+from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
 from dudmap.mapping.adaptive_mesh import NO_CHILDREN, NO_VOXELS, extract_groups
 from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
@@ -51,7 +43,8 @@ def make_volume(
 class AdaptiveVolume(TsdfVolume):
     """A map whose voxels are halved where the surface is curved or finely coloured and the sensor resolves it.
 
-    What is known of a view (``known_share``) is that of the coarsest level; see ``docs/adaptive.md``.
+    Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
+    mesh and views read the finest. See ``docs/adaptive.md``.
 
     Args:
         camera, config, sensor, depth_max, backend, max_blocks, extent: As of ``TsdfVolume``.
@@ -206,62 +199,15 @@ class AdaptiveVolume(TsdfVolume):
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
-    @property
-    def _tree(self) -> tuple[NDArray[np.int32], ...]:
-        """Slots of the children of the first two levels (slots, 8), as the kernels take them."""
-        return (*(level.children for level in self.levels), NO_CHILDREN)[:2]
-
-    @property
-    def _finer_voxels(self) -> tuple[NDArray[np.int32], ...]:
-        return (*(level.blocks.geometry for level in self.levels), NO_VOXELS)[:2]
-
-    def _shows_finer_voxels(self, camera: Camera) -> bool:
-        """Whether a pixel is smaller than a voxel at the largest depth at which smaller voxels are opened."""
-        sensor, voxel_size = self.sensor, self.voxel_size
-        depth = np.sqrt(max(voxel_size / 2 - sensor.sigma_base, 0) / max(sensor.sigma_scale, 1e-9))
-        return min(depth, self.depth_max) < voxel_size * camera.fx
-
-    def linearize(
-        self,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        camera: Camera,
-        T_world_camera: NDArray[np.float64],
-        parameters: RegistrationParameters,
-    ) -> NormalEquations:
-        """See ``TsdfVolume.linearize``; images with larger pixels than voxels see the coarsest level alone."""
-        if not self._shows_finer_voxels(camera):
-            return super().linearize(depth, intensity, weights, camera, T_world_camera, parameters)
-        T = self.window.T_grid_camera(T_world_camera)
-        return linearize(
-            self.grid, self._tree, self._finer_voxels, depth, intensity, weights, camera.intrinsics, T, parameters
-        )
-
-    def sample(
-        self,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        camera: Camera,
-        T_world_camera: NDArray[np.float64],
-    ) -> MapSample:
-        """See ``TsdfVolume.sample``; as of ``linearize``."""
-        sample = super().sample(depth, intensity, camera, T_world_camera)
-        if self._shows_finer_voxels(camera):
-            T = self.window.T_grid_camera(T_world_camera)
-            refine_sample(sample, self.grid, self._tree, self._finer_voxels, depth, intensity, camera.intrinsics, T)
-        return sample
-
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
         """See ``TsdfVolume.raycast``."""
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        tree = (*(level.children for level in self.levels), NO_CHILDREN)[:2]
+        geometry = (*(level.blocks.geometry for level in self.levels), NO_VOXELS)[:2]
         colors = (*(level.blocks.colors for level in self.levels), NO_VOXELS)[:2]
-        return raycast(
-            self.grid, self._tree, self._finer_voxels, colors, T_world_camera, camera.intrinsics, camera.shape,
-            parameters,
-        )  # fmt: skip
+        return raycast(self.grid, tree, geometry, colors, T_world_camera, camera.intrinsics, camera.shape, parameters)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by dual contouring, where every cell corner has at least ``min_weight``

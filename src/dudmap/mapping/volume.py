@@ -20,10 +20,8 @@ from dudmap.kernels.parameters import (
     UNKNOWN,
     MapSample,
     MeshParameters,
-    NormalEquations,
     RaycastParameters,
     RaycastResult,
-    RegistrationParameters,
     VoxelGrid,
 )
 from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
@@ -251,19 +249,6 @@ class TsdfVolume:
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
         return self._integrator.grid(self.blocks, self.window)
-
-    def linearize(
-        self,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        weights: NDArray[np.float32],
-        camera: Camera,
-        T_world_camera: NDArray[np.float64],
-        parameters: RegistrationParameters,
-    ) -> NormalEquations:
-        """Normal equations of the registration of an image (h, w) of ``camera`` at a pose inside the window."""
-        T = self.window.T_grid_camera(T_world_camera)
-        return self.backend.linearize(self.grid, depth, intensity, weights, camera.intrinsics, T, parameters)
 
     def sample(
         self,

@@ -117,7 +117,7 @@ class Tracker:
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
         volume.look_at(T_init)
-        T, iterations, system, settled, seen = T_init, 0, None, True, COMPLETE
+        T, iterations, system, settled, seen = T_init, 0, None, True, None
         lit, weights = levels[-1], np.ones_like(levels[-1].depth)
         for index, level in enumerate(levels):
             limit = self.config.iterations[first_level + index]
@@ -136,14 +136,15 @@ class Tracker:
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
             stop = self.config.stop if finest else self.config.stop_coarse
-            seen = self._observability(volume, lit, T, weights, system, color_weight)
+            if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
+                seen = self._observability(volume, lit, T, weights, system, color_weight)
             T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight, seen)
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
         T = T.copy()
         T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return replace(self._judge(T, exposure, system, lit, weights, iterations, seen), settled=settled)
+        return replace(self._judge(T, exposure, system, lit, weights, iterations, seen or COMPLETE), settled=settled)
 
     def _observability(
         self,
@@ -155,25 +156,17 @@ class Tracker:
         color_weight: float | None,
     ) -> Observability:
         """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
-        config, R = self.config, T_world_camera[:3, :3]
-        color_weight = config.color_weight if color_weight is None else color_weight
-        if config.min_information == 0:
+        least, R = self.config.min_information, T_world_camera[:3, :3]
+        if least == 0:
             return COMPLETE
+        parameters = self._parameters(volume, color_weight)
         noise = gradient_noise(
-            level,
-            system.residuals,
-            weights,
-            R,
-            volume.voxel_size,
-            volume.camera.width,
-            color_weight,
-            config,
-            self.sensor,
-        )
-        if noise is None or noise.is_exceeded(system.H, config.min_information):
+            level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, parameters
+        )  # fmt: skip
+        if noise is None or noise.is_exceeded(system.H, least):
             return COMPLETE
         distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
-        return noise.observability(distances.H, system.H, R, config.min_information)
+        return noise.observability(distances.H, system.H, R, least)
 
     def _optimize(
         self,
@@ -232,19 +225,24 @@ class Tracker:
             weights: (h, w) float32 static weights in [0, 1].
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
+        equations = volume.backend.linearize(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
+            volume.window.T_grid_camera(T_world_camera), self._parameters(volume, color_weight),
+        )  # fmt: skip
+        return LinearSystem(*equations)
+
+    def _parameters(self, volume: TsdfVolume, color_weight: float | None) -> RegistrationParameters:
+        """Parameters of the cost in a map; ``color_weight`` None takes that of the configuration."""
         config, sensor = self.config, self.sensor
-        color_weight = config.color_weight if color_weight is None else color_weight
-        parameters = RegistrationParameters(
+        return RegistrationParameters(
             band=volume.band,
             huber=config.huber,
             tukey=config.tukey if config.robust == "tukey" else 0.0,
-            color_weight=color_weight,
+            color_weight=config.color_weight if color_weight is None else color_weight,
             color_huber=config.color_huber,
             sigma_at_one_metre=sensor.sigma(1.0),
             noise_weighting=float(config.noise_weighting),
         )
-        equations = volume.linearize(level.depth, level.intensity, weights, level.camera, T_world_camera, parameters)
-        return LinearSystem(*equations)
 
     def _judge(
         self,
