@@ -33,20 +33,21 @@ def main() -> None:
     parser.add_argument("--length", type=float, default=300.0, help="of the walk until it is where it began, metres")
     parser.add_argument("--max-memory", default="1GB")
     parser.add_argument("--speed", type=float, default=1.0, help="m/s")
+    parser.add_argument("--beyond", type=float, default=12.0, help="length of the walk after that, metres")
     parser.add_argument("--fps", type=float, default=20.0)
     parser.add_argument("--size", default="320x240")
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE")
     options = parser.parse_args()
     width, height = (int(number) for number in options.size.split("x"))
     camera = DEFAULT_CAMERA.resized(width, height)
-    corridor = ring_corridor(options.length, options.speed, options.fps, camera=camera)
+    corridor = ring_corridor(options.length, options.speed, options.fps, options.beyond, camera)
     limit = None if options.max_memory == "none" else MemoryLimit(memory_size(options.max_memory))
     slam = Slam(camera, Config().override(options.set), max_blocks=limit)
     print(f"{len(corridor)} frames of {options.size}, {options.length:g} m; {machine()['cpu']}")
     print("| walk m | ms per frame, median | memory MB | blocks in memory | on disk | lost | corrections |")
     print("|---|---|---|---|---|---|---|")
     times, lost, corrected, tenth = [], 0, [], max(len(corridor) // 10, 1)
-    medians, reasons = [], {}
+    medians, reasons, slowest = [], {}, []
     with ThreadPoolExecutor(1) as reader:
         following = reader.submit(corridor.__getitem__, 0)
         for number in range(len(corridor)):
@@ -54,6 +55,8 @@ def main() -> None:
             start = time.perf_counter()
             result = slam.process(frame)
             times.append(1000 * (time.perf_counter() - start))
+            stage = max(result.timings, key=result.timings.__getitem__, default="")
+            slowest = sorted([*slowest, (times[-1], number, stage, result.timings.get(stage, 0.0))])[-5:]
             following = reader.submit(corridor.__getitem__, min(number + 1, len(corridor) - 1))
             following.result()
             if result.T_world_camera is None:
@@ -73,6 +76,8 @@ def main() -> None:
     print(f"\ntime per frame, last tenth over first: {medians[-1] / medians[0]:.2f}; slowest frame {max(times):.0f} ms")
     print(f"peak memory {peak_rss_mb()} MB; ATE {100 * found['ate_rmse_m']:.1f} cm; "
           f"corrected at frames {corrected}")  # fmt: skip
+    for total, number, stage, most in reversed(slowest):
+        print(f"slow: frame {number}, {total:.0f} ms, of which {stage} {most:.0f} ms")
     for reason, numbers in reasons.items():
         print(f"lost, {reason}: frames {numbers}")
     shares = [_covered(corridor, slam, number) for number in range(0, len(corridor), max(len(corridor) // 60, 1))]

@@ -1,15 +1,19 @@
 """A map whose far blocks wait on disk is the map that is in memory as a whole."""
 
 import sqlite3
+import threading
+import time
 
 import numpy as np
 import pytest
 
 from dudmap.errors import MapError
 from dudmap.geometry import se3
+from dudmap.mapping.block_pager import MAX_PENDING, REGION, BlockPager
 from dudmap.mapping.incremental_mesh import IncrementalMesh
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.mapping.voxel_blocks import VoxelBlocks
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.system import restore, take_snapshot
 from triangles import triangles
@@ -153,3 +157,43 @@ def test_a_paged_map_is_stored_and_goes_on(tmp_path):
             assert content(paged) == content(whole)
     assert content(paged) == content(whole)
     database.close()
+
+
+def scattered(*starts):
+    """Blocks, each in a region of its own along x, 20 regions from each start (block coordinates)."""
+    blocks = VoxelBlocks()
+    coords = np.array([(start + REGION * n, 0, 0) for start in starts for n in range(20)], np.int32)
+    blocks.allocate(blocks.entries_at(coords, len(coords)), 1)
+    return blocks
+
+
+def seen(pager, blocks, start):
+    pager.focus(blocks, np.array([start + 8, 0, 0]), np.array([start + 19 * REGION, 8, 8]), 1)
+
+
+def test_no_frame_waits_for_the_disk(monkeypatch):
+    written, resume = RegionStore.write, threading.Event()
+    monkeypatch.setattr(RegionStore, "write", lambda *arguments: (resume.wait(20), written(*arguments)))
+    blocks, pager = scattered(0, 2000, 4000, 6000), BlockPager(79)
+    start = time.perf_counter()
+    seen(pager, blocks, 0)
+    assert time.perf_counter() - start < 5
+    assert blocks.num_voxel_blocks == 80 - MAX_PENDING
+    resume.set()
+    pager.clear()
+
+
+def test_what_is_far_leaves_before_what_is_near_comes(monkeypatch):
+    blocks, pager = scattered(0, 2000), BlockPager(25)
+    seen(pager, blocks, 0)
+    assert blocks.num_voxel_blocks <= 25
+    insert, most = VoxelBlocks.insert, []
+
+    def counted(self, *rest):
+        insert(self, *rest)
+        most.append(self.num_voxel_blocks)
+
+    monkeypatch.setattr(VoxelBlocks, "insert", counted)
+    seen(pager, blocks, 2000)
+    assert len(most) >= 15
+    assert max(most) <= 25

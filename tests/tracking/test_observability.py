@@ -11,7 +11,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.motion_model import MAX_DRIFT, MotionModel
-from dudmap.tracking.observability import GradientNoise, sentence
+from dudmap.tracking.observability import FILTER_PX, INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
 from dudmap.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
@@ -115,6 +115,48 @@ def test_truncated_step_leaves_the_free_direction_alone():
     assert spans(seen.unobservable @ np.kron(np.eye(2), R).T, free[None])
     b = rng.normal(size=6)
     assert abs(seen.step(J.T @ J, b) @ free) < 1e-9
+
+
+@pytest.mark.parametrize("robust", ["huber", "tukey"])
+def test_noise_is_the_sum_over_the_readings(robust):
+    rng = np.random.default_rng(4)
+    config = Config().override([f"tracker.robust={robust}"])
+    level = Pyramid.of(frame(corner, grey, rng), CAMERA, config).tracked[0]
+    shape = level.depth.shape
+    residuals = rng.normal(0, [[[0.02]], [[0.1]]], (2, *shape)).astype(np.float32)
+    residuals[:, rng.random(shape) < 0.1] = np.nan
+    weights = rng.random(shape).astype(np.float32)
+    volume = TsdfVolume(CAMERA, CONFIG.volume, config.sensor, 6.0)
+    R = se3.exp_rotation(np.array([0.4, -0.3, 0.2]))
+    parameters = Tracker(config.tracker, config.sensor)._parameters(volume, None)
+    found = gradient_noise(level, residuals, weights, R, 0.03, CAMERA.width, parameters)
+    distances, intensities, total = np.zeros((6, 6)), np.zeros((6, 6)), 0.0
+    stride, t, scale = level.camera.width // 40, config.tracker, level.camera.width / CAMERA.width
+    for v in range(stride // 2, shape[0], stride):
+        for u in range(stride // 2, shape[1], stride):
+            if np.isnan(residuals[1, v, u]):
+                continue
+            z, pixel = float(level.depth[v, u]), float(level.depth[v, u]) / level.camera.fx
+            p = R @ [(u - level.camera.cx) * pixel, (v - level.camera.cy) * pixel, z]
+            J = np.hstack([np.eye(3), -se3.hat(p)])
+            ratio = min(config.sensor.sigma(1.0) / config.sensor.sigma(z), 1)
+            a, c = abs(residuals[:, v, u].astype(float)) * (ratio, 1)
+            w = weights[v, u] * ratio**2
+            w *= t.huber / max(a, t.huber) if robust == "huber" else max(1 - (a / t.tukey) ** 2, 0) ** 2
+            around = level.depth[max(v - 1, 0) : v + 2, max(u - 1, 0) : u + 2].astype(float)
+            middle = min(v, 1), min(u, 1)
+            step = np.hypot(np.ptp(around[:, middle[1]][[0, -1]]), np.ptp(around[middle[0]][[0, -1]])) / 2
+            step = min(step, 9.5 * pixel) * scale
+            width = np.hypot(FILTER_PX * scale * pixel, 0.015)
+            variance = (config.sensor.sigma(z) * pixel) ** 2 / (8 * np.pi * width**4)
+            variance += 2 * (2 / 3) ** 2 * step**2 / 12 / 0.03**2
+            distances += stride**2 * w * variance * J.T @ J
+            total += w * variance
+            shade = t.color_weight * weights[v, u] * t.color_huber / max(c, t.color_huber)
+            intensities += stride**2 * shade * 2 * (2 / 3) ** 2 * (INTENSITY_SIGMA / 0.03) ** 2 * J.T @ J
+    assert total > 0
+    np.testing.assert_allclose(found.distances, distances, rtol=1e-3, atol=1e-4 * distances.max())
+    np.testing.assert_allclose(found.intensities, intensities, rtol=1e-3, atol=1e-4 * intensities.max())
 
 
 def test_sentence_names_the_directions():

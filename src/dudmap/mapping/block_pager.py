@@ -4,7 +4,7 @@ The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Nie
 """
 
 import weakref
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from itertools import product
@@ -149,11 +149,12 @@ class BlockPager:
             (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS,
         )
         self._settle(blocks, frame_number)
+        wanted = self._stored_in(first, last) if self._away else []
+        self._make_room(blocks, first, last, frame_number, wanted)
+        for region in wanted:
+            self._bring_back(blocks, region, frame_number)
         if self._away:
-            for region in self._stored_in(first, last):
-                self._bring_back(blocks, region, frame_number)
             self._read_ahead(first, last)
-        self._make_room(blocks, first, last, frame_number)
 
     def _stored_in(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> list[Region]:
         """Regions of the box from ``first`` to ``last`` that are in the store."""
@@ -167,8 +168,9 @@ class BlockPager:
         if region in self._writing:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
-            read = self._reading.pop(region, None) or self._submit(self._read, region)
-            records = read.result()
+            read = self._reading.pop(region, None)
+            # one that waits behind regions to be written is read at once
+            records = self._read(region) if read is None or read.cancel() else read.result()
             if region not in self._archived:
                 self._unchanged_since[region] = frame_number
         del self._away[region]
@@ -192,26 +194,37 @@ class BlockPager:
         return self._stored.read(region)
 
     def _make_room(
-        self, blocks: VoxelBlocks, first: NDArray[np.integer], last: NDArray[np.integer], frame_number: int
+        self,
+        blocks: VoxelBlocks,
+        first: NDArray[np.integer],
+        last: NDArray[np.integer],
+        frame_number: int,
+        coming: Sequence[Region],
     ) -> None:
-        """Move the regions farthest from the box to the store while there are too many blocks."""
+        """Move the regions farthest from the box to the store while there are too many blocks with those that come.
+
+        Beyond what must leave only as many do as can wait to be written, so that no frame waits for the disk.
+        """
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(blocks)
-        if blocks.num_voxel_blocks <= allowed or self._retry_in:
+        needed = blocks.num_voxel_blocks + sum(self._away[region].voxel_blocks for region in coming)
+        if needed <= allowed or self._retry_in:
             return
         keys, region_of = _regions_of_entries(blocks)
         owned = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
         outside = np.maximum(np.maximum(first - keys, keys - last), 0)
         distance = np.linalg.norm(outside, axis=1)
         leaving = np.zeros(len(keys), dtype=bool)
-        surplus = blocks.num_voxel_blocks - ROOM * allowed
+        at_once = MAX_PENDING - len(self._writing)
         for n in np.lexsort((np.arange(len(keys)), -distance)):
-            if surplus <= 0 or distance[n] == 0:
+            enough = needed <= (allowed if np.count_nonzero(leaving) >= at_once else ROOM * allowed)
+            if enough or distance[n] == 0:
                 break
             leaving[n] = True
-            surplus -= owned[n]
-        self._send_all_away(blocks, keys, region_of, leaving, frame_number)
-        blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
+            needed -= owned[n]
+        if leaving.any():
+            self._send_all_away(blocks, keys, region_of, leaving, frame_number)
+            blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
 
     def page_out(self, blocks: VoxelBlocks, frame_number: int) -> VoxelBlocks:
         """Move all regions to the store; returns the empty blocks that take the place of ``blocks``."""

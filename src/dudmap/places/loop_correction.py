@@ -107,6 +107,7 @@ class LoopCorrector:
         """Whether the stored frames fit the corrected map clearly worse than the old one, in distance or intensity."""
         chosen = np.unique(np.linspace(0, len(nodes) - 1, COMPARED_FRAMES).round().astype(int))
         before = self._misfit(self.atlas.volume, [nodes[i] for i in chosen], Ts[chosen])
+        self.atlas.volume.page_out()
         after = self._misfit(volume, [nodes[i] for i in chosen], Ts_new[chosen])
         return bool(
             after[0] > MAX_DISTANCE_RATIO * before[0] + MAX_DISTANCE_OFFSET

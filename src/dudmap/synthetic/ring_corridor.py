@@ -17,6 +17,9 @@ CORNER = 1.1
 """Radius of the walk at the corners, metres."""
 EYES = 1.45
 """Height of the camera, metres."""
+WALLS, FLOORS = ("wallpaper", "brick", "plaster", "wood"), ("checks", "parquet", "wood")
+"""Textures. Each surface has its own part and its own scale of one, across and down: in the same scale the few pictures
+would repeat exactly, and a place could not be told from the one a period farther on, which no building asks for."""
 
 
 def ring_corridor(
@@ -78,7 +81,7 @@ def _scene(corners: NDArray[np.float64], rng: np.random.Generator) -> Scene:
     reach = WIDTH / 2 + ROOM_DEPTH + 0.5
     size = (*(high + 2 * reach), 0.2)
     solids = [
-        box((*(high / 2), -0.1), size, Material("checks", (0.4, 0.4))),
+        box((*(high / 2), -0.11), size, Material("plaster", (0.4, 0.4))),
         box((*(high / 2), HEIGHT + 0.1), size, Material("plaster", (0.5, 0.5))),
         box((*(high / 2), HEIGHT / 2), (*(high - WIDTH), HEIGHT), Material("brick", (0.5, 0.5))),
     ]
@@ -105,23 +108,38 @@ def _rooms(start: NDArray[np.float64], end: NDArray[np.float64], rng: np.random.
     yaw = float(np.degrees(np.arctan2(along[1], along[0])))
     T = pose((*start, 0.0), yaw)  # x along the corridor, y towards the inner wall
     length, wall, far = float(np.linalg.norm(end - start)), -WIDTH / 2, -WIDTH / 2 - ROOM_DEPTH
-    textures = ("wallpaper", "brick", "plaster", "wood")
-    solids = [box((length / 2, far - 0.1, HEIGHT / 2), (length + 2 * WIDTH, 0.2, HEIGHT), _material(rng, textures))]
+    solids = [box((length / 2, far - 0.1, HEIGHT / 2), (length + 2 * WIDTH, 0.2, HEIGHT), _material(rng, WALLS))]
     edges = np.arange(-WIDTH / 2, length + WIDTH / 2, ROOM_SPACING)
     for x in (*edges, length + WIDTH / 2):
-        solids.append(box((x, (wall + far) / 2, HEIGHT / 2), (0.1, ROOM_DEPTH, HEIGHT), _material(rng, textures)))
+        solids.append(box((x, (wall + far) / 2, HEIGHT / 2), (0.1, ROOM_DEPTH, HEIGHT), _material(rng, WALLS)))
     for first, last in zip(edges, np.append(edges[1:], length + WIDTH / 2), strict=True):
         door = (first + last) / 2 + rng.uniform(-0.5, 0.5)
-        paint = _material(rng, textures)
+        paint = _material(rng, WALLS)
+        solids += _surfaces(max(first, WIDTH / 2), min(last, length - WIDTH / 2), far, rng)
         for low, high in ((first, door - DOOR / 2), (door + DOOR / 2, last)):
             if high > low:
                 solids.append(box(((low + high) / 2, wall - 0.05, HEIGHT / 2), (high - low, 0.1, HEIGHT), paint))
         solids.append(box((door, wall - 0.05, HEIGHT - 0.2), (DOOR, 0.1, 0.4), paint))
         solids += _furniture(door, wall, far, rng)
-        solids.append(poster(first + 0.7, wall + 0.011, 1.5, (0.8, 0.6), int(rng.integers(4))))
+        solids.append(_picture(first + 0.7, wall + 0.011, rng))
         if WIDTH < last - 1.0 < length - WIDTH:  # there is no inner wall at the corners
-            solids.append(poster(last - 1.0, WIDTH / 2 - 0.011, 1.5, (0.9, 0.65), int(rng.integers(4))))
+            solids.append(_picture(last - rng.uniform(0.7, 2.5), WIDTH / 2 - 0.011, rng))
     return [solid.moved(T) for solid in solids]
+
+
+def _surfaces(first: float, last: float, far: float, rng: np.random.Generator) -> list[Primitive]:
+    """Floor and inner wall between two places along the corridor; none at its corners."""
+    middle, run = (first + last) / 2, last - first
+    if run <= 0:
+        return []
+    return [
+        box((middle, (WIDTH / 2 + far) / 2, -0.005), (run, WIDTH / 2 - far, 0.01), _material(rng, FLOORS)),
+        box((middle, WIDTH / 2 - 0.005, HEIGHT / 2), (run, 0.01, HEIGHT), _material(rng, WALLS)),
+    ]
+
+
+def _picture(x: float, y: float, rng: np.random.Generator) -> Primitive:
+    return poster(x, y, rng.uniform(1.3, 1.7), (rng.uniform(0.5, 1.0), rng.uniform(0.4, 0.8)), int(rng.integers(4)))
 
 
 def _furniture(door: float, wall: float, far: float, rng: np.random.Generator) -> list[Primitive]:
@@ -142,7 +160,8 @@ def _furniture(door: float, wall: float, far: float, rng: np.random.Generator) -
 
 def _material(rng: np.random.Generator, textures: tuple[str, ...]) -> Material:
     (red, green, blue), (u, v) = rng.uniform(0.75, 1.15, 3).tolist(), rng.uniform(0, 1, 2).tolist()
-    return Material(str(rng.choice(textures)), (0.5, 0.5), (u, v), (red, green, blue))
+    scale = rng.uniform(0.3, 0.6, 2)
+    return Material(str(rng.choice(textures)), (float(scale[0]), float(scale[1])), (u, v), (red, green, blue))
 
 
 def _stripes(rng: np.random.Generator) -> Material:

@@ -8,6 +8,8 @@ from dudmap.kernels.median import median
 
 RESOLUTION = 0.5
 """Displacement, in voxels or pixels, below which intensities cannot tell two images apart: half a sampling distance."""
+STRIDE = 8
+"""Every so many pixels, across and down, enter the median."""
 
 
 def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: float, voxel_size: float) -> float:
@@ -21,7 +23,13 @@ def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: flo
         sigma^2 + |grad I|^2 (s u)^2 = sigma^2 (1 + (s u / r)^2),   r = sigma / |grad I|,
 
     where r is the displacement that the intensities resolve at all: half a pixel of the level, or half a voxel, since
-    the map holds no finer detail. The weight is divided by the bracket, for the median depth of the image.
+    the map holds no finer detail. The weight is divided by the bracket with the median of u / r over the image. The
+    motion field of a twist (v, omega) is, per unit of the image at depth 1 (Longuet-Higgins and Prazdny 1980),
+
+        (-v_x + x v_z) / z - omega_y + y omega_z + x (y omega_x - x omega_y),
+        (-v_y + y v_z) / z + omega_x - x omega_z + y (y omega_x - x omega_y):
+
+    a camera that moves forwards shifts the middle of its image less than one that moves sideways.
 
     Args:
         level: Finest level of the registration.
@@ -29,10 +37,15 @@ def motion_discount(level: Level, velocity: NDArray[np.float64], time_sigma: flo
         time_sigma: Standard deviation of the time between the colour and the depth of a pixel, seconds.
         voxel_size: Metres.
     """
-    readings = level.depth[level.depth > 0]
-    if len(readings) == 0:
+    camera, part = level.camera, np.s_[STRIDE // 2 :: STRIDE, STRIDE // 2 :: STRIDE]
+    v, u = np.nonzero(level.depth[part] > 0)
+    if len(u) == 0:
         return 1.0
-    z = float(median(readings))
-    speed = float(np.linalg.norm(velocity[:3])) / z + float(np.linalg.norm(velocity[3:]))  # rad/s at the median depth
-    resolved = RESOLUTION * max(1 / level.camera.fx, voxel_size / z)
-    return 1 / (1 + (time_sigma * speed / resolved) ** 2)
+    z = level.depth[part][v, u].astype(np.float64)
+    x = (STRIDE * u + STRIDE // 2 - camera.cx) / camera.fx
+    y = (STRIDE * v + STRIDE // 2 - camera.cy) / camera.fy
+    (vx, vy, vz), (wx, wy, wz) = velocity[:3], velocity[3:]
+    tilt = y * wx - x * wy
+    across, down = (x * vz - vx) / z - wy + y * wz + x * tilt, (y * vz - vy) / z + wx - x * wz + y * tilt
+    resolved = RESOLUTION * np.maximum(1 / camera.fx, voxel_size / z)
+    return 1 / (1 + (time_sigma * float(median(np.hypot(across, down) / resolved))) ** 2)

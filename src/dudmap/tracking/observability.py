@@ -6,13 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.observation import Level
-from dudmap.kernels.parameters import ImageStack
+from dudmap.kernels.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, noise_sums
+from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 
 FILTER_PX = 4.0
-"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of an image 640 wide, with which the
-gradient noise of the distances is computed."""
+"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of the image that is filtered, with which
+the gradient noise of the distances is computed."""
 INTENSITY_SIGMA = 1 / 255
 """Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
@@ -74,9 +74,13 @@ class GradientNoise:
     depth: float
 
     def is_exceeded(self, H: NDArray[np.float64], least: float) -> bool:
-        """Whether H has at least ``least`` times the information of the noise on every direction. Then one of its two
-        terms has."""
-        return bool(_eigenvalues(H, self.distances + self.intensities)[0][0] >= least)
+        """Whether H has more than ``least`` times the information of the noise on every direction: whether their
+        difference is positive definite. Then one of its two terms has."""
+        try:
+            np.linalg.cholesky(H - least * (self.distances + self.intensities))
+        except np.linalg.LinAlgError:
+            return False
+        return True
 
     def observability(
         self,
@@ -127,9 +131,7 @@ def gradient_noise(
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
     map_width: int,
-    color_weight: float,
-    config: TrackerConfig,
-    sensor: SensorConfig,
+    parameters: RegistrationParameters,
 ) -> GradientNoise | None:
     """What noise of the gradients contributes to H in a view.
 
@@ -148,61 +150,28 @@ def gradient_noise(
         R_world_camera: (3, 3).
         voxel_size: Metres.
         map_width: Width of the images that the map was made of, pixels.
-        color_weight: Weight of the intensities.
-        config, sensor: The weights of the residuals.
+        parameters: The weights of the residuals.
 
     Returns:
         None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
         neighbouring voxels take the same reading, and the noise is another one.
     """
-    stride = max(1, level.camera.width // SAMPLES_ACROSS)
-    part = np.s_[stride // 2 :: stride, stride // 2 :: stride]
-    on_map = np.isfinite(residuals[1][part]) & (weights[part] > 0)
-    if np.count_nonzero(on_map) < MIN_SAMPLES:
+    camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
+    scale = camera.width / map_width
+    sums, numbers = np.zeros(NUM_SUMS), (FILTER_PX * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
+    noise_sums(
+        stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
+        *numbers, sums,
+    )  # fmt: skip
+    count, depth, weight = sums[:3]
+    if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
         return None
-    v, u = (stride * index + stride // 2 for index in np.nonzero(on_map))
-    z, camera = level.depth[v, u].astype(np.float64), level.camera
-    p = np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1) @ R_world_camera.T
-    distance, difference = (np.abs(residuals[number][v, u]).astype(np.float64) for number in range(2))
-    sigma, pixel = np.maximum(sensor.sigma(z), 1e-6), z / camera.fx
-    if float(pixel.mean()) * camera.width / map_width > voxel_size:
-        return None
-    scale = np.minimum(sensor.sigma(1.0) / sigma, 1) if config.noise_weighting else np.ones_like(z)
-    if config.robust == "tukey":
-        robust = (1 - np.minimum(distance * scale / config.tukey, 1) ** 2) ** 2
-    else:
-        robust = config.huber / np.maximum(distance * scale, config.huber)
-    width = np.hypot(FILTER_PX * camera.width / 640 * pixel, voxel_size / 2)
-    static = stride**2 * weights[v, u].astype(np.float64)
-    w = static * robust * scale**2
-    steps = _depth_steps(level.depth, v, u, pixel) * camera.width / map_width
-    w_noise = w * (sigma**2 * pixel**2 / (8 * np.pi * width**4) + INTERPOLATED * steps**2 / 12 / voxel_size**2)
-    w_color = color_weight * static * config.color_huber / np.maximum(difference, config.color_huber)
-    color_variance = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if color_weight > 0 else 0.0
-    distances, intensities = _isotropic(w_noise, p), _isotropic(w_color * color_variance, p)
-    variance = float(w_noise.sum() / max(w.sum(), 1e-12))
-    return GradientNoise(distances, intensities, (max(variance, 1e-12), color_variance), float(z.mean()))
-
-
-def _depth_steps(
-    depth: NDArray[np.float32], v: NDArray[np.intp], u: NDArray[np.intp], pixel: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Change (n,) of the depth from a pixel to the next, metres, at most that of the steepest surface."""
-    h, w = depth.shape
-    across = depth[v, np.minimum(u + 1, w - 1)] - depth[v, np.maximum(u - 1, 0)]
-    down = depth[np.minimum(v + 1, h - 1), u] - depth[np.maximum(v - 1, 0), u]
-    return np.minimum(np.hypot(across, down) / 2, STEEPEST * pixel)
-
-
-def _isotropic(w: NDArray[np.float64], p: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sum (6, 6) of w J' J with J = [I, -hat(p)] over points (n, 3), of weights (n,)."""
-    N = np.zeros((6, 6))
-    first, second = w @ p, (w[:, None] * p).T @ p
-    N[:3, :3] = np.eye(3) * w.sum()
-    N[3:, :3] = [[0, -first[2], first[1]], [first[2], 0, -first[0]], [-first[1], first[0], 0]]
-    N[:3, 3:] = N[3:, :3].T
-    N[3:, 3:] = np.eye(3) * np.trace(second) - second
-    return N + REGULAR * np.diag(np.diag(N))  # readings in one line leave a rotation without any
+    s_d = sums[3] / max(weight, 1e-12)
+    s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
+    noise = np.empty((2, 6, 6))
+    for moments, share, out in zip((sums[3:-NUM_MOMENTS], sums[-NUM_MOMENTS:]), (1.0, s_c), noise, strict=True):
+        isotropic(moments, R_world_camera, stride**2 * share, REGULAR, out)
+    return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)
 
 
 def sentence(unobservable: NDArray[np.float64]) -> str:
