@@ -21,6 +21,7 @@ from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResul
 from dudmap.mapping.adaptive_mesh import NO_CHILDREN, NO_VOXELS, extract_groups
 from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.mapping.map_file import MapContent
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.refinement import Refinement
 from dudmap.mapping.volume import TsdfVolume
@@ -38,6 +39,21 @@ def make_volume(
     """An empty map with one voxel size or, with ``volume.adaptive``, several; arguments as of ``TsdfVolume``."""
     kind = AdaptiveVolume if config.adaptive else TsdfVolume
     return kind(camera, config, sensor, depth_max, backend, max_blocks)
+
+
+def volume_of(content: MapContent) -> TsdfVolume:
+    """The map of a map file.
+
+    Raises:
+        MapError: Its levels of smaller voxels do not fit its configuration or each other.
+    """
+    volume = make_volume(content.camera, content.config, content.sensor, content.depth_max)
+    volume.blocks = content.blocks
+    if isinstance(volume, AdaptiveVolume):
+        volume.restore_levels(content.levels)
+    elif content.levels:
+        raise MapError("the map is damaged: it has smaller voxels, but its configuration says volume.adaptive=false")
+    return volume
 
 
 class AdaptiveVolume(TsdfVolume):
@@ -101,7 +117,8 @@ class AdaptiveVolume(TsdfVolume):
         """Memory of the map: that of the coarsest level, as without refinement, and that of the others."""
         finer = 0
         for parents, level in zip(self._coarser, self.levels, strict=True):
-            finer += level.blocks.num_bytes + parents.num_slots * 32 + level.blocks.num_slots * 5
+            links = parents.num_slots * 8 * 4 + level.blocks.num_slots * (4 + 1)  # children; parent and calm
+            finer += level.blocks.num_bytes + links
         return super().num_bytes + finer
 
     @property
@@ -238,7 +255,10 @@ class AdaptiveVolume(TsdfVolume):
             MapError: There are more levels than the configuration has, or a block has no parent.
         """
         if len(levels) > len(self.levels):
-            raise MapError(f"the map has {len(levels)} levels of smaller voxels, its configuration {len(self.levels)}")
+            raise MapError(
+                f"the map is damaged: it has {len(levels)} levels of smaller voxels, its configuration allows "
+                f"{len(self.levels)}"
+            )
         for number, blocks in enumerate(levels):
             level, parents = self.levels[number], self._coarser[number]
             level.blocks = blocks

@@ -19,7 +19,8 @@ HYSTERESIS = 0.5
 MAX_CALM = 3
 """Successive examinations of that result after which its smaller voxels are dropped."""
 FILTERED = 0.5
-"""Standard deviation of a filtered reading, relative to that of a raw one."""
+"""Standard deviation of a filtered reading relative to that of a raw one: assumed, since part of the noise of a sensor
+is the same over the window of the filter."""
 BEND_NOISE = np.sqrt(6) / 4
 """Standard deviation of the bend along one axis for distances with the standard deviation 1."""
 SIGNIFICANT = 2.0

@@ -405,14 +405,6 @@ class TsdfVolume:
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        from dudmap.mapping.adaptive_volume import make_volume
+        from dudmap.mapping.adaptive_volume import volume_of
 
-        content = read_map(path)
-        volume = make_volume(content.camera, content.config, content.sensor, content.depth_max)
-        volume.blocks = content.blocks
-        volume.restore_levels(content.levels)
-        return volume
-
-    def restore_levels(self, levels: list[VoxelBlocks]) -> None:
-        """Take over the finer blocks of a map file, level by level; a map with one voxel size has none."""
-        assert not levels
+        return volume_of(read_map(path))
