@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from dudmap.kernels.gathers import LANES
 from dudmap.kernels.neighbors import load_corners, load_row
 
 SHAPE = np.array([3, 2, 4], dtype=np.int64)  # blocks
@@ -38,9 +39,9 @@ def test_a_row_of_points_finds_what_each_of_them_finds(grid):
     window, geometry, dense = grid
     points = np.stack(np.unravel_index(np.random.default_rng(4).permutation(np.prod(dense.shape)), dense.shape), axis=1)
     points = points[(points < np.array(dense.shape) - 1).all(axis=1)]
-    blocks, voxels = points >> 3, points & 7
-    w = len(points)
-    pairs = np.empty((4, w), dtype=np.int64)
+    points = points[: len(points) // LANES * LANES]
+    blocks, voxels, w = points >> 3, points & 7, len(points)
+    words = np.empty((8, w), dtype=np.int32)
     load_row(
         window,
         SHAPE,
@@ -48,10 +49,7 @@ def test_a_row_of_points_finds_what_each_of_them_finds(grid):
         np.ravel_multi_index(tuple(blocks.T), tuple(SHAPE)).astype(np.int32),
         np.ravel_multi_index(tuple(voxels.T), (8, 8, 8)).astype(np.int32),
         (voxels == 7).any(axis=1).astype(np.int32),
-        np.empty((2, w + 1), dtype=np.int32),
-        np.empty(w, dtype=np.int64),
-        np.empty((w, 8), dtype=np.int64),
-        pairs,
+        np.empty(w + LANES, dtype=np.int32),
+        words,
     )
-    found = pairs.view(np.int32).reshape(4, w, 2).transpose(1, 0, 2).reshape(w, 8)
-    assert (found == [around(dense, *point) for point in points]).all()
+    assert (words.T == [around(dense, *point) for point in points]).all()

@@ -18,18 +18,20 @@ from pathlib import Path
 import pytest
 
 from dudmap.config import Config
-from dudmap.kernels import filtering, integration, labeling, registration
+from dudmap.kernels import filtering, integration, labeling, registration, sampling
 from dudmap.slam import Slam
 from dudmap.synthetic import sequence
 from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
-    (registration, "linearize_rows"): {"loops": 2, "fma": 48, "packed": 140, "converted": 2},
+    (registration, "linearize_rows"): {"loops": 3, "fma": 48, "packed": 140, "converted": 2},
+    (sampling, "sample_rows"): {"loops": 3, "fma": 6, "packed": 11, "converted": 7},
     (integration, "integrate_blocks"): {"loops": 3, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
     (labeling, "mean_field"): {"loops": 1},
     (filtering, "bilateral"): {"loops": 2, "fma": 3, "packed": 28},
+    (filtering, "fill_holes"): {"loops": 2, "packed": 12},
     (filtering, "limit_depth"): {"loops": 1},
     (filtering, "pad"): {"loops": 1},
     (filtering, "intensities"): {"loops": 1, "fma": 2, "packed": 3, "converted": 2},

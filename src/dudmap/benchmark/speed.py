@@ -50,7 +50,7 @@ def speed_figures(
     """
     figures: list[SpeedFigure] = []
     announce("frames at 1, 2 and 0.5 cm voxels")
-    for voxel, median, p95 in ((0.01, 33.0, 50.0), (0.02, 20.0, None), (0.005, 70.0, None)):
+    for voxel, median, p95 in ((0.01, 20.0, 50.0), (0.02, 14.0, None), (0.005, 40.0, None)):
         row = _measured(time_frames, (voxel, frames))
         name = f"frame, {100 * voxel:g} cm voxels"
         figures.append(SpeedFigure(f"{name}, median", "ms", median, row["median"]))

@@ -225,11 +225,11 @@ class DynamicDetector:
         Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
         free space they are -MAX_LOG_ODDS.
         """
-        surface, sample, depth = frame.surface, frame.sample, frame.level.depth
-        evidence = np.zeros(depth.shape, dtype=np.float32)
-        evidence[surface] = np.clip(mixture.log_odds(residual[surface]), -MAX_LOG_ODDS, MAX_LOG_ODDS)
-        within_noise = surface & (np.abs(sample.distance) < frame.noise)
-        evidence[within_noise] = np.maximum(evidence[within_noise], 1)
+        depth = frame.level.depth
+        evidence = np.clip(mixture.log_odds(residual), -MAX_LOG_ODDS, MAX_LOG_ODDS)
+        within_noise = np.abs(frame.sample.distance) < frame.noise
+        evidence = np.where(within_noise, np.maximum(evidence, np.float32(1)), evidence)
+        evidence = np.where(frame.surface, evidence, np.float32(0))  # NaN elsewhere
         if not self.config.free_space:
             return evidence
         unknown = float(np.mean(frame.unknown[depth > 0])) if depth.any() else 0.0
@@ -302,7 +302,7 @@ class DynamicDetector:
 
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
     """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
-    return np.hypot(sensor.sigma(depth), MAP_ROUGHNESS * voxel_size).astype(np.float32)
+    return np.asarray(np.sqrt(np.square(sensor.sigma(depth)) + (MAP_ROUGHNESS * voxel_size) ** 2), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:

@@ -206,5 +206,11 @@ def classify_segments(evidence: SegmentEvidence, dynamic_before: NDArray[np.floa
 
 
 def upper_quartile(values: NDArray[np.float64]) -> float:
-    """75th percentile; 0 of no values."""
-    return float(np.percentile(values, 75)) if len(values) else 0.0
+    """75th percentile, linear between two values; 0 of no values. NumPy's takes ten times as long for so few."""
+    if len(values) == 0:
+        return 0.0
+    ordered = np.sort(values)
+    place = 0.75 * (len(values) - 1)
+    low = int(place)
+    below, above, share = float(ordered[low]), float(ordered[min(low + 1, len(values) - 1)]), place - low
+    return below + (above - below) * share

@@ -1,5 +1,6 @@
 """Recognition of frames that a sensor or a driver has spoilt: wrong stamps, repeated images, a changed unit."""
 
+import statistics
 from collections import deque
 from dataclasses import replace
 from typing import NamedTuple
@@ -129,7 +130,7 @@ class StreamCheck:
 
     @property
     def _usual_interval(self) -> float:
-        return float(np.median(self._intervals)) if self._intervals else 0.0
+        return statistics.median(self._intervals) if self._intervals else 0.0
 
     # -- images --------------------------------------------------------------------------------------------------------
 
@@ -166,14 +167,15 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
         before, after: (h, w) metres, 0 = no reading.
         reach: How far the camera may have moved in between, metres.
     """
-    both = (before > 0) & (after > 0)
-    if np.count_nonzero(both) < MIN_PIXELS:
+    both = np.flatnonzero((before > 0) & (after > 0))
+    if len(both) < MIN_PIXELS:
         return 1.0
-    ratios = after[both] / before[both]
+    before, after = before.reshape(-1)[both], after.reshape(-1)[both]
+    ratios = after / before
     factor = float(np.median(ratios))
     if max(factor, 1 / factor) < SMALLEST_FACTOR:
         return 1.0
-    change = float(np.median(np.abs(after[both] - before[both])))
+    change = float(np.median(np.abs(after - before)))
     agrees = np.abs(ratios / factor - 1) < SAME_FACTOR
     return factor if change > reach and agrees.mean() > AGREEING_SHARE else 1.0
 

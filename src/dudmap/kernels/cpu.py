@@ -41,7 +41,7 @@ PIXEL_ROWS = 60
 """Image rows of one band of loops over pixels that are cheaper."""
 TILE_ROWS = 15
 """Rows of tiles, or of strided pixels, of one band."""
-PIXELS_PER_BAND = 4800
+PIXELS_PER_BAND = 9600
 """Pixels of one band of a linearisation; the coarsest level is one band."""
 BLOCKS_PER_BAND = 256
 """Blocks of one band of the fusion."""
@@ -283,13 +283,15 @@ class CpuBackend:
         """See ``Backend.observe_free``."""
         grid = grid.on_host()
         p, size = single(parameters), np.array(view.depth.shape, dtype=np.int64)
+        nearest = view.tiles.nearest[np.isfinite(view.tiles.nearest)]
+        far = min(p.depth_max, nearest.max(initial=0))  # nothing farther lies in front of all readings
         ranges = bands(int(grid.shape[0]) // 2, PLANES_PER_BAND)
         found = [np.empty(MAX_FOUND, dtype=np.int32) for _ in ranges]
         counts = run_bands(
             lambda start, stop, out: visibility.observe_free(
                 2 * start + parity, 2 * stop + parity, 2, grid.window, grid.shape, grid.origin, view.T_camera_world,
                 view.intrinsics, size, np.float32(BLOCK) * p.voxel_size, view.tiles.nearest, view.tiles.valid, p.band,
-                p.depth_max, grid.free_count, count, free_after, out,
+                far, grid.free_count, count, free_after, out,
             ),
             ranges, found,
         )  # fmt: skip

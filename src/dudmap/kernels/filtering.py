@@ -71,30 +71,24 @@ def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
                     row[u] = zero if between(z, above[u], below[u], gap) else row[u]
 
 
-@kernel
-def _distance(line, at, step):
-    """Pixels from ``at`` to the next reading along a line; 0 = none within LONGEST_RUN."""
-    for k in range(1, LONGEST_RUN + 1):
-        n = at + k * step
-        if n < 0 or n >= line.size:
-            return 0
-        if line[n] > 0:
-            return k
-    return 0
+@scalar
+def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
+    """Whether the run of missing pixels around a missing pixel is short and its two ends lie on one surface.
 
-
-@kernel
-def _in_small_hole(line, at, slope, noise_floor):
-    """Whether the run of missing pixels around ``at`` is short and its two ends lie on one surface."""
-    before = _distance(line, at, -1)
-    if before == 0:
-        return False
-    after = _distance(line, at, 1)
-    if after == 0 or before + after > LONGEST_RUN + 1:
-        return False
-    a, b = line[at - before], line[at + after]
+    Args:
+        a1, a2, a3: Readings one, two and LONGEST_RUN = three pixels before it, 0 = none.
+        b1, b2, b3: Likewise after it.
+        slope, noise_floor: See ``fill_holes``.
+    """
+    zero, one, two, three = f32(0), f32(1), f32(2), f32(3)
+    a, b = a1 if a1 > zero else a2 if a2 > zero else a3, b1 if b1 > zero else b2 if b2 > zero else b3
+    before, after = (
+        one if a1 > zero else two if a2 > zero else three,
+        one if b1 > zero else two if b2 > zero else three,
+    )
     near = min(a, b)
-    return abs(a - b) <= max(noise_floor, slope * near * near)
+    short = before + after <= f32(LONGEST_RUN + 1)
+    return (near > zero) & short & (abs(a - b) <= max(noise_floor, slope * near * near))
 
 
 @kernel
@@ -114,14 +108,29 @@ def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
         out: (H, W) float32 out.
     """
     h, w = depth.shape
+    line = np.zeros(w + 2 * LONGEST_RUN, np.float32)
+    holes = np.empty(w, np.uint8)
+    zero, one = np.float32(0), np.float32(1)
     for v in range(row_start, row_stop):
-        row = depth[v]
+        row, target = depth[v], out[v]
         for u in range(w):
-            z = row[u]
-            out[v, u] = z
-            if z > 0 or not (
-                _in_small_hole(row, u, slope, noise_floor) or _in_small_hole(depth[:, u], v, slope, noise_floor)
-            ):
+            line[np.uintp(u + LONGEST_RUN)] = target[u] = row[u]
+        above, above2, above3 = depth[max(v - 1, 0)], depth[max(v - 2, 0)], depth[max(v - 3, 0)]
+        below, below2, below3 = depth[min(v + 1, h - 1)], depth[min(v + 2, h - 1)], depth[min(v + 3, h - 1)]
+        # rows outside the image have no reading
+        i1, i2, i3 = one if v > 0 else zero, one if v > 1 else zero, one if v > 2 else zero
+        j1, j2, j3 = one if v + 1 < h else zero, one if v + 2 < h else zero, one if v + 3 < h else zero
+        for u in range(w):
+            k = np.uintp(u)
+            a1, a2, a3 = line[np.uintp(u + 2)], line[np.uintp(u + 1)], line[k]
+            b1, b2, b3 = line[np.uintp(u + 4)], line[np.uintp(u + 5)], line[np.uintp(u + 6)]
+            in_row = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
+            a1, a2, a3 = i1 * above[k], i2 * above2[k], i3 * above3[k]
+            b1, b2, b3 = j1 * below[k], j2 * below2[k], j3 * below3[k]
+            in_column = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
+            holes[k] = (line[np.uintp(u + 3)] <= zero) & (in_row | in_column)
+        for u in range(w):
+            if holes[u] == 0:
                 continue
             total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
             for y in range(max(v - 2, 0), min(v + 3, h)):

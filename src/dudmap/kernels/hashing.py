@@ -77,8 +77,19 @@ def rebuild(table, coords, num_entries):
 
 
 @kernel
-def fill_window(window, origin, coords, slot_of, num_entries):
-    """Write every entry that lies in the window: its voxel slot, or ``-2 - entry`` for one without voxels."""
+def fill_window(window, origin, coords, slot_of, num_entries, inside):
+    """Write every entry that lies in the window: its voxel slot, or ``-2 - entry`` for one without voxels.
+
+    Args:
+        window: (Wx, Wy, Wz) int32 in and out.
+        origin: (3,) int64 coordinates of its first block.
+        coords, slot_of, num_entries: The entries.
+        inside: (num_entries,) int32 out, the slots in the window.
+
+    Returns:
+        Number of slots in the window.
+    """
+    count = 0
     for entry in range(num_entries):
         x = coords[entry, 0] - origin[0]
         y = coords[entry, 1] - origin[1]
@@ -86,3 +97,7 @@ def fill_window(window, origin, coords, slot_of, num_entries):
         if 0 <= x < window.shape[0] and 0 <= y < window.shape[1] and 0 <= z < window.shape[2]:
             slot = slot_of[entry]
             window[x, y, z] = slot if slot >= 0 else -2 - entry
+            if slot >= 0:
+                inside[count] = slot
+                count += 1
+    return count

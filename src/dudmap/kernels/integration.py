@@ -2,9 +2,23 @@
 
 import numpy as np
 
+from dudmap.kernels.memory import prefetch
 from dudmap.kernels.pixel import free_depth, project, ray, reading_weight
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.vectors import wide_vectors
 from dudmap.kernels.voxel import fuse_color, fuse_voxel, is_occupied, pack_pixel_color, pack_reading
+
+CACHE_LINE = 16
+"""32-bit words of a cache line of most processors."""
+
+
+@kernel
+def used_readings(depth, used, farthest, out):
+    """Readings of ``depth`` (H, W) up to ``farthest`` metres where ``used`` (H, W) bool; the others become 0."""
+    source, chosen, target = depth.reshape(-1), used.reshape(-1), out.reshape(-1)
+    for n in range(source.size):
+        z = source[n]
+        target[n] = z if (z > np.float32(0)) & (z <= farthest) & chosen[n] else np.float32(0)
 
 
 @kernel
@@ -22,25 +36,29 @@ def pack_pixels(row_start, row_stop, depth, rgb, weights, parameters, pixels):
         parameters: FusionParameters.
         pixels: (H * W + 1, 2) int32 out; the last row is left as it is.
     """
+    wide_vectors()
     h, w = depth.shape
     far, band = np.float32(1e9), parameters.band
     by_unit = np.float32(1) / parameters.depth_unit
     column = np.full(w + 2, far, np.float32)
+    first, second = np.empty(w, np.int32), np.empty(w, np.int32)
     for v in range(row_start, row_stop):
         above, middle, below = depth[max(v - 1, 0)], depth[v], depth[min(v + 1, h - 1)]
         for u in range(w):
             a, b, c = above[u], middle[u], below[u]
             a, b, c = a if a > 0 else far, b if b > 0 else far, c if c > 0 else far
             column[np.uintp(u + 1)] = min(min(a, b), c)
-        row = pixels[v * w : v * w + w]
         source, gains = rgb[v].reshape(-1), weights[v]
         for u in range(w):
             k = np.uintp(u)
             near = min(min(column[k], column[np.uintp(u + 1)]), column[np.uintp(u + 2)])
-            row[k, 0] = pack_reading(middle[k], free_depth(middle[k], near, band), by_unit)
+            first[k] = pack_reading(middle[k], free_depth(middle[k], near, band), by_unit)
         for u in range(w):
             r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
-            row[u, 1] = pack_pixel_color(r, g, b, gains[u])
+            second[u] = pack_pixel_color(r, g, b, gains[u])
+        row = pixels[v * w : v * w + w].reshape(-1)
+        for u in range(w):
+            row[np.uintp(2 * u)], row[np.uintp(2 * u + 1)] = first[u], second[u]
 
 
 @kernel
@@ -62,6 +80,7 @@ def integrate_blocks(
         parameters: FusionParameters.
         occupied: (n,) int32 out: voxels that hold a surface or were never observed.
     """
+    wide_vectors()
     voxel_size = parameters.voxel_size
     by_unit = np.float32(1) / parameters.sdf_unit
     zero, half, one = np.float32(0), np.float32(0.5), np.float32(1)
@@ -90,6 +109,10 @@ def integrate_blocks(
 
     for block in range(start, stop):
         slot = slots[block]
+        following = np.uintp(slots[min(block + 1, stop - 1)]) * np.uintp(512)
+        for n in range(0, 512, CACHE_LINE):
+            prefetch(map_geometry, following + np.uintp(n))
+            prefetch(map_colors, following + np.uintp(n))
         ox = np.float32(coords[slot, 0] * 8) * voxel_size
         oy = np.float32(coords[slot, 1] * 8) * voxel_size
         oz = np.float32(coords[slot, 2] * 8) * voxel_size
@@ -138,6 +161,7 @@ def observation_weights(row_start, row_stop, depth, intrinsics, noise, best, out
         best: Weight of a frontal reading at one metre.
         out: (H, W) uint8 out, at least 1 where there is a reading.
     """
+    wide_vectors()
     h, w = depth.shape
     zero = np.float32(0)
     fx, fy, cx, by_fx = intrinsics[0], intrinsics[1], intrinsics[2], np.float32(1) / intrinsics[0]

@@ -22,15 +22,3 @@ def prefetch(typing_context, array, index):
         return context.get_dummy_value()
 
     return types.void(array, index), generate
-
-
-@intrinsic
-def pair(typing_context, array, index):
-    """Elements ``index`` and ``index + 1`` of a flat int32 array as one int64, in the order of memory."""
-
-    def generate(context, builder, signature, arguments):
-        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
-        pointer = builder.bitcast(builder.gep(data, [arguments[1]]), ir.IntType(64).as_pointer())
-        return builder.load(pointer, align=4)
-
-    return types.int64(array, index), generate

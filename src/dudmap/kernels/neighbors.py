@@ -1,14 +1,14 @@
 """The eight voxels around points of the map: what a trilinear interpolation loads.
 
-For two thirds of all points one block holds all eight. A branch on that is mispredicted for every third point, which
-also ends the prefetching of the next ones. A single point therefore always takes eight look-ups; a row of points is
-divided into two lists first, without a branch.
+For two thirds of all points one block holds all eight. A branch on that is mispredicted for every third point. A single
+point therefore always takes eight look-ups; of a row of points, those of the other third are listed first, without a
+branch, and both kinds are loaded by vector instructions.
 """
 
 import numpy as np
 
-from dudmap.kernels.memory import pair, prefetch
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.gathers import LANES, load_voxels, load_voxels_of_blocks
+from dudmap.kernels.threads import kernel, scalar
 
 
 @kernel
@@ -50,77 +50,60 @@ def _voxel(geometry, slot, voxel):
     return word if slot >= 0 else np.int32(0)
 
 
+@scalar
+def last_corner(shape):
+    """Largest x, y, z of a lattice point of a window of ``shape`` blocks that has eight voxels around it, int32."""
+    return np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
+
+
+@scalar
+def locate(x, y, z, last, size_y, size_z):
+    """Where ``load_row`` finds the eight voxels around a point of the window's lattice, voxels.
+
+    Args:
+        x, y, z: The point, float32.
+        last: See ``last_corner``.
+        size_y, size_z: Blocks of the window.
+
+    Returns:
+        Cell; voxel; 1 where the eight voxels lie in more than one block, else 0; whether the point lies inside, without
+        which the others are those of another point; fractions of its coordinates.
+    """
+    lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
+    jx, jy, jz = np.int32(lx), np.int32(ly), np.int32(lz)
+    kx = min(max(jx, np.int32(0)), last[0])
+    ky = min(max(jy, np.int32(0)), last[1])
+    kz = min(max(jz, np.int32(0)), last[2])
+    inside = (jx == kx) & (jy == ky) & (jz == kz)
+    cell = np.int32(((kx >> 3) * size_y + (ky >> 3)) * size_z + (kz >> 3))
+    voxel = np.int32(((kx & 7) * 8 + (ky & 7)) * 8 + (kz & 7))
+    crosses = np.int32((((kx & 7) + 1) | ((ky & 7) + 1) | ((kz & 7) + 1)) >> 3)
+    return cell, voxel, crosses, inside, x - lx, y - ly, z - lz
+
+
 @kernel
-def load_row(window, shape, geometry, cells, voxels, crossing, lists, positions, corners, pairs):
+def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
-    All addresses are computed and prefetched before the first load.
+    Those of the points, a third, whose eight voxels lie in several blocks are looked up on their own.
 
     Args:
         window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
         shape: (3,) int64 blocks of the window.
         geometry: (slots * 512,) int32 packed voxels.
-        cells: (w,) int32, cell of the window that holds the point.
+        cells: (w,) int32, cell of the window that holds the point; w is a multiple of ``LANES``.
         voxels: (w,) int32, number within the block of the voxel at its lower corner.
         crossing: (w,) int32, 1 where the eight voxels lie in more than one block, 0 elsewhere.
-        lists, positions, corners: (2, w + 1) int32, (w,) int64, (w, 8) int64, work space.
-        pairs: (4, w) int64 out: two neighbours along z in each, at (x, y), (x, y + 1), (x + 1, y), (x + 1, y + 1).
+        outer: (w + LANES,) int32, work space.
+        words: (8, w) int32 out, corner 4 dx + 2 dy + dz.
     """
-    inner, outer = lists[0], lists[1]
-    words, row = pairs.view(np.int32).reshape(-1), np.uintp(2 * pairs.shape[1])
-    num_inner, num_outer = np.uintp(0), np.uintp(0)
+    flat, num_outer = words.reshape(-1), np.uintp(0)
     for u in range(len(cells)):
-        inner[num_inner] = outer[num_outer] = u
-        crosses = np.int64(crossing[u])
-        num_outer += np.uintp(crosses)
-        num_inner += np.uintp(1 - crosses)
-        position = _position(np.int64(window[np.uintp(cells[u])]), np.int64(voxels[u]))
-        positions[u] = position
-        own, near = np.uintp(max(position, 0)), np.uintp(crosses - 1)  # near: all bits, or none where it crosses
-        prefetch(geometry, own)
-        prefetch(geometry, own + (np.uintp(8) & near))
-        prefetch(geometry, own + (np.uintp(64) & near))
-        prefetch(geometry, own + (np.uintp(72) & near))
-    for n in range(num_outer):
-        u = np.uintp(outer[n])
-        _find_corners(window, np.int64(cells[u]), np.int64(voxels[u]), shape[1], shape[2], corners[n])
-        for i in range(8):
-            prefetch(geometry, np.uintp(max(corners[n, i], 0)))
-    for n in range(num_inner):
-        u = np.uintp(inner[n])
-        own, known = np.uintp(max(positions[u], 0)), ~(positions[u] >> 63)
-        pairs[0, u] = pair(geometry, own) & known
-        pairs[1, u] = pair(geometry, own + np.uintp(8)) & known
-        pairs[2, u] = pair(geometry, own + np.uintp(64)) & known
-        pairs[3, u] = pair(geometry, own + np.uintp(72)) & known
-    for n in range(num_outer):
-        k = np.uintp(2 * outer[n])
-        for i in range(4):
-            words[k] = _word(geometry, corners[n, 2 * i])
-            words[k + np.uintp(1)] = _word(geometry, corners[n, 2 * i + 1])
-            k += row
-
-
-@kernel
-def _find_corners(window, cell, voxel, size_y, size_z, positions):
-    """Write the indices of the eight voxels from ``voxel`` of the block in ``cell`` upwards; -1 = unknown."""
-    x, y, z = ((voxel >> 6) + 1) >> 3, (((voxel >> 3) & 7) + 1) >> 3, ((voxel & 7) + 1) >> 3  # 1 where the next crosses
-    to_x, to_y, to_z = x * size_y * size_z, y * size_z, z
-    step_x, step_y, step_z = 64 - 512 * x, 8 - 64 * y, 1 - 8 * z
-    for i in range(2):
-        for j in range(2):
-            c, n = cell + i * to_x + j * to_y, voxel + i * step_x + j * step_y
-            positions[4 * i + 2 * j] = _position(np.int64(window[np.uintp(c)]), n)
-            positions[4 * i + 2 * j + 1] = _position(np.int64(window[np.uintp(c + to_z)]), n + step_z)
-
-
-@kernel
-def _position(slot, voxel):
-    """Index of a voxel of a slot; -1 if there is no slot."""
-    return slot * 512 + voxel if slot >= 0 else np.int64(-1)
-
-
-@kernel
-def _word(geometry, position):
-    """Word of a voxel, 0 at index -1; the load does not depend on the test of the index."""
-    return geometry[np.uintp(max(position, 0))] & np.int32(~(position >> 63))
+        outer[num_outer] = u
+        num_outer += np.uintp(crossing[u])
+    for start in range(0, len(cells), LANES):
+        load_voxels(window, geometry, cells, voxels, crossing, start, flat, len(cells))
+    if num_outer > 0:
+        outer[num_outer : num_outer + np.uintp(LANES)] = outer[num_outer - np.uintp(1)]
+    for start in range(0, num_outer, LANES):
+        load_voxels_of_blocks(window, shape[1], shape[2], geometry, cells, voxels, outer, start, flat, len(cells))

@@ -4,6 +4,7 @@ Numba compiles named tuples as they are. Tuples of parameters hold floats only: 
 that the loops calculate with.
 """
 
+from functools import lru_cache
 from typing import NamedTuple, Protocol, TypeVar
 
 import numpy as np
@@ -19,8 +20,9 @@ UNKNOWN, SURFACE, FREE = 0, 1, 2
 Parameters = TypeVar("Parameters", bound=tuple)
 
 
+@lru_cache(maxsize=64, typed=True)
 def single(parameters: Parameters) -> Parameters:
-    """The same tuple, also of nested ones, with every number as float32."""
+    """The same tuple, also of nested ones, with every number as float32; made once for equal ones of one type."""
     values = [single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters]
     return type(parameters)(*values)
 

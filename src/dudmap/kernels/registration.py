@@ -1,18 +1,20 @@
 """One linearisation of the direct SDF and intensity registration (thesis eq. 4.27-4.47).
 
-A row of pixels is worked through in three stages: vector arithmetic for addresses, scalar loads of eight voxels into
-buffers, vector arithmetic for residuals and sums. No stage mixes loads with branches, so LLVM vectorises the first
-and the last on every CPU.
+A row of pixels is worked through in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
+vector arithmetic for residuals and sums. No stage mixes loads with branches, so LLVM vectorises the first and the last
+on every CPU.
 """
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.neighbors import load_row
+from dudmap.kernels.gathers import LANES
+from dudmap.kernels.neighbors import last_corner, load_row, locate
 from dudmap.kernels.parameters import ImageStack, NormalEquations
 from dudmap.kernels.pixel import elements, rotate
 from dudmap.kernels.residual import normal_terms, trilinear, weigh
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.vectors import wide_vectors
 from dudmap.kernels.voxel import intensity_of, sdf_steps
 
 NUM_SUMS = 32
@@ -46,16 +48,11 @@ def linearize_rows(
         residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
         sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
+    wide_vectors()
     w = depth.shape[1]
-    cells = np.empty(w, np.int32)
-    voxels = np.empty(w, np.int32)
-    crossing = np.empty(w, np.int32)
-    lists = np.empty((2, w + 1), np.int32)
-    positions = np.empty(w, np.int64)
-    corners = np.empty((w, 8), np.int64)
-    pairs = np.empty((4, w), np.int64)
-    words = pairs.view(np.int32)
-    near_low, near_high, far_low, far_high = words[0], words[1], words[2], words[3]
+    padded = -(-w // LANES) * LANES
+    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
     fx = np.empty(w, np.float32)
     fy = np.empty(w, np.float32)
     fz = np.empty(w, np.float32)
@@ -70,8 +67,7 @@ def linearize_rows(
     by_255 = np.float32(1 / 255)
     by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
     cx, cy = intrinsics[2], intrinsics[3]
-    last_x, last_y, last_z = np.int32(shape[0] * 8 - 2), np.int32(shape[1] * 8 - 2), np.int32(shape[2] * 8 - 2)
-    size_y, size_z = shape[1], shape[2]
+    last, size_y, size_z = last_corner(shape), shape[1], shape[2]
     t = elements(T)
 
     for v in range(row_start, row_stop):
@@ -82,20 +78,13 @@ def linearize_rows(
             y = row_y * z
             rx, ry, rz = rotate(t, x, y, z)
             gx, gy, gz = rx + t[3], ry + t[7], rz + t[11]
-            lx, ly, lz = np.floor(gx), np.floor(gy), np.floor(gz)
-            jx, jy, jz = np.int32(lx), np.int32(ly), np.int32(lz)
-            kx = min(max(jx, np.int32(0)), last_x)
-            ky = min(max(jy, np.int32(0)), last_y)
-            kz = min(max(jz, np.int32(0)), last_z)
-            ok = (z > zero) & (jx == kx) & (jy == ky) & (jz == kz)
-            cells[u] = np.int32(((kx >> 3) * size_y + (ky >> 3)) * size_z + (kz >> 3))
-            voxels[u] = np.int32(((kx & 7) * 8 + (ky & 7)) * 8 + (kz & 7))
-            crossing[u] = np.int32((((kx & 7) + 1) | ((ky & 7) + 1) | ((kz & 7) + 1)) >> 3)
-            fx[u], fy[u], fz[u] = gx - lx, gy - ly, gz - lz
+            cells[u], voxels[u], crosses, within, fx[u], fy[u], fz[u] = locate(gx, gy, gz, last, size_y, size_z)
+            ok = within & (z > zero)
+            crossing[u] = crosses if ok else np.int32(0)
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
             inside[u] = one if ok else zero
 
-        load_row(window, shape, geometry, cells, voxels, crossing, lists, positions, corners, pairs)
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
@@ -103,8 +92,8 @@ def linearize_rows(
         b0 = b1 = b2 = b3 = b4 = b5 = zero
         cost = on_map = readings = total_weight = chi = zero
         for u in range(w):
-            c0, c1, c2, c3 = near_low[2 * u], near_low[2 * u + 1], near_high[2 * u], near_high[2 * u + 1]
-            c4, c5, c6, c7 = far_low[2 * u], far_low[2 * u + 1], far_high[2 * u], far_high[2 * u + 1]
+            c0, c1, c2, c3 = words[0, u], words[1, u], words[2, u], words[3, u]
+            c4, c5, c6, c7 = words[4, u], words[5, u], words[6, u], words[7, u]
             ax, ay, az = fx[u], fy[u], fz[u]
             z = depth[v, u]
             low = min(

@@ -2,15 +2,18 @@
 
 import numpy as np
 
+from dudmap.kernels.gathers import LANES
+from dudmap.kernels.neighbors import last_corner, load_row, locate
 from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN
 from dudmap.kernels.pixel import elements, ray, transform
-from dudmap.kernels.threads import kernel
+from dudmap.kernels.threads import kernel, scalar
+from dudmap.kernels.vectors import wide_vectors
 from dudmap.kernels.voxel import intensity_of, sdf_steps
 
-f64 = np.float64
+f32, f64 = np.float32, np.float64
 
 
-@kernel
+@scalar
 def corner_weight(k, ax, ay, az):
     """Trilinear weight, float64, of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
     one = f64(1)
@@ -25,7 +28,8 @@ def sample_rows(
 ):  # fmt: skip
     """Sample the map at the points of pixel rows ``row_start`` to ``row_stop``.
 
-    Corners without an observation are left out of the interpolation; a point needs half of the weight.
+    Corners without an observation are left out of the interpolation; a point needs half of the weight. A row is worked
+    through in stages, see ``registration.py``.
 
     Args:
         row_start, row_stop: Rows of the band.
@@ -43,42 +47,44 @@ def sample_rows(
         difference: (h, w) float32 out, map minus image intensity, NaN where the map has none.
         occupancy: (h, w) uint8 out: UNKNOWN (also without a reading), SURFACE or FREE.
     """
-    nan = np.float32(np.nan)
+    wide_vectors()
+    w = depth.shape[1]
+    nan, half, zero = f32(np.nan), f64(0.5), f64(0)
+    padded = -(-w // LANES) * LANES
+    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    slots = np.empty(w, np.int32)
+    fractions, inside = np.empty((3, w), np.float32), np.empty(w, np.bool_)
+    last, size_y, size_z = last_corner(shape), shape[1], shape[2]
     t = elements(T)
     for v in range(row_start, row_stop):
-        for u in range(depth.shape[1]):
+        row_y = ray(v, intrinsics[3], intrinsics[1])
+        for u in range(w):
             z = depth[v, u]
-            distance[v, u], difference[v, u], occupancy[v, u] = nan, nan, UNKNOWN
-            if z <= 0:
-                continue
-            x, y = ray(u, intrinsics[2], intrinsics[0]) * z, ray(v, intrinsics[3], intrinsics[1]) * z
-            gx, gy, gz = transform(t, x, y, z)
-            ix, iy, iz = np.int64(np.floor(gx)), np.int64(np.floor(gy)), np.int64(np.floor(gz))
-            if ix < 0 or iy < 0 or iz < 0 or ix >= shape[0] * 8 - 1 or iy >= shape[1] * 8 - 1 or iz >= shape[2] * 8 - 1:
-                continue
-            slot = window[((ix >> 3) * shape[1] + (iy >> 3)) * shape[2] + (iz >> 3)]
-            if slot < 0:
-                if slot <= -2 and free_count[-2 - slot] >= free_after:
-                    occupancy[v, u] = FREE
-                continue
-            sdf, shade, total, shaded = np.float32(0), np.float32(0), np.float32(0), np.float32(0)
-            ax, ay, az = gx - np.float32(ix), gy - np.float32(iy), gz - np.float32(iz)
+            gx, gy, gz = transform(t, ray(u, intrinsics[2], intrinsics[0]) * z, row_y * z, z)
+            cells[u], voxels[u], crosses, within, ax, ay, az = locate(gx, gy, gz, last, size_y, size_z)
+            crossing[u] = crosses if within else np.int32(0)
+            fractions[0, u], fractions[1, u], fractions[2, u] = ax, ay, az
+            inside[u] = within & (z > f32(0))
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+        for u in range(w):
+            slots[u] = window[np.uintp(cells[u])] if inside[u] else np.int32(-1)
+        for u in range(w):
+            sdf, total, shade, shaded = zero, zero, zero, zero
             for k in range(8):
-                i, j, m = ix + (k >> 2), iy + ((k >> 1) & 1), iz + (k & 1)
-                other = window[((i >> 3) * shape[1] + (j >> 3)) * shape[2] + (m >> 3)]
-                if other < 0:
-                    continue
-                word = geometry[np.int64(other) * 512 + (((i & 7) * 8 + (j & 7)) * 8 + (m & 7))]
-                if (word & 0xFF00) == 0:
-                    continue
-                part = corner_weight(k, ax, ay, az)
+                word = words[k, u]
+                part = corner_weight(k, fractions[0, u], fractions[1, u], fractions[2, u])
+                part = part if (word & 0xFF00) != 0 else zero
                 sdf += part * sdf_steps(word)
                 total += part
-                intensity_part = part if intensity_of(word) > 0 else np.float32(0)
+                intensity_part = part if intensity_of(word) > f32(0) else zero
                 shade += intensity_part * intensity_of(word)
                 shaded += intensity_part
-            if total < np.float32(0.5):
-                continue
-            distance[v, u] = sdf / total * sdf_unit
-            difference[v, u] = shade / shaded / np.float32(255) - intensity[v, u] if shaded > 0 else nan
-            occupancy[v, u] = SURFACE
+            near = (slots[u] >= 0) & (total >= half)
+            distance[v, u] = f32(sdf / total * sdf_unit) if near else nan
+            lit = near & (shaded > zero)
+            difference[v, u] = f32(shade / shaded / f64(255) - intensity[v, u]) if lit else nan
+            occupancy[v, u] = SURFACE if near else UNKNOWN
+        for u in range(w):
+            if slots[u] <= -2 and free_count[np.uintp(-2 - slots[u])] >= free_after:
+                occupancy[v, u] = FREE

@@ -4,6 +4,7 @@ import numpy as np
 
 from dudmap.kernels.pixel import band_behind, band_front, elements, project, ray, sigma, transform
 from dudmap.kernels.threads import kernel
+from dudmap.kernels.vectors import wide_vectors
 
 TILE = 8
 """Edge of a tile of the depth image, pixels."""
@@ -23,6 +24,8 @@ def mark_blocks(
     A block known to be free gets voxels only within the fixed part of the band: in the part that grows with the noise,
     blocks would appear and vanish with every frame.
 
+    A row of pixels goes along its rays step by step: the addresses are computed for all of them before cells are read.
+
     Args:
         row_start, row_stop, stride: Rows of the band, and the step between pixels.
         depth: (H, W) float32, metres, 0 = none.
@@ -41,32 +44,44 @@ def mark_blocks(
     Returns:
         Number of cells found; never more than ``len(found)``.
     """
-    count = 0
+    wide_vectors()
+    count, w = 0, -(-depth.shape[1] // stride)
+    z, x, near = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
+    spread, steps = np.empty(w, np.float32), np.empty(w, np.float32)
+    cells, beyond = np.empty(w, np.int32), np.empty(w, np.bool_)
+    size_x, size_y, size_z = np.int32(shape[0]), np.int32(shape[1]), np.int32(shape[2])
+    none, one = np.int32(0), np.float32(1)
     t = elements(T)
     for v in range(row_start, row_stop, stride):
-        y0 = ray(v, intrinsics[3], intrinsics[1])
-        for u in range(0, depth.shape[1], stride):
-            z = depth[v, u]
-            if z <= 0:
-                continue
-            near, far = z - band_front(z, band), z + band_behind(z, band)
-            x0 = ray(u, intrinsics[2], intrinsics[0])
-            length = np.sqrt(x0 * x0 + y0 * y0 + np.float32(1))
-            steps = 1 + np.int64(np.ceil((far - near) * length / (np.float32(0.6) * block_size)))
-            for step in range(steps + 1):
-                d = near + (far - near) * np.float32(step) / np.float32(steps)
-                gx, gy, gz = transform(t, x0 * d, y0 * d, d)
-                bx, by, bz = np.int64(np.floor(gx)), np.int64(np.floor(gy)), np.int64(np.floor(gz))
-                if 0 <= bx < shape[0] and 0 <= by < shape[1] and 0 <= bz < shape[2]:
-                    cell = (bx * shape[1] + by) * shape[2] + bz
-                    slot = window[cell]
-                    outside = d < z - band.front or d > z + band.behind
-                    if slot >= 0 or (slot <= -2 and outside and free_count[-2 - slot] >= free_after):
-                        continue
-                    if stamps[cell] != frame_number and count < len(found):
-                        stamps[cell] = frame_number
-                        found[count] = cell
-                        count += 1
+        y, row, most = ray(v, intrinsics[3], intrinsics[1]), depth[v], np.float32(-1)
+        for n in range(w):
+            z[n], x[n] = row[np.uintp(n * stride)], ray(n * stride, intrinsics[2], intrinsics[0])
+            front, behind = band_front(z[n], band), band_behind(z[n], band)
+            near[n], spread[n] = z[n] - front, front + behind
+            length = np.sqrt(x[n] * x[n] + y * y + one)
+            parts = one + np.ceil(spread[n] * length / (np.float32(0.6) * block_size))
+            steps[n] = parts if z[n] > np.float32(0) else -one
+            most = max(most, steps[n])
+        for step in range(np.int64(most) + 1):
+            part = np.float32(step)
+            for n in range(w):
+                d = near[n] + spread[n] * part / steps[n]
+                gx, gy, gz = transform(t, x[n] * d, y * d, d)
+                bx, by, bz = np.int32(np.floor(gx)), np.int32(np.floor(gy)), np.int32(np.floor(gz))
+                inside = (bx >= none) & (by >= none) & (bz >= none) & (bx < size_x) & (by < size_y) & (bz < size_z)
+                cells[n] = np.int32((bx * size_y + by) * size_z + bz if inside & (part <= steps[n]) else np.int32(-1))
+                beyond[n] = (d < z[n] - band.front) | (d > z[n] + band.behind)
+            for n in range(w):
+                if cells[n] < 0:
+                    continue
+                cell = np.uintp(cells[n])
+                slot = window[cell]
+                if slot >= 0 or (slot <= -2 and beyond[n] and free_count[np.uintp(-2 - slot)] >= free_after):
+                    continue
+                if stamps[cell] != frame_number and count < len(found):
+                    stamps[cell] = frame_number
+                    found[count] = cell
+                    count += 1
     return count
 
 
@@ -79,19 +94,27 @@ def tile_ranges(row_start, row_stop, depth, nearest, farthest, valid):
         depth: (H, W) float32.
         nearest, farthest, valid: (ceil(H / TILE), ceil(W / TILE)) float32 out; no reading gives inf, 0, 0.
     """
+    h, w = depth.shape
+    zero, one, none = np.float32(0), np.float32(1), np.float32(np.inf)
+    near, far, count = np.empty(w, np.float32), np.empty(w, np.float32), np.empty(w, np.float32)
     for ty in range(row_start, row_stop):
+        first, last = ty * TILE, min(ty * TILE + TILE, h)
+        near[:], far[:], count[:] = none, zero, zero
+        for v in range(first, last):
+            row = depth[v]
+            for u in range(w):
+                z = row[u]
+                near[u] = min(near[u], z if z > zero else none)
+                far[u] = max(far[u], z)
+                count[u] += one if z > zero else zero
         for tx in range(nearest.shape[1]):
-            near, far, count, total = np.float32(np.inf), np.float32(0), 0, 0
-            for v in range(ty * TILE, min(ty * TILE + TILE, depth.shape[0])):
-                for u in range(tx * TILE, min(tx * TILE + TILE, depth.shape[1])):
-                    z = depth[v, u]
-                    total += 1
-                    if z > 0:
-                        count += 1
-                        near = min(near, z)
-                        far = max(far, z)
-            nearest[ty, tx], farthest[ty, tx] = near, far
-            valid[ty, tx] = np.float32(count) / np.float32(total)
+            left, right = tx * TILE, min(tx * TILE + TILE, w)
+            lowest, highest, readings = none, zero, zero
+            for u in range(left, right):
+                lowest, highest = min(lowest, near[u]), max(highest, far[u])
+                readings += count[u]
+            nearest[ty, tx], farthest[ty, tx] = lowest, highest
+            valid[ty, tx] = readings / np.float32((right - left) * (last - first))
 
 
 @kernel

@@ -52,12 +52,12 @@ class BlockWindow:
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""
         self.origin = origin
-        self.cells.fill(-1)
-        self.stamps.fill(0)
+        self.cells.fill(-1)  # the stamps may stay: no frame has the number of an earlier one
         cells = self.cells.reshape(tuple(self.shape))
-        hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries)
+        inside = np.empty(blocks.num_entries, dtype=np.int32)
+        count = hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
         self.mirror.wrote()
-        self.near = np.sort(self.cells[self.cells >= 0])
+        self.near = np.sort(inside[:count])
 
     @property
     def local_origin(self) -> NDArray[np.int64]:

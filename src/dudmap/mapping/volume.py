@@ -14,6 +14,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh, joined
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.integration import used_readings
 from dudmap.kernels.parameters import (
     FREE,
     SURFACE,
@@ -177,10 +178,9 @@ class TsdfVolume:
                 f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour "
                 f"{frame.color.shape[1]}x{frame.color.shape[0]}"
             )
-        depth = frame.depth.astype(np.float32)
-        depth[~((depth > 0) & (depth <= self.depth_max))] = 0
-        if static_mask is not None:
-            depth[~static_mask] = 0
+        used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else np.ascontiguousarray(static_mask)
+        depth = np.empty(frame.depth.shape, dtype=np.float32)
+        used_readings(np.ascontiguousarray(frame.depth, np.float32), used, np.float32(self.depth_max), depth)
         self.look_at(T_world_camera)
         self._frame_number += 1
         self._fuse(depth, frame.color, weights, T_world_camera, count)

@@ -149,8 +149,9 @@ class RedundantViews:
         if not config.enabled:
             return
         place = self._place
-        if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
+        if config.measure == "features":
             self.features.set_reference(view.observation.rgb)
+        if config.measure == "features" or place is None or not self._is_near(place, T_world_camera):
             place = _Place(T_world_camera, np.zeros_like(level.depth), np.zeros(level.depth.shape, np.int64))
         static = _static(view, estimate)
         behind = self._is_behind(place, level, volume)

@@ -214,7 +214,8 @@ def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, A
         return
     window.origin = index["origin"]
     cells = window.cells.reshape(tuple(window.shape))
-    hashing.fill_window(cells, window.origin, blocks.coords, blocks.slot_of, blocks.num_entries)
+    inside = np.empty(blocks.num_entries, dtype=np.int32)
+    count = hashing.fill_window(cells, window.origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
     window.near = index["near"]
-    if not np.array_equal(np.sort(window.near), np.sort(window.cells[window.cells >= 0])):
+    if not np.array_equal(np.sort(window.near), np.sort(inside[:count])):
         raise StateError("the stored map is damaged: the blocks around the camera are not those of the map")

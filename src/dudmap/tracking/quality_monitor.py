@@ -1,5 +1,6 @@
 """Acceptance of a registration: absolute checks, and comparison with the registrations before it."""
 
+import statistics
 from collections import deque
 from dataclasses import dataclass
 
@@ -109,7 +110,7 @@ class QualityMonitor:
         if len(self._residuals) < MIN_HISTORY:
             return ""
         strict = self.recovering or recognized
-        residual, share, color = (float(np.median(q)) for q in (self._residuals, self._shares, self._colors))
+        residual, share, color = (_median(q) for q in (self._residuals, self._shares, self._colors))
         worst = 2.5 if recognized else 1.6 if self.recovering else 4.0
         if crowded and not strict:
             worst, residual = 2.0, max(residual, SMALL_RESIDUAL_SIGMAS * self.config.sensor.sigma(1.0))
@@ -126,7 +127,7 @@ class QualityMonitor:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
         if len(self._residuals) < MIN_HISTORY:
             return 1.0, 1.0
-        residual, color = (float(np.median(q)) for q in (self._residuals, self._colors))
+        residual, color = (_median(q) for q in (self._residuals, self._colors))
         return tracking.residual / max(residual, 1e-6), tracking.color_residual / max(color, SMALL_COLOR_RESIDUAL)
 
     def is_unusual(self, tracking: TrackingResult) -> bool:
@@ -158,3 +159,8 @@ class QualityMonitor:
         if share > 0.5 and verified < MIN_VERIFIED_SHARE:
             return f"{share:.0%} of the readings seem to move, and only {verified:.0%} rest where the map has a surface"
         return ""
+
+
+def _median(values: deque[float]) -> float:
+    """Median of a few values, NaN of none."""
+    return statistics.median(values) if values else np.nan
