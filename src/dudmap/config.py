@@ -353,16 +353,18 @@ class Config(ConfigSection):
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
 
-    @model_validator(mode="after")
-    def _computable(self) -> "Config":
-        if self.volume.adaptive and self.device not in ("auto", "cpu"):
-            raise ValueError(f"volume.adaptive is computed on the CPU, not on {self.device}; set device to cpu or auto")
-        return self
-
     @property
     def compute_device(self) -> str:
-        """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes."""
-        return "cpu" if self.volume.adaptive and self.device == "auto" else self.device
+        """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes.
+
+        Raises:
+            ConfigError: Such a map is to be computed on a GPU.
+        """
+        if not self.volume.adaptive:
+            return self.device
+        if self.device not in ("auto", "cpu"):
+            raise ConfigError(f"volume.adaptive is computed on the CPU, not on {self.device}; take --device cpu")
+        return "cpu"
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":

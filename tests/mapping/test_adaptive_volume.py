@@ -201,8 +201,8 @@ def test_what_is_not_supported_is_said_in_one_sentence():
         make_volume(CAMERA, CONFIG, SENSOR, 3.0, max_blocks=100)
     with pytest.raises(ConfigError, match="--max-memory"):
         Slam(CAMERA, Config().override(["volume.adaptive=true"]), max_blocks=100)
-    with pytest.raises(ConfigError, match="set device to cpu or auto"):
-        Config().override(["volume.adaptive=true", "device=cuda"])
+    with pytest.raises(ConfigError, match="on the CPU, not on cuda; take --device cpu"):
+        Slam(CAMERA, Config().override(["volume.adaptive=true", "device=cuda"]))
     assert Config().override(["volume.adaptive=true"]).compute_device == "cpu"
 
 
