@@ -4,7 +4,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from scipy.spatial import cKDTree
+from scipy.spatial import KDTree
 
 from dudmap.evaluation.surface import point_triangle_distances
 from dudmap.geometry import se3
@@ -36,7 +36,7 @@ def mixed(level, centres):
 def distances_to(mesh, points):
     """Distances (n,) of points (n, 3) to the nearest of the triangles whose centres are near."""
     corners = mesh.vertices[mesh.faces].astype(np.float64)
-    near = cKDTree(corners.mean(axis=1)).query(points, k=16)[1]
+    near = KDTree(corners.mean(axis=1)).query(points, k=16)[1]
     found = point_triangle_distances(np.repeat(points, 16, axis=0), corners[near.ravel()])
     return found.reshape(-1, 16).min(axis=1)
 
