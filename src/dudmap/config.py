@@ -134,6 +134,15 @@ class VolumeConfig(ConfigSection):
     """Weight of a free-space observation in a voxel that holds a surface."""
     free_after: int = Field(default=4, ge=1, le=200)
     """Number of free-space observations after which a block counts as free space."""
+    adaptive: bool = False
+    """Smaller voxels where the surface is curved or finely coloured and the sensor resolves it (thesis section 7.1)."""
+    adaptive_levels: int = Field(default=1, ge=1, le=2)
+    """How often the voxel size may be halved: once, or twice (adaptive only)."""
+    adaptive_bend: float = Field(default=0.4, gt=0)
+    """Curvature of the surface from which on voxels are halved, times the voxel size (adaptive only): 0.4 is a radius
+    of two and a half voxels, that of edges and thin things."""
+    adaptive_texture: float = Field(default=0.6, gt=0)
+    """Bend of the intensities (0..1) between neighbouring voxels from which on they are halved (adaptive only)."""
 
     @model_validator(mode="after")
     def _reachable(self) -> "VolumeConfig":
@@ -343,6 +352,19 @@ class Config(ConfigSection):
     loops: LoopsConfig = LoopsConfig()
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
+
+    @property
+    def compute_device(self) -> str:
+        """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes.
+
+        Raises:
+            ConfigError: Such a map is to be computed on a GPU.
+        """
+        if not self.volume.adaptive:
+            return self.device
+        if self.device not in ("auto", "cpu"):
+            raise ConfigError(f"volume.adaptive is computed on the CPU, not on {self.device}; take --device cpu")
+        return "cpu"
 
     @classmethod
     def load(cls, path: str | Path) -> "Config":

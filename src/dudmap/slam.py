@@ -24,6 +24,7 @@ from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.gpu.device import make_backend
+from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
@@ -91,7 +92,7 @@ class Slam:
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        self.device = config.device
+        self.device = config.compute_device
         backend = make_backend(self.device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
@@ -484,6 +485,6 @@ class Slam:
 
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.device)
-        return TsdfVolume(
+        return make_volume(
             self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
         )

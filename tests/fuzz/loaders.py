@@ -154,6 +154,23 @@ def map_file(folder):
     return folder / "map.npz"
 
 
+def adaptive_map_file(folder):
+    """A small map of two walls that meet, with smaller voxels at their edge."""
+    from dudmap.config import SensorConfig, VolumeConfig
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.mapping.adaptive_volume import AdaptiveVolume
+
+    config = VolumeConfig(voxel_size=0.1, adaptive=True, adaptive_bend=0.1)
+    made = AdaptiveVolume(Camera(20, 20, 15.5, 11.5, 32, 24), config, SensorConfig(), 3.0)
+    depth = np.broadcast_to(1.0 / (1 - 0.7 * np.abs(np.arange(32) - 15.5) / 20), (24, 32)).astype(np.float32)
+    for _ in range(3):
+        made.integrate(Frame(0.0, depth, np.full((24, 32, 3), 90, np.uint8)), np.eye(4))
+    assert made.levels[0].blocks.num_voxel_blocks > 0
+    made.save(folder / "map.npz")
+    return folder / "map.npz"
+
+
 def load_map(path):
     from dudmap.mapping.volume import TsdfVolume
 
@@ -394,6 +411,7 @@ LOADERS = {
     "archive tar.xz": Loader(partial(archive, "xztar"), read_recording),
     "masks": Loader(masks, load_masks),
     "map": Loader(map_file, load_map),
+    "adaptive map": Loader(adaptive_map_file, load_map),
     "state of a run": Loader(state, load_state),
     "keyframes": Loader(keyframes, load_keyframe_file),
     "depth model": Loader(depth_model, load_depth_model),

@@ -355,6 +355,21 @@ def test_maps_whose_arrays_do_not_fit(array, change, tmp_path, subjects):
     refused(lambda: TsdfVolume.load(tmp_path / "map.npz"), DudmapError)
 
 
+@pytest.mark.parametrize(
+    ("array", "change"),
+    [("slot_coords1", lambda a: a + 1000), ("slot_coords1", lambda a: a[:-1]), ("slot_coords1", lambda a: a * 0),
+     ("geometry1", lambda a: a[:, :7]), ("colors1", lambda a: a.astype(np.float32))],
+)  # fmt: skip
+def test_smaller_voxels_that_do_not_fit_their_map(array, change, tmp_path, subjects):
+    from dudmap.mapping.volume import TsdfVolume
+
+    with open_arrays(subjects("adaptive map").path) as found:
+        content = {name: np.array(found[name]) for name in found}
+    content[array] = change(content[array])
+    np.savez(tmp_path / "map.npz", **content)
+    refused(lambda: TsdfVolume.load(tmp_path / "map.npz"), MapError)
+
+
 def test_a_tar_that_says_it_is_larger(tmp_path, monkeypatch):
     monkeypatch.setenv("DUDMAP_CACHE", str(tmp_path / "cache"))
     out = io.BytesIO()

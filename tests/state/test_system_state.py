@@ -45,6 +45,7 @@ CASES = {
     "thesis": (["preset=thesis"], 12, ()),
     "every frame kept": (["loops.keep_gap=1", "relocalization.keyframe_gap=1", "loops.min_age=0.2"], 22, ()),
     "lost": (["submaps.patience=0.3"], 24, range(18, 26)),
+    "several voxel sizes": (["volume.adaptive=true", "volume.adaptive_bend=0.05"], 12, ()),
     "a second submap": (["submaps.patience=0.3"], 30, range(12, 24)),
 }
 

@@ -288,24 +288,9 @@ def raycast(
     grid = grid.on_host()
     shape = grid.shape
     low, high = np.float32(parameters.depth_min), np.float32(parameters.depth_max)
-    to_camera, to_lattice, radius = motions(grid, T_world_camera)
-    height, width = size
-    tiles = (-(-height // TILE), -(-width // TILE))
-    window = grid.window.reshape(tuple(shape))
-    ranges = bands(len(window), -(-len(window) // 8))
-    nears = np.full((len(ranges), *tiles), INFINITE, dtype=np.float32)
-    fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
-    image_size = np.array(size, dtype=np.int64)
-    run_bands(
-        lambda start, stop, near, far: _splat(
-            start, stop, window, to_camera, intrinsics, image_size, radius, low, high, near, far
-        ),
-        ranges,
-        nears,
-        fars,
-    )
-    near, far = nears.min(axis=0), fars.max(axis=0)
-
+    near, far = tile_depths(grid, T_world_camera, intrinsics, size, low, high)
+    _, to_lattice, _ = motions(grid, T_world_camera)
+    height = size[0]
     depth = np.empty(size, dtype=np.float32)
     color = np.empty((*size, 3), dtype=np.uint8)
     normals = np.empty((*size, 3), dtype=np.float32)
@@ -318,6 +303,33 @@ def raycast(
         bands(height, BAND),
     )  # fmt: skip
     return RaycastResult(depth, color, normals)
+
+
+def tile_depths(
+    grid: VoxelGrid,
+    T_world_camera: NDArray[np.float64],
+    intrinsics: NDArray[np.float32],
+    size: tuple[int, int],
+    low: np.float32,
+    high: np.float32,
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Nearest and farthest depth at which each tile of an image may meet a block, between ``low`` and ``high``, m."""
+    to_camera, _, radius = motions(grid, T_world_camera)
+    tiles = (-(-size[0] // TILE), -(-size[1] // TILE))
+    window = np.asarray(grid.window).reshape(tuple(grid.shape))
+    ranges = bands(len(window), -(-len(window) // 8))
+    nears = np.full((len(ranges), *tiles), INFINITE, dtype=np.float32)
+    fars = np.zeros((len(ranges), *tiles), dtype=np.float32)
+    image_size = np.array(size, dtype=np.int64)
+    run_bands(
+        lambda start, stop, near, far: _splat(
+            start, stop, window, to_camera, intrinsics, image_size, radius, low, high, near, far
+        ),
+        ranges,
+        nears,
+        fars,
+    )
+    return nears.min(axis=0), fars.max(axis=0)
 
 
 def motions(

@@ -99,15 +99,21 @@ class Integrator:
             frame_number: Number of the frame among those of the map, from 1.
             count: Number of equal frames that it stands for.
         """
-        T_camera_local = se3.inverse(T_world_camera)
-        T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (window.local_origin * window.block_size)
-        T_camera_local = T_camera_local[:3].astype(np.float32)
-        view = self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_local)
+        view = self.view(window, camera, depth, T_world_camera)
         self._allocate(blocks, window, view, frame_number)
         weights = self.reading_weights(depth, camera) if weights is None else weights
         self._average(blocks, window, view, color, weights, frame_number, count)
         if self.config.carving:
             self._observe_free(blocks, window, view, frame_number, count)
+
+    def view(
+        self, window: BlockWindow, camera: Camera, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]
+    ) -> DepthView:
+        """A depth image (H, W) at a pose (4, 4), in coordinates from the window's local origin."""
+        T_camera_local = se3.inverse(T_world_camera)
+        T_camera_local[:3, 3] += T_camera_local[:3, :3] @ (window.local_origin * window.block_size)
+        T_camera_local = T_camera_local[:3].astype(np.float32)
+        return self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_local)
 
     def grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
         """The blocks around the view as a back end takes them; valid until blocks are added."""

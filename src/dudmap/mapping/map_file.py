@@ -1,7 +1,7 @@
 """The map as a file: a NumPy archive that is written in parts, so that the map need not be in memory at once."""
 
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -31,6 +31,7 @@ class MapContent(NamedTuple):
     sensor: SensorConfig
     depth_max: float
     blocks: VoxelBlocks
+    levels: list[VoxelBlocks]
 
 
 def write_map(path: str | Path, volume: "TsdfVolume") -> None:
@@ -65,6 +66,11 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
                 _write_array(archive, name, array.dtype, array.shape, iter([array]))
             for name in ("geometry", "colors"):
                 _write_array(archive, name, np.int32, shape, (getattr(part, name) for part in volume.records()))
+            for number, level in enumerate(volume.levels, start=1):
+                slots = level.blocks.active_slots
+                for name in ("slot_coords", "geometry", "colors"):
+                    array = getattr(level.blocks, name)[slots]
+                    _write_array(archive, f"{name}{number}", array.dtype, array.shape, iter([array]))
     except OSError as error:
         raise MapError(f"cannot write the map to {path}: {error}") from error
 
@@ -102,6 +108,22 @@ def read_map(path: str | Path) -> MapContent:
                 VoxelBlocks.restored(
                     data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
                 ),
+                _read_levels(data),
             )
     except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error
+
+
+def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:
+    """The blocks with smaller voxels, level by level.
+
+    Raises:
+        ValueError: Their arrays do not belong together.
+    """
+    levels, names = [], set(data)
+    while f"slot_coords{len(levels) + 1}" in names:
+        number = len(levels) + 1
+        coords = data[f"slot_coords{number}"]
+        free, entries = np.zeros(len(coords), np.uint8), np.arange(len(coords), dtype=np.int32)
+        levels.append(VoxelBlocks.restored(coords, free, entries, data[f"geometry{number}"], data[f"colors{number}"]))
+    return levels

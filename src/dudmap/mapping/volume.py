@@ -1,7 +1,7 @@
 """Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +27,7 @@ from dudmap.kernels.parameters import (
 )
 from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
 from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.map_file import read_map, write_map
 from dudmap.mapping.memory_limit import MemoryLimit
@@ -35,8 +36,6 @@ from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
 _MAP_IDS = itertools.count()
-INTENSITY = 0xFF
-"""Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_JUMP = 5.0
 """Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
 one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
@@ -65,10 +64,13 @@ class TsdfVolume:
         band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
         sdf_unit: Metres per step of a stored distance.
         map_id: Number of the map in this process; ``clear`` gives a new one.
+        levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser levels first; none here.
 
     Raises:
         MapError: The voxels are too small for a window that covers ``depth_max``.
     """
+
+    levels: Sequence[FineBlocks] = ()
 
     def __init__(
         self,
@@ -181,10 +183,20 @@ class TsdfVolume:
         used_readings(np.ascontiguousarray(frame.depth, np.float32), used, np.float32(self.depth_max), depth)
         self.look_at(T_world_camera)
         self._frame_number += 1
+        self._fuse(depth, frame.color, weights, T_world_camera, count)
+
+    def _fuse(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
+        count: int,
+    ) -> None:
+        """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
         self._integrator.integrate(
-            self.blocks, self.window, self.camera, depth, frame.color, weights, T_world_camera, self._frame_number,
-            count,
-        )  # fmt: skip
+            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+        )
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
@@ -212,12 +224,7 @@ class TsdfVolume:
             other._bring(first, first + REGION)
             slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
             slots = slots[slots >= 0]
-            there = other.slots_at(self.blocks.slot_coords[slots].astype(np.int32))
-            known = there >= 0
-            intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
-            intensities[known] = other.blocks.geometry[there[known]] & INTENSITY
-            colors[known] = other.blocks.colors[there[known]]
-            self.blocks.write(slots, (self.blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
+            self.blocks.take_colors(slots, other.blocks)
             self.blocks.written[slots] = number
             if self.pager is not None:
                 self.pager.changed(first)
@@ -398,7 +405,6 @@ class TsdfVolume:
         Raises:
             MapError: The file is missing, damaged or not a map of this version.
         """
-        content = read_map(path)
-        volume = cls(content.camera, content.config, content.sensor, content.depth_max)
-        volume.blocks = content.blocks
-        return volume
+        from dudmap.mapping.adaptive_volume import volume_of
+
+        return volume_of(read_map(path))

@@ -55,6 +55,7 @@ class VolumeMirror:
             setattr(target, name, getattr(source, name).copy())
         target.num_entries = source.num_entries
         target.use_slots(source.num_slots)
+        self.volume.levels = [level.copied() for level in self._source.levels]
         self.volume._frame_number += 1
         target.written[slots] = self.volume._frame_number
         self._copied[slots] = self._source.num_integrated

@@ -15,6 +15,8 @@ COORDINATE_BITS = 18
 """Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
 MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
 """Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+INTENSITY = 0xFF
+"""Bits of a voxel's geometry word that hold its intensity (``kernels/voxel.py``)."""
 MAX_LOAD = 0.8
 """Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
 
@@ -101,6 +103,15 @@ class VoxelBlocks:
         self.geometry[slots], self.colors[slots] = geometry, colors
         self.geometry_mirror.wrote(slots)
         self.colors_mirror.wrote(slots)
+
+    def take_colors(self, slots: NDArray[np.integer], other: "VoxelBlocks") -> None:
+        """Give slots (n,) the colours and intensities that their blocks have in another map; 0 where it has none."""
+        there = other.slots_at(self.slot_coords[slots].astype(np.int32))
+        known = there >= 0
+        intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
+        intensities[known] = other.geometry[there[known]] & INTENSITY
+        colors[known] = other.colors[there[known]]
+        self.write(slots, (self.geometry[slots] & ~INTENSITY) | intensities, colors)
 
     @property
     def num_voxel_blocks(self) -> int:

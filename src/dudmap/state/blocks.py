@@ -172,7 +172,7 @@ def restore_map(
         StateError: The rows do not fit the index.
     """
     frame_number = volume._frame_number
-    volume.clear()
+    TsdfVolume.clear(volume)  # not what a subclass has besides, which is in the tree
     volume._frame_number = frame_number
     n, m = len(index["coords"]), len(index["entry_of"])
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)

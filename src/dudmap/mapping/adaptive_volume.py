@@ -1,0 +1,266 @@
+"""The map with smaller voxels where they matter (thesis section 7.1).
+
+The blocks of ``TsdfVolume`` cover everything that is seen, as without refinement: free space, carving and the band far
+from the surface are theirs. Blocks of half, and within them of a quarter of the voxel size lie over them where the
+surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.errors import ConfigError, MapError
+from dudmap.geometry.camera import Camera
+from dudmap.geometry.mesh import Mesh, joined
+from dudmap.kernels.adaptive_raycasting import raycast
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
+from dudmap.mapping.adaptive_mesh import NO_CHILDREN, NO_VOXELS, extract_groups
+from dudmap.mapping.fine_blocks import FineBlocks
+from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.mapping.map_file import MapContent
+from dudmap.mapping.memory_limit import MemoryLimit
+from dudmap.mapping.refinement import Refinement
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.mapping.voxel_blocks import VoxelBlocks
+
+
+def make_volume(
+    camera: Camera,
+    config: VolumeConfig,
+    sensor: SensorConfig,
+    depth_max: float,
+    backend: Backend | None = None,
+    max_blocks: int | MemoryLimit | None = None,
+) -> TsdfVolume:
+    """An empty map with one voxel size or, with ``volume.adaptive``, several; arguments as of ``TsdfVolume``."""
+    kind = AdaptiveVolume if config.adaptive else TsdfVolume
+    return kind(camera, config, sensor, depth_max, backend, max_blocks)
+
+
+def volume_of(content: MapContent) -> TsdfVolume:
+    """The map of a map file.
+
+    Raises:
+        MapError: Its levels of smaller voxels do not fit its configuration or each other.
+    """
+    volume = make_volume(content.camera, content.config, content.sensor, content.depth_max)
+    volume.blocks = content.blocks
+    if isinstance(volume, AdaptiveVolume):
+        volume.restore_levels(content.levels)
+    elif content.levels:
+        raise MapError("the map is damaged: it has smaller voxels, but its configuration says volume.adaptive=false")
+    return volume
+
+
+class AdaptiveVolume(TsdfVolume):
+    """A map whose voxels are halved where the surface is curved or finely coloured and the sensor resolves it.
+
+    Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
+    mesh and views read the finest. See ``docs/adaptive.md``.
+
+    Args:
+        camera, config, sensor, depth_max, backend, max_blocks, extent: As of ``TsdfVolume``.
+
+    Attributes:
+        levels: The finer levels, that with the larger voxels first.
+
+    Raises:
+        ConfigError: The device is not the CPU, or blocks are to wait on disk.
+        MapError: As of ``TsdfVolume``.
+    """
+
+    levels: Sequence[FineBlocks]
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: VolumeConfig | None = None,
+        sensor: SensorConfig | None = None,
+        depth_max: float = 6.0,
+        backend: Backend | None = None,
+        max_blocks: int | MemoryLimit | None = None,
+        extent: float | None = None,
+    ) -> None:
+        if max_blocks is not None:
+            raise ConfigError(
+                "a map with volume.adaptive stays in memory as a whole; leave out --max-memory, or set "
+                "volume.adaptive=false"
+            )
+        if not isinstance(backend or CpuBackend(), CpuBackend):
+            raise ConfigError("a map with volume.adaptive is computed on the CPU; take --device cpu")
+        super().__init__(camera, config, sensor, depth_max, backend, None, extent)
+        self._integrators, self._refinements = [], []
+        for number in range(self.config.adaptive_levels):
+            coarse = self.voxel_size / 2**number
+            scale = StorageScale.of(self._halved(coarse / 2), self.sensor, depth_max)
+            band = scale.band._replace(limit=self.band.limit)
+            integrator = Integrator(self._halved(coarse / 2), scale, depth_max, self.backend)
+            integrator.parameters = integrator.parameters._replace(band=band, sdf_unit=self.sdf_unit)
+            self._integrators.append(integrator)
+            parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
+            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
+
+    def _halved(self, voxel_size: float) -> VolumeConfig:
+        return self.config.model_copy(update={"voxel_size": voxel_size})
+
+    def clear(self) -> None:
+        """Remove everything that was integrated."""
+        super().clear()
+        self.levels = [FineBlocks(self.voxel_size / 2 ** (n + 1)) for n in range(self.config.adaptive_levels)]
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the map: that of the coarsest level, as without refinement, and that of the others."""
+        finer = 0
+        for parents, level in zip(self._coarser, self.levels, strict=True):
+            links = parents.num_slots * 8 * 4 + level.blocks.num_slots * (4 + 1)  # children; parent and calm
+            finer += level.blocks.num_bytes + links
+        return super().num_bytes + finer
+
+    @property
+    def _coarser(self) -> list[VoxelBlocks]:
+        """The parents of each level."""
+        return [self.blocks, *(level.blocks for level in self.levels[:-1])]
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def _fuse(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
+        count: int,
+    ) -> None:
+        weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
+        super()._fuse(depth, color, weights, T_world_camera, count)
+        number = self._frame_number
+        view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
+        slots = self.window.near
+        for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
+            level.follow(parents)
+            children = level.children_of(slots)
+            self._average(n, view, color, weights, children, count)
+            updated = slots[parents.written[slots] == number]
+            depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
+            touched = self._refinements[n].update(level, parents, updated, depths, number)
+            parents.written[touched] = number
+            slots = children[level.blocks.entry_of[children] >= 0]
+        self._note_changes(number)
+
+    def _average(
+        self,
+        n: int,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        candidates: NDArray[np.int32],
+        count: int,
+    ) -> None:
+        """Average an image into blocks of a finer level, and drop those that it shows to be empty."""
+        if len(candidates) == 0:
+            return
+        level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
+        blocks = level.blocks
+        if self.config.antialias:
+            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), level.voxel_size)
+        grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
+        turn = number if self.config.take_turns else -1
+        slots, occupied = self.backend.fuse(
+            grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
+        )
+        blocks.written[slots] = number
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
+        if self.config.carving:
+            empty = slots[occupied == 0]
+            self._coarser[n].written[level.parents[empty]] = number
+            level.drop(empty)
+
+    def _note_changes(self, number: int) -> None:
+        """Pass on to the coarsest level which blocks were written, for those that follow the changes of the map."""
+        for level, parents in zip(self.levels[::-1], self._coarser[::-1], strict=True):
+            slots = level.blocks.active_slots
+            slots = slots[level.blocks.written[slots] == number]
+            parents.written[level.parents[slots]] = number
+
+    def _depths(
+        self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Depth (n,) of the centres of blocks in the camera frame, metres."""
+        centres = (blocks.slot_coords[slots] + 0.5) * (8 * voxel_size)
+        return (centres - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+
+    def take_over(self, other: TsdfVolume) -> None:
+        """See ``TsdfVolume.take_over``."""
+        assert isinstance(other, AdaptiveVolume)
+        super().take_over(other)
+        self.levels = other.levels
+
+    def for_camera(
+        self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
+    ) -> "AdaptiveVolume":
+        """See ``TsdfVolume.for_camera``."""
+        other = AdaptiveVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
+        other.blocks, other._frame_number, other.levels = self.blocks, self._frame_number, self.levels
+        return other
+
+    def take_colors(self, other: TsdfVolume) -> None:
+        """See ``TsdfVolume.take_colors``."""
+        super().take_colors(other)
+        for level, theirs in zip(self.levels, other.levels, strict=True):
+            level.blocks.take_colors(level.blocks.active_slots, theirs.blocks)
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
+        """See ``TsdfVolume.raycast``."""
+        camera = camera or self.camera
+        self.look_at(T_world_camera)
+        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        tree = (*(level.children for level in self.levels), NO_CHILDREN)[:2]
+        geometry = (*(level.blocks.geometry for level in self.levels), NO_VOXELS)[:2]
+        colors = (*(level.blocks.colors for level in self.levels), NO_VOXELS)[:2]
+        return raycast(self.grid, tree, geometry, colors, T_world_camera, camera.intrinsics, camera.shape, parameters)
+
+    def extract_mesh(self, min_weight: int | None = None) -> Mesh:
+        """Triangles of the zero level by dual contouring, where every cell corner has at least ``min_weight``
+        observations.
+
+        Raises:
+            MapError: The map is empty.
+        """
+        if self.is_empty:
+            raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        slots = self.active_slots
+        parameters = self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight)
+        meshes = extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)
+        return meshes[0]
+
+    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+        """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
+        parameters = self._mesh_parameters(self.config.min_weight)
+        meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
+        return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def restore_levels(self, levels: list[VoxelBlocks]) -> None:
+        """Take over the finer blocks of a map file, level by level.
+
+        Raises:
+            MapError: There are more levels than the configuration has, or a block has no parent.
+        """
+        if len(levels) > len(self.levels):
+            raise MapError(
+                f"the map is damaged: it has {len(levels)} levels of smaller voxels, its configuration allows "
+                f"{len(self.levels)}"
+            )
+        for number, blocks in enumerate(levels):
+            level, parents = self.levels[number], self._coarser[number]
+            level.blocks = blocks
+            if not np.all(level.link(parents)):
+                raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")

@@ -1,0 +1,124 @@
+"""Blocks of half the voxel size inside the blocks of a coarser level of the map."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.kernels.mirror import grown
+from dudmap.kernels.parameters import VoxelGrid
+from dudmap.mapping.voxel_blocks import VoxelBlocks
+
+OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
+"""Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
+NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
+"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
+
+
+class FineBlocks:
+    """One level of refinement. A block covers one octant of its parent, a block of the next coarser level.
+
+    Args:
+        voxel_size: Edge of a voxel of this level, metres.
+
+    Attributes:
+        voxel_size: See above.
+        blocks: Blocks of this level; their coordinates are in units of their own size.
+        children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
+        parents: (slots,) int32 slot of the parent of each block.
+        calm: (slots,) uint8 successive evaluations in which a block was not needed.
+    """
+
+    def __init__(self, voxel_size: float) -> None:
+        self.voxel_size = voxel_size
+        self.blocks = VoxelBlocks()
+        self.children = np.full((0, 8), -1, dtype=np.int32)
+        self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
+        self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+
+    def follow(self, parents: VoxelBlocks) -> NDArray[np.int32]:
+        """Make room for the slots of the parents, and drop the blocks whose parent has been released.
+
+        Returns:
+            (n,) int32 slots that were dropped.
+        """
+        if len(self.children) < len(parents.entry_of):
+            self.children = grown(self.children, len(parents.entry_of), -1)
+        slots = self.blocks.active_slots
+        parent = self.parents[slots]
+        orphan = parents.entry_of[parent] < 0
+        orphan |= np.any(parents.slot_coords[parent] != self.blocks.slot_coords[slots] >> 1, axis=1)
+        self.drop(slots[orphan])
+        return slots[orphan]
+
+    def open(
+        self, parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64], frame_number: int
+    ) -> NDArray[np.int32]:
+        """New, empty blocks in octants (n,) of parents in slots (n,) that have none there; their slots (n,) int32."""
+        coords = (2 * parents.slot_coords[slots] + OCTANTS[octants]).astype(np.int32)
+        entries = self.blocks.entries_at(coords, len(coords))
+        new = self.blocks.allocate(entries, frame_number)
+        if len(self.parents) < len(self.blocks.entry_of):
+            self.parents = grown(self.parents, len(self.blocks.entry_of), -1)
+            self.calm = grown(self.calm, len(self.blocks.entry_of), 0)
+        self.parents[new], self.calm[new] = slots, 0
+        self.children[slots, octants] = new
+        return new
+
+    def drop(self, slots: NDArray[np.int32]) -> None:
+        """Remove blocks (n,)."""
+        if len(slots) == 0:
+            return
+        octants = self.octants_of(slots)
+        self.children[self.parents[slots], octants] = -1
+        self.blocks.release(slots, 0)
+        self.parents[slots] = -1
+
+    def octants_of(self, slots: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Octant (n,) of the parent that each of these blocks (n,) covers."""
+        low = (self.blocks.slot_coords[slots] & 1).astype(np.int64)
+        return 4 * low[:, 0] + 2 * low[:, 1] + low[:, 2]
+
+    def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all children of the parents in slots (m,), in their order."""
+        found = self.children[slots].ravel()
+        return found[found >= 0]
+
+    def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
+        """Find the parents of all blocks anew, by coordinates.
+
+        Returns:
+            (n,) whether each of the active slots has a parent.
+        """
+        self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
+        self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
+        self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+        slots = self.blocks.active_slots
+        found = parents.slots_at((self.blocks.slot_coords[slots] >> 1).astype(np.int32))
+        known = found >= 0
+        self.parents[slots[known]] = found[known]
+        self.children[found[known], self.octants_of(slots[known])] = slots[known]
+        return known
+
+    def copied(self) -> "FineBlocks":
+        """Copy for another thread to read; blocks are neither opened nor dropped there."""
+        out, n = FineBlocks(self.voxel_size), self.blocks.num_slots
+        for name in ("geometry", "colors", "slot_coords", "entry_of"):
+            setattr(out.blocks, name, getattr(self.blocks, name)[:n].copy())
+        out.blocks.use_slots(n)
+        out.children, out.parents = self.children.copy(), self.parents[:n].copy()
+        return out
+
+    def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
+        """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""
+        coords = self.blocks.slot_coords
+        coords = coords if not origin.any() else (coords - origin).astype(coords.dtype)
+        nothing = np.empty(0, dtype=np.int32)
+        return VoxelGrid(
+            nothing, np.zeros(3, np.int64), origin, self.blocks.geometry_mirror, self.blocks.colors_mirror,
+            coords, self.blocks.free_count, self.voxel_size, sdf_unit,
+        )  # fmt: skip
+
+
+def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+    coords = blocks.slot_coords[slots][:, None] + NEIGHBOURHOOD
+    return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)

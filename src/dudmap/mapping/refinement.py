@@ -1,0 +1,132 @@
+"""Where the map needs smaller voxels: where the surface bends or is finely coloured and the sensor resolves it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.kernels.parameters import TruncationBand
+from dudmap.kernels.refinement import SATURATED, examine, prolong
+from dudmap.kernels.threads import bands, run_bands
+from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood
+from dudmap.mapping.voxel_blocks import VoxelBlocks
+
+FIRST = 3
+"""Frames after which a block is examined for the first time."""
+PERIOD = 16
+"""Frames from one examination of a block to the next."""
+HYSTERESIS = 0.5
+"""Share of the thresholds below which a block with smaller voxels no longer needs them."""
+MAX_CALM = 3
+"""Successive examinations of that result after which its smaller voxels are dropped."""
+FILTERED = 0.5
+"""Standard deviation of a filtered reading relative to that of a raw one: assumed, since part of the noise of a sensor
+is the same over the window of the filter."""
+BEND_NOISE = np.sqrt(6) / 4
+"""Standard deviation of the bend along one axis for distances with the standard deviation 1."""
+SIGNIFICANT = 2.0
+"""Standard deviations of the bend of noise that a bend must exceed in addition to the threshold."""
+BAND = 64
+"""Blocks of one band."""
+
+
+class Refinement:
+    """Opens and drops the blocks of one level.
+
+    Args:
+        config: Thresholds.
+        sensor: Noise of the readings.
+        band: Truncation band of the coarser level.
+        voxel_size: Of the coarser level, metres.
+        sdf_unit: Metres per step of a stored distance.
+    """
+
+    def __init__(
+        self, config: VolumeConfig, sensor: SensorConfig, band: TruncationBand, voxel_size: float, sdf_unit: float
+    ) -> None:
+        self.config, self.sensor, self.band = config, sensor, band
+        self.voxel_size, self.sdf_unit = voxel_size, sdf_unit
+
+    def update(
+        self,
+        level: FineBlocks,
+        parents: VoxelBlocks,
+        slots: NDArray[np.int32],
+        depths: NDArray[np.float64],
+        number: int,
+    ) -> NDArray[np.int32]:
+        """Examine blocks of the coarser level that a frame was fused into.
+
+        Args:
+            level: Blocks of this level, changed here.
+            parents: Those of the coarser one.
+            slots: (n,) int32 slots of the parents.
+            depths: (n,) depth of their centres in the view, metres.
+            number: Number of the frame.
+
+        Returns:
+            (m,) int32 slots of the parents whose children changed.
+        """
+        sigma = self.sensor.sigma(depths)
+        fused = parents.fused[slots].astype(np.int64)
+        due = (fused == FIRST) | ((fused > FIRST) & ((slots + number) % PERIOD == 0))
+        due &= (depths > 0) & (sigma < level.voxel_size)
+        slots, sigma, fused = slots[due], sigma[due], fused[due]
+        if len(slots) == 0:
+            return slots
+        near = neighbourhood(parents, slots)
+        bend, texture, surface = self._examine(parents, near)
+        noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (self.voxel_size * np.sqrt(np.minimum(fused, 64)))
+        needed = np.maximum(
+            bend / np.hypot(self.config.adaptive_bend, noise)[:, None], texture / self.config.adaptive_texture
+        )
+        children = level.children[slots]
+        rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
+        if len(rows):
+            opened = level.open(parents, slots[rows], octants, number)
+            self._prolong(level, parents, near[rows], octants, opened)
+        dropped = self._drop_calm(level, children, surface, needed)
+        changed = np.zeros(len(slots), dtype=bool)
+        changed[rows] = True
+        return slots[changed | dropped]
+
+    def _drop_calm(
+        self, level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Drop children (n, 8) that are not needed any more; whether a parent (n,) lost one."""
+        rows, octants = np.nonzero(children >= 0)
+        slots = children[rows, octants]
+        calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
+        level.calm[slots] = np.where(calm, level.calm[slots] + 1, 0)
+        unneeded = level.calm[slots] >= MAX_CALM
+        level.drop(slots[unneeded])
+        out = np.zeros(len(children), dtype=bool)
+        out[rows[unneeded]] = True
+        return out
+
+    def _examine(
+        self, parents: VoxelBlocks, near: NDArray[np.int32]
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
+        bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
+        surface = np.empty((len(near), 8), dtype=np.uint8)
+        by_voxel = np.float32(self.sdf_unit / self.voxel_size)
+        saturated = np.float32(SATURATED * self.band.front / self.voxel_size)
+        geometry = parents.geometry
+        run_bands(
+            lambda start, stop: examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface),
+            bands(len(near), BAND),
+        )
+        return bend, texture, surface.astype(bool)
+
+    def _prolong(
+        self,
+        level: FineBlocks,
+        parents: VoxelBlocks,
+        near: NDArray[np.int32],
+        octants: NDArray[np.int64],
+        slots: NDArray[np.int32],
+    ) -> None:
+        """Fill new blocks with the interpolation of the coarser level."""
+        geometry, colors = level.blocks.geometry, level.blocks.colors
+        prolong(0, len(slots), parents.geometry, parents.colors, near, octants, slots, geometry, colors)
+        level.blocks.geometry_mirror.wrote(slots)
+        level.blocks.colors_mirror.wrote(slots)
