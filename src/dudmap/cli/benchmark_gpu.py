@@ -7,6 +7,7 @@ from typing import Annotated
 
 import typer
 
+from dudmap.atomic_file import write_text
 from dudmap.cli.output import JsonOption, answer
 
 
@@ -57,7 +58,7 @@ def gpu(
             rows += measurements.measure_open3d(python, name, each, frames, steps, "CPU:0" if other == "CPU" else other)
     text = measurements.table(rows)
     out.mkdir(parents=True, exist_ok=True)
-    (out / "gpu.md").write_text(text, encoding="utf-8")
+    write_text(out / "gpu.md", text)
     content = {"machine": machine(), "versions": versions(), "rows": [asdict(row) for row in rows]}
-    (out / "gpu.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
+    write_text(out / "gpu.json", json.dumps(content, indent=2) + "\n")
     answer(content | {"out": out}, f"{text}\nwritten to {out}", as_json=as_json)
