@@ -260,7 +260,9 @@ class Slam:
             FrameError: The images do not fit the camera or each other; the frame changed nothing.
         """
         view = self.prepare(self._given(frame, arrays), dynamic_mask)
-        if rejection := self.stream.rejection(view.observation):
+        with view.timer("check"):
+            rejection = self.stream.rejection(view.observation)
+        if rejection:
             return self._reject(view, rejection)
         view = self.color_motion.predicted(self._resumed(view))
         if self.reference.is_empty:

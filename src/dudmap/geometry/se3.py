@@ -41,6 +41,26 @@ def exp(xi: Matrix) -> Matrix:
     return T
 
 
+def exp_all(twists: Matrix) -> Matrix:
+    """Rigid motions (n, 4, 4) of twists (n, 6), each as by ``exp``."""
+    v, omega = twists[:, :3, None], twists[:, 3:]
+    theta_squared = np.sum(omega * omega, axis=1)[:, None, None]
+    W = np.zeros((len(twists), 3, 3))
+    W[:, (2, 0, 1), (1, 2, 0)] = omega
+    W[:, (1, 2, 0), (2, 0, 1)] = -omega
+    small = theta_squared < 1e-8  # Taylor series: the closed forms are 0/0 there
+    square = np.where(small, 1.0, theta_squared)
+    theta = np.sqrt(square)
+    a = np.where(small, 1 - theta_squared / 6, np.sin(theta) / theta)
+    b = np.where(small, 0.5 - theta_squared / 24, (1 - np.cos(theta)) / square)
+    c = np.where(small, 1 / 6 - theta_squared / 120, (1 - a) / square)
+    WW = W @ W
+    T = np.tile(np.eye(4), (len(twists), 1, 1))
+    T[:, :3, :3] += a * W + b * WW
+    T[:, :3, 3:] = v + b * (W @ v) + c * (WW @ v)
+    return T
+
+
 def exp_rotation(omega: Matrix) -> Matrix:
     """Rotation matrix (3, 3) of a rotation vector (3,), radians (Rodrigues)."""
     x, y, z = (float(value) for value in omega)
