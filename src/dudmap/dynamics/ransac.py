@@ -75,8 +75,8 @@ def rigid_motion(
     A = J[draws].reshape(-1, 6, 6)
     A = A + 1e-9 * np.eye(6)  # samples with a repeated point are degenerate; their hypotheses have no support
     motions = se3.exp_all(np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64))
-    by_axis = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
-    found = consensus.Correspondences(*by_axis, areas, camera.intrinsics)
+    points, targets, expected = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
+    found = consensus.Correspondences(points, targets, expected, areas, camera.intrinsics)
     scores = consensus.msac_scores(motions, found, params)
     best = np.argpartition(scores, -REFINED, axis=0)[-REFINED:]
     levels = [np.concatenate([T_expected[None], motions[highest]]) for highest in best.T]
