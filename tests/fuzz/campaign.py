@@ -3,7 +3,8 @@
 Usage: python tests/fuzz/campaign.py [--inputs 100000] [--seconds 60] [--loaders "bag,map"] [--out fuzz.jsonl]
 
 Input number n of a loader is the same on every machine; ``--only LOADER:n`` repeats one, and ``--keep LOADER:n FOLDER``
-writes it, to be added to tests/fuzz/corpus.
+writes it, to be added to tests/fuzz/corpus. Findings and the counts of each loader are appended to the file ``--out``;
+``--table FILE...`` prints the counts of one or several such files in Markdown, where the last reading counts.
 """
 
 import argparse
@@ -96,8 +97,62 @@ def fuzz(name, inputs, seconds, seed, memory, report):
 
 
 def chosen(text):
+    """Names of loaders that are, or contain, a part of ``text``."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
-    return [name for name in LOADERS if not parts or any(part in name for part in parts)]
+    return [name for name in LOADERS if not parts or any(fits(part, name) for part in parts)]
+
+
+def fits(part, name):
+    return part == name if part in LOADERS else part in name
+
+
+def campaign(names, inputs, seconds, seed, memory, out):
+    """Fuzz these loaders one after another; returns the number of findings."""
+    print(HEAD)
+    total = 0
+    for name in names:
+        before, begin = len(lines_of(out)), time.time()
+        count, deaths = fuzz(name, inputs, seconds, seed, memory, out)
+        found = len(lines_of(out)) - before
+        total += found
+        result = {
+            "loader": name, "first": seed, "inputs": count, "deaths": deaths, "findings": found,
+            "seconds": round(time.time() - begin, 1), "date": time.strftime("%Y-%m-%d"),
+            "python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores",
+        }  # fmt: skip
+        with out.open("a") as file:
+            file.write(json.dumps(result) + "\n")
+        print(row(result), flush=True)
+    return total
+
+
+HEAD = "| loader | inputs | per second | deaths | findings |\n|---|---|---|---|---|"
+
+
+def row(result):
+    rate = result["inputs"] / max(result["seconds"], 0.1)
+    return f"| {result['loader']} | {result['inputs']:,} | {rate:.0f} | {result['deaths']} | {result['findings']} |"
+
+
+def lines_of(path):
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
+
+
+def table(paths):
+    """Counts of the files of one or several campaigns, as text in Markdown.
+
+    Of readings of a loader from the same first number on, the last counts: the others are from before a mend.
+    """
+    results = [line for path in paths for line in lines_of(path) if "inputs" in line]
+    last = {(line["loader"], line["first"]): line for line in results}
+    rows = []
+    for name in LOADERS:
+        parts = [line for (loader, _), line in last.items() if loader == name]
+        sums = {key: sum(line[key] for line in parts) for key in ("inputs", "seconds", "deaths", "findings")}
+        rows.append({"loader": name, **sums})
+    total = {key: sum(line[key] for line in rows) for key in ("inputs", "seconds", "deaths", "findings")}
+    where = sorted({f"{line['date']}, Python {line['python']}, {line['machine']}" for line in last.values()})
+    return "\n".join([*where, "", HEAD, *map(row, [*rows, {"loader": "all", **total}])])
 
 
 def main():
@@ -109,8 +164,12 @@ def main():
     parser.add_argument("--memory", type=float, default=2.0, help="GiB that a loader may take")
     parser.add_argument("--only", help="LOADER:NUMBER, repeat one input and show what happens")
     parser.add_argument("--keep", nargs=2, help="LOADER:NUMBER and a folder, write the input")
-    parser.add_argument("--out", type=Path, default=Path("fuzz.jsonl"), help="findings")
+    parser.add_argument("--out", type=Path, default=Path("fuzz.jsonl"), help="findings and counts are appended")
+    parser.add_argument("--table", nargs="+", type=Path, help="such files, print their counts and end")
     arguments = parser.parse_args()
+    if arguments.table:
+        print(table(arguments.table))
+        return
     if arguments.only or arguments.keep:
         name, _, number = (arguments.only or arguments.keep[0]).rpartition(":")
         with tempfile.TemporaryDirectory() as folder:
@@ -124,21 +183,11 @@ def main():
                 subject.change(int(number))
                 subject.loader.load(subject.path)
         return
-    arguments.out.write_text("")
-    print(
-        f"{time.strftime('%Y-%m-%d')}, Python {platform.python_version()}, {platform.machine()}, {os.cpu_count()} cores"
-    )
-    print("| loader | inputs | deaths | findings |\n|---|---|---|---|")
-    total = 0
-    for name in chosen(arguments.loaders):
-        before = len(arguments.out.read_text().splitlines())
-        count, deaths = fuzz(
-            name, arguments.inputs, arguments.seconds, arguments.seed, arguments.memory, arguments.out.resolve()
-        )  # fmt: skip
-        found = len(arguments.out.read_text().splitlines()) - before
-        total += found
-        print(f"| {name} | {count} | {deaths} | {found} |", flush=True)
-    sys.exit(1 if total else 0)
+    found = campaign(
+        chosen(arguments.loaders), arguments.inputs, arguments.seconds, arguments.seed, arguments.memory,
+        arguments.out.resolve(),
+    )  # fmt: skip
+    sys.exit(1 if found else 0)
 
 
 if __name__ == "__main__":
