@@ -143,7 +143,7 @@ def line(rng, data):
         lines.insert(k, lines[rng.randrange(len(lines))])
     elif change == 2:
         lines[k] = lines[k].rstrip(b"\n")
-    else:
+    elif len(data) < 2**20:  # not again and again in one input
         lines += [lines[k]] * 500
     return b"".join(lines)
 

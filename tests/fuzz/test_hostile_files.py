@@ -17,9 +17,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from loaders import CAMERA, LOADERS, check_sentence
+from loaders import LOADERS
 from mutations import png
+from recording_loaders import CAMERA
 from trial import Finding, Subject, TooSlow
+from verdict import check_sentence
 
 import layouts
 from dudmap.errors import DatasetError, DudmapError, FrameError, MapError

@@ -8,8 +8,9 @@ import warnings
 from contextlib import contextmanager
 
 import numpy as np
-from loaders import LOADERS, check_sentence
+from loaders import LOADERS
 from mutations import SPECIAL, mutated, put_special
+from verdict import check_sentence
 
 from dudmap.errors import DudmapError
 

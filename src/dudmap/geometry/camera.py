@@ -11,6 +11,8 @@ from dudmap.errors import DatasetError
 Scalar = TypeVar("Scalar", bound=np.floating)
 LARGEST_PIXELS = 2**26
 """Largest number of pixels of an image, 8192x8192; the images of phones have up to 50 million."""
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e9
+"""Units of depth per metre: a unit is a kilometre or less and a nanometre or more. 16-bit values stay finite then."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +42,11 @@ class Camera:
             raise DatasetError(
                 f"camera has fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}, depth_scale={self.depth_scale}; "
                 "focal lengths and depth scale must be positive finite numbers"
+            )
+        if not SMALLEST_SCALE <= self.depth_scale <= LARGEST_SCALE:
+            raise DatasetError(
+                f"camera has depth_scale={self.depth_scale}; expected units per metre from {SMALLEST_SCALE} to "
+                f"{LARGEST_SCALE:.0e}, such as 1000 for millimetres"
             )
         if self.width < 16 or self.height < 16:
             raise DatasetError(f"camera image is {self.width}x{self.height}; at least 16x16 pixels are needed")
