@@ -8,6 +8,7 @@ writes it, to be added to tests/fuzz/corpus. Findings and the counts of each loa
 """
 
 import argparse
+import gc
 import json
 import mmap
 import os
@@ -40,6 +41,8 @@ def child(name, first, inputs, seconds, share, memory, report):
         (folder / "cwd").mkdir()
         os.chdir(folder / "cwd")
         subject.warm_up()  # before memory is limited
+        gc.collect()
+        gc.freeze()  # what stays need not be looked through again and again
         status = Path("/proc/self/status").read_text()
         used = int(status.partition("VmSize:")[2].split()[0]) * 1024
         resource.setrlimit(resource.RLIMIT_AS, (used + int(memory * 2**30),) * 2)

@@ -18,6 +18,8 @@ SECONDS = 10
 """Time that a loader has for one input."""
 
 
+NAMES = "a\nb", "\x1b[2J", "x" * 200, "-0.png", "nan.png"
+"""Names of files that no recorder gives."""
 SECRET = "the content of a file outside"
 
 
@@ -45,6 +47,7 @@ class Subject:
         self.files = {file: file.read_bytes() for file in sorted(self.home.rglob("*")) if file.is_file()}
         for file in (*self.files, self.secret):
             mark(file)
+        self.renamed = []
         self.valid = self.listed()
 
     def change(self, seed):
@@ -56,18 +59,19 @@ class Subject:
             if rng.random() < 0.06:
                 put_special(file, rng.choice(SPECIAL), self.secret)
             elif rng.random() < 0.02:
-                file.rename(
-                    file.with_name(rng.choice(("a\nb", "\x1b[2J", "x" * 200, "-0.png", "nan.png")) + file.suffix)
-                )
+                self.renamed.append(file.rename(file.with_name(rng.choice(NAMES) + file.suffix)))
             else:
                 file.write_bytes(mutated(rng, file.name, self.files[file]))
                 mark(file)
         return chosen
 
     def restore(self, changed=None):
-        """Make the input valid again, where only the files ``changed`` are not (default: all)."""
-        for path in sorted(self.listed().keys() - self.valid.keys(), reverse=True):
+        """Make the input valid again, where only the files ``changed`` are not (default: any file)."""
+        for path in sorted(self.listed().keys() - self.valid.keys(), reverse=True) if changed is None else ():
             os.rmdir(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
+        for file in self.renamed:
+            file.unlink(missing_ok=True)
+        self.renamed = []
         for file in self.files if changed is None else changed:
             if file.is_symlink() or file.is_fifo():
                 file.unlink()
