@@ -25,6 +25,7 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 from loaders import LOADERS
+from remembered import remember_rosbags
 from trial import Finding, Subject
 
 COUNT = struct.Struct("<QQ")
@@ -38,6 +39,7 @@ def child(name, first, inputs, seconds, share, memory, report):
     folder = Path(tempfile.mkdtemp(prefix="fuzz-", dir="/dev/shm" if Path("/dev/shm").is_dir() else None))
     try:
         subject = Subject(name, folder)
+        remember_rosbags()
         (folder / "cwd").mkdir()
         os.chdir(folder / "cwd")
         subject.warm_up()  # before memory is limited
