@@ -25,7 +25,7 @@ from pathlib import Path
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
 from loaders import LOADERS
-from remembered import remember_rosbags
+from remembered import remember_images, remember_rosbags
 from trial import Finding, Subject
 
 COUNT = struct.Struct("<QQ")
@@ -40,6 +40,7 @@ def child(name, first, inputs, seconds, share, memory, report):
     try:
         subject = Subject(name, folder)
         remember_rosbags()
+        remember_images(subject.files.values())
         (folder / "cwd").mkdir()
         os.chdir(folder / "cwd")
         subject.warm_up()  # before memory is limited

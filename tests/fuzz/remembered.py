@@ -1,4 +1,4 @@
-"""Code and trees that the package rosbags makes of text are kept, since most of an input is that of the one before."""
+"""What libraries make of unchanged parts of an input is kept, as most of an input is valid and that of the one before."""
 
 import copy
 from collections import OrderedDict
@@ -42,3 +42,20 @@ def remember_rosbags():
 
     store.exec = utils.exec = run
     metadata.YAML = reader.YAML = Yaml
+
+
+def remember_images(files):
+    """Keep what OpenCV decodes of the images among the valid files, given by their content."""
+    import cv2
+
+    valid, images, decode = set(files), {}, cv2.imdecode
+
+    def decoded(data, flags):
+        content = data.tobytes()
+        if content not in valid:
+            return decode(data, flags)
+        if (content, flags) not in images:
+            images[content, flags] = decode(data, flags)
+        return images[content, flags].copy()
+
+    cv2.imdecode = decoded
