@@ -1,4 +1,4 @@
-"""What libraries make of unchanged parts of an input is kept, as most of an input is valid and that of the one before."""
+"""What libraries make of the valid parts of an input is kept, as most of an input is valid."""
 
 import copy
 from collections import OrderedDict
