@@ -15,6 +15,7 @@ import os
 import platform
 import resource
 import shutil
+import signal
 import struct
 import sys
 import tempfile
@@ -30,6 +31,10 @@ from trial import Finding, Subject
 
 COUNT = struct.Struct("<QQ")
 """In memory shared with the child: number of inputs that were read, and number of the present one."""
+
+
+STUCK = 600
+"""Waits of 0.2 s for one input after which a child is killed, or for its kernels to be compiled."""
 
 
 def child(name, first, inputs, seconds, share, memory, report):
@@ -71,6 +76,22 @@ def child(name, first, inputs, seconds, share, memory, report):
         shutil.rmtree(folder, ignore_errors=True)
 
 
+def watched(pid, share):
+    """Status of the end of a child, which is killed where it stays with one input; compiled code hears no alarm.
+
+    Time in which this process is stopped itself does not count.
+    """
+    last, waits = b"", 0
+    while waits < STUCK:
+        ended, status = os.waitpid(pid, os.WNOHANG)
+        if ended:
+            return status
+        time.sleep(0.2)
+        waits, last = (waits + 1 if share[: COUNT.size] == last else 0), share[: COUNT.size]
+    os.kill(pid, signal.SIGKILL)
+    return os.waitpid(pid, 0)[1]
+
+
 def fuzz(name, inputs, seconds, seed, memory, report):
     """Inputs that were read, and deaths of the process."""
     share, number, count, deaths, left = mmap.mmap(-1, COUNT.size), seed, 0, 0, seconds
@@ -88,7 +109,7 @@ def fuzz(name, inputs, seconds, seed, memory, report):
                     file.write(json.dumps({"loader": name, "number": -1, "what": traceback.format_exc()}) + "\n")
             finally:
                 os._exit(code)
-        _, status = os.waitpid(pid, 0)
+        status = watched(pid, share)
         done, at = COUNT.unpack(share[: COUNT.size])
         count += done
         if os.WIFSIGNALED(status):

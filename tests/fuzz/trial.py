@@ -113,7 +113,10 @@ class Subject:
                 warnings.simplefilter("ignore")
                 self.loader.load(self.path)
         except DudmapError as error:
-            check_sentence(error)
+            try:
+                check_sentence(error)
+            except AssertionError as wrong:
+                raise Finding(f"not a sentence: {str(error)[:300]!r}") from wrong
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
