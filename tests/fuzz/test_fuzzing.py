@@ -26,7 +26,7 @@ def test_random_inputs(name, subjects):
     subject.warm_up()
 
     @settings(
-        max_examples=3 if subject.loader.slow else 12, deadline=None, database=None, derandomize=True,
+        max_examples=12, deadline=None, database=None, derandomize=True,
         suppress_health_check=list(HealthCheck),
     )  # fmt: skip
     @given(st.integers(0, 2**32))

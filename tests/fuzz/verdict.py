@@ -10,7 +10,6 @@ class Loader:
 
     write: Callable
     load: Callable
-    slow: bool = False  # much more than a millisecond per input
 
 
 def check_sentence(error):
