@@ -390,7 +390,7 @@ class Config(ConfigSection):
         """
         _check_keys(tree)
         preset = tree.get("preset", "default")
-        if preset not in PRESETS:
+        if not isinstance(preset, str) or preset not in PRESETS:
             raise ConfigError(f"unknown preset {preset!r}; expected one of {', '.join(PRESETS)}")
         try:
             return cls.model_validate(_merged(PRESETS[preset], tree))

@@ -112,7 +112,7 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
 def to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
-    return (block + np.float32(8) - p) * inverse if d > np.float32(0) else (block - p) * inverse
+    return (block + np.float32(8) - p) * inverse if d >= np.float32(0) else (block - p) * inverse
 
 
 @kernel
