@@ -1,0 +1,56 @@
+"""Launches that are repeated in one order: a graph on a GPU, where it captures one."""
+
+from typing import Any
+
+from dudmap.gpu import faults
+from dudmap.gpu.streams import Queue, gate
+
+_refusing: set[str] = set()
+"""Devices that have refused to capture a graph."""
+
+
+class Sequence:
+    """Recorded launches, none of which allocates, or depends on a number that the host reads in between.
+
+    A device that captures no graph, though it works, gets the launches one by one, and that is told.
+
+    Args:
+        queue: Where they are launched.
+        commands: The launches, whose arguments stay as they are.
+        as_graph: Whether a graph is wanted; on the CPU device launches one by one are as fast.
+    """
+
+    def __init__(self, queue: Queue, commands: list[Any], as_graph: bool | None = None) -> None:
+        self._queue, self._commands = queue, commands
+        self._as_graph = queue.is_pinned if as_graph is None else as_graph
+        self._graph: Any = None
+
+    @property
+    def is_graph(self) -> bool:
+        """Whether the launches are a graph by now."""
+        return self._graph is not None
+
+    def prepare(self) -> None:
+        """Capture the graph, unless there is one, or another thread uses the device. The launches may run once."""
+        if not self._as_graph or self.is_graph or self._queue.device in _refusing:
+            return
+        with gate(self._queue.device).capture() as is_alone:
+            if is_alone:
+                try:
+                    self._graph = self._queue.captured(self._commands)
+                except RuntimeError as error:
+                    self._refuse(error)
+
+    def run(self) -> None:
+        """Launch everything in order."""
+        if self._graph is None:
+            for command in self._commands:
+                self._queue.repeat(command)
+        else:
+            self._queue.replay(self._graph)
+
+    def _refuse(self, error: RuntimeError) -> None:
+        device = self._queue.device
+        _refusing.add(device)
+        reason = " ".join(str(error).split())
+        faults.tell(f"{device} captures no graph ({reason}); its kernels are launched one by one, which takes longer")

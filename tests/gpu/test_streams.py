@@ -1,0 +1,200 @@
+"""Streams, events, pinned buffers and graphs: the results are those of the CPU device whatever is done first."""
+
+import threading
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from dudmap.gpu.device import make_backend
+
+wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+make_backend("warp-cpu")
+
+from streamed import NAME, Gpu
+from test_images import FILTER
+
+from dudmap.config import Config
+from dudmap.gpu import backend as backends
+from dudmap.gpu import faults, sequence
+from dudmap.gpu.backend import WarpBackend
+from dudmap.gpu.memory import Images
+from dudmap.gpu.staging import ImagePool, Staging
+from dudmap.gpu.streams import CaptureGate, HostQueue, StreamQueue, main_queue, own_queue
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.tracker import Tracker
+from small_maps import CAMERA, CONFIG
+
+SEEDS = range(6)
+TRACKER = Tracker(Config().override(["tracker.widths=[80,160]", "tracker.iterations=[5,4]"]).tracker, Config().sensor)
+
+
+@pytest.fixture
+def streamed(monkeypatch):
+    """Makes a GPU, of which all memory is its own."""
+
+    def make(seed):
+        monkeypatch.setattr(backends, "_IMAGES", {})
+        return Gpu(monkeypatch, seed)
+
+    yield make
+    sequence._refusing.clear()
+
+
+def prepared(backend, frame):
+    """Depth and intensity of a frame, and of its half."""
+    depth = backend.filter(frame.depth.astype(np.float32), FILTER)
+    shade = backend.intensity(np.ascontiguousarray(frame.color))
+    small = backend.halve(depth, shade, 0.02)
+    return SimpleNamespace(levels=[small, (depth, shade)], color=np.ascontiguousarray(frame.color))
+
+
+def processed(device, recording):
+    """Everything that a small run computes; each frame is prepared before the one before it is registered and fused."""
+    preparing, volume = WarpBackend(device), TsdfVolume(CAMERA, CONFIG, depth_max=6.0, backend=WarpBackend(device))
+    found, following = [], prepared(preparing, recording[0])
+    for index in range(4):
+        view, following = following, prepared(preparing, recording[index + 1])
+        T = recording.ground_truth.Ts_world_camera[index]
+        if index:
+            levels = [
+                SimpleNamespace(camera=CAMERA.scaled(n), depth=depth, intensity=shade)
+                for n, (depth, shade) in zip((1, 0), view.levels, strict=True)
+            ]
+            result = TRACKER.align(volume, levels, T)
+            found += [result.T_world_camera, result.residual, result.color_residual, result.iterations]
+        volume.integrate(SimpleNamespace(depth=view.levels[1][0], color=view.color), T)
+        found += [image.copy() for level in view.levels for image in level]
+        del view
+    mesh = volume.extract_mesh(1)
+    return [*found, volume.blocks.geometry.copy(), mesh.vertices, mesh.colors, volume.raycast(T).depth]
+
+
+@pytest.fixture(scope="module")
+def expected(recording):
+    return processed("cpu", recording)
+
+
+def same(found, expected):
+    return len(found) == len(expected) and all(
+        np.array_equal(a, b, equal_nan=True) for a, b in zip(found, expected, strict=True)
+    )
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_the_order_of_the_streams_changes_no_result(streamed, recording, expected, seed):
+    gpu = streamed(seed)
+    found = processed(NAME, recording)
+    assert same(found, expected)
+    assert gpu.launched > 4  # the registrations are graphs
+
+
+def test_work_that_does_not_wait_is_found_out(streamed, recording, expected, monkeypatch):
+    """The GPU of these tests is one on which mistakes show."""
+    monkeypatch.setattr(StreamQueue, "wait", lambda self, event: None)
+    results = []
+    for seed in SEEDS:
+        streamed(seed)
+        results.append(same(processed(NAME, recording), expected))
+    assert not all(results)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_buffer_is_filled_again_when_it_was_read(streamed, seed):
+    streamed(seed)
+    queue = own_queue(NAME)
+    staging, targets = Staging(queue), [wp.empty((3, 4), dtype=wp.float32, device=NAME) for _ in range(7)]
+    for number, target in enumerate(targets):
+        staging.upload(np.full((3, 4), number, np.float32), target)
+    assert [staging.download(target)[0, 0] for target in targets] == [*range(7)]
+
+
+def test_a_buffer_that_is_filled_too_early_is_found_out(streamed, monkeypatch):
+    monkeypatch.setattr(StreamQueue, "finish", lambda self, event: None)
+    streamed(0)
+    queue = own_queue(NAME)
+    staging, targets = Staging(queue), [wp.empty((3, 4), dtype=wp.float32, device=NAME) for _ in range(7)]
+    for number, target in enumerate(targets):
+        staging.upload(np.full((3, 4), number, np.float32), target)
+    wp.synchronize_device(NAME)
+    assert [target.numpy()[0, 0] for target in targets] != [*range(7)]
+
+
+@pytest.mark.parametrize("device", ["cpu", NAME])
+def test_images_that_are_gone_make_room_for_others(streamed, device):
+    if device == NAME:
+        streamed(0)
+    images, pool = Images(device), ImagePool(own_queue(device), main_queue(device))
+    first, host = pool.take((3, 4)), np.zeros((3, 4), np.float32)
+    images.remember(host, first, pool.give_back)
+    assert images.twin(host) is first
+    assert pool.take((3, 4)) is not first
+    del host
+    assert pool.take((4, 3)) is not first
+    assert pool.take((3, 4)) is first
+    assert pool.take((3, 4)) is not first
+
+
+def test_an_upload_of_the_main_queue_is_not_taken_by_another_one(streamed):
+    streamed(0)
+    images, array = Images(NAME), np.zeros((3, 4), np.float32)
+    array.flags.writeable = False
+    assert images.up(array) is images.up(array)
+    assert images.twin(array) is None
+
+
+def test_a_device_that_captures_no_graph_launches_one_by_one(streamed, recording, expected):
+    gpu, told = streamed(1), []
+    gpu.refusal = "Graph capture is not supported"
+    with faults.told_to(told.append):
+        assert same(processed(NAME, recording), expected)
+    assert gpu.launched == 0
+    assert len(told) == 1
+    assert told[0].startswith("cuda:0 captures no graph (Graph capture is not supported)")
+    assert not faults.is_lost(NAME)
+
+
+def test_a_graph_of_the_cpu_device_gives_the_same(recording, expected, monkeypatch):
+    """Warp records and replays there, too."""
+    made = []
+
+    def init(self, queue, commands, as_graph=None):
+        original(self, queue, commands, True)
+        made.append(self)
+
+    original = sequence.Sequence.__init__
+    monkeypatch.setattr(sequence.Sequence, "__init__", init)
+    assert same(processed("cpu", recording), expected)
+    assert made
+    assert all(one.is_graph for one in made)
+
+
+def test_nothing_is_captured_while_another_thread_uses_the_device():
+    gate, entered, leave, waited = CaptureGate(), threading.Event(), threading.Event(), []
+
+    def use():
+        with gate.use():
+            entered.set()
+            leave.wait(10)
+
+    thread = threading.Thread(target=use)
+    thread.start()
+    assert entered.wait(10)
+    with gate.use(), gate.capture() as alone:  # its own use does not count
+        assert not alone
+    leave.set()
+    thread.join()
+    with gate.capture() as alone:
+        assert alone
+        late = threading.Thread(target=lambda: (gate.use().__enter__(), waited.append(True)))
+        late.start()
+        late.join(0.05)
+        assert not waited
+    late.join(10)
+    assert waited == [True]
+
+
+def test_both_queues_have_every_operation():
+    for kind in (HostQueue, StreamQueue):
+        for name in ("launch", "repeat", "copy", "record", "wait", "finish", "captured", "replay", "download"):
+            assert callable(getattr(kind, name))
