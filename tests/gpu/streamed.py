@@ -8,19 +8,26 @@ Every call is checked against the signature of the function of Warp that it stan
 
 import inspect
 import threading
+import time
+from importlib import import_module
+from types import SimpleNamespace
 
 import numpy as np
 import warp as wp
 from warp._src.context import invoke
 
 NAME = "cuda:0"
+MODULES = (
+    "backend", "clock", "descent", "linearization", "memory", "meshing", "preparation", "staging", "streams",
+)  # fmt: skip
+"""Modules that call Warp."""
 
 
 class Work:
     """Something to do after everything before it in its stream, and after other work."""
 
     def __init__(self, stream, run=None, after=()):
-        self.stream, self.run, self.after, self.done = stream, run, after, False
+        self.stream, self.run, self.after, self.done, self.time = stream, run, after, False, 0.0
 
 
 class Event:
@@ -82,6 +89,16 @@ class ScopedCapture:
         self.graph, self.stream.graph = self.stream.graph, None
 
 
+class Warp:
+    """Warp with other functions."""
+
+    def __init__(self, own):
+        vars(self).update(own)
+
+    def __getattr__(self, name):
+        return getattr(wp, name)
+
+
 class Gpu:
     """Takes the place of the functions of Warp.
 
@@ -95,19 +112,18 @@ class Gpu:
         self.random = np.random.default_rng(seed)
         self.streams, self.captures, self.launched, self.refusal = [], 0, 0, ""
         self._contexts = set()
-        self._real = {name: getattr(wp, name) for name in ("empty", "array", "launch", "copy")}
-        self._scan = wp.utils.array_scan
         self.main = self.stream()
         own = {
             "empty": self.empty, "zeros": self.zeros, "full": self.full, "array": self.array, "launch": self.launch,
             "copy": self.copy, "Stream": self.stream, "Event": Event, "get_stream": lambda device=None: self.main,
             "get_device": self.get_device, "synchronize_event": self.synchronize_event,
             "synchronize_device": self.synchronize_device, "ScopedCapture": self.capture,
-            "capture_launch": self.capture_launch,
+            "capture_launch": self.capture_launch, "get_event_elapsed_time": self.get_event_elapsed_time,
         }  # fmt: skip
-        for name, function in own.items():
-            monkeypatch.setattr(wp, name, checked(getattr(wp, name), function))
-        monkeypatch.setattr(wp.utils, "array_scan", self.scan)
+        self.warp = Warp({name: checked(getattr(wp, name), function) for name, function in own.items()})
+        self.warp.utils = SimpleNamespace(array_scan=self.scan)
+        for name in MODULES:
+            monkeypatch.setattr(import_module(f"dudmap.gpu.{name}"), "wp", self.warp)
 
     # -- order -------------------------------------------------------------------------------------------------------
 
@@ -124,7 +140,7 @@ class Gpu:
             head = heads[self.random.integers(len(heads))].works.pop(0)
             if head.run:
                 head.run()
-            head.done = True
+            head.done, head.time = True, time.perf_counter()
 
     def check_context(self):
         assert threading.get_ident() in self._contexts, "without a context, events fail without an exception"
@@ -143,7 +159,7 @@ class Gpu:
         return Device()
 
     def empty(self, shape=None, dtype=float, device=None, pinned=False):
-        array = self._real["empty"](shape, dtype=dtype, device="cpu")
+        array = wp.empty(shape, dtype=dtype, device="cpu")
         if array.size:
             array.numpy().view(np.uint8).fill(0x7B)
         array.is_pageable = device != NAME and not pinned
@@ -161,38 +177,44 @@ class Gpu:
 
     def array(self, data=None, dtype=None, device=None, copy=True):
         dtype = {} if dtype is None else {"dtype": dtype}
-        source = self._real["array"](data, device="cpu", copy=copy, **dtype)
+        source = wp.array(data, device="cpu", copy=copy, **dtype)
         if device != NAME:
             source.is_pageable = True
             return source
         array = self.empty(source.shape, source.dtype, device)
-        self.main.give(lambda: self._real["copy"](array, source))
+        self.main.give(lambda: wp.copy(array, source))
         return array
 
     def launch(self, kernel, dim, inputs=(), outputs=(), device=None, stream=None, record_cmd=False):
         assert device == NAME or stream in self.streams
         arguments = [*inputs, *outputs]
         if record_cmd:
-            return Launch(self, self._real["launch"](kernel, dim, arguments, device="cpu", record_cmd=True))
-        (stream or self.main).give(lambda: self._real["launch"](kernel, dim, arguments, device="cpu"))
+            return Launch(self, wp.launch(kernel, dim, arguments, device="cpu", record_cmd=True))
+        (stream or self.main).give(lambda: wp.launch(kernel, dim, arguments, device="cpu"))
         return None
 
     def copy(self, dest, src, dest_offset=0, src_offset=0, count=0, stream=None):
         if getattr(src, "is_pageable", False):
-            kept = self._real["empty"](src.shape, dtype=src.dtype, device="cpu")
-            self._real["copy"](kept, src)
+            kept = wp.empty(src.shape, dtype=src.dtype, device="cpu")
+            wp.copy(kept, src)
             src = kept
-        work = (stream or self.main).give(lambda: self._real["copy"](dest, src, dest_offset, src_offset, count))
+        work = (stream or self.main).give(lambda: wp.copy(dest, src, dest_offset, src_offset, count))
         if getattr(dest, "is_pageable", False):
             self.finish(work)
 
     def scan(self, array, out, inclusive=True):
-        self.main.give(lambda: self._scan(array, out, inclusive=inclusive))
+        self.main.give(lambda: wp.utils.array_scan(array, out, inclusive=inclusive))
 
     def synchronize_event(self, event):
         assert not self.captures, "no thread may wait while one captures"
         if event.work is not None:
             self.finish(event.work)
+
+    def get_event_elapsed_time(self, start_event, end_event, synchronize=True):
+        assert start_event.enable_timing
+        assert end_event.enable_timing
+        self.synchronize_event(end_event)
+        return 1000 * (end_event.work.time - start_event.work.time)
 
     def synchronize_device(self, device=None):
         for stream in self.streams:

@@ -39,7 +39,7 @@ class Preparation:
         """See ``Backend.filter``."""
         p = parameters
         with self._lock, self._gate.use():
-            steps = [(kernels.limit_depth, (p.depth_min, p.depth_max))]
+            steps: list[tuple[Any, tuple[Any, ...]]] = [(kernels.limit_depth, (p.depth_min, p.depth_max))]
             if p.drop_mixed:
                 steps.append((kernels.drop_mixed, (p.alpha, p.hole_noise, p.steepest)))
             if p.fill_holes:

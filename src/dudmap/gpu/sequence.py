@@ -1,5 +1,7 @@
 """Launches that are repeated in one order: a graph on a GPU, where it captures one."""
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 from dudmap.gpu import faults
@@ -7,6 +9,18 @@ from dudmap.gpu.streams import Queue, gate
 
 _refusing: set[str] = set()
 """Devices that have refused to capture a graph."""
+_wanted = [True]
+"""Whether graphs are used, as the innermost block says."""
+
+
+@contextmanager
+def one_by_one() -> Iterator[None]:
+    """Within the block the launches of graphs are made one by one, so that each kernel can be measured."""
+    _wanted.append(False)
+    try:
+        yield
+    finally:
+        _wanted.pop()
 
 
 class Sequence:
@@ -32,7 +46,7 @@ class Sequence:
 
     def prepare(self) -> None:
         """Capture the graph, unless there is one, or another thread uses the device. The launches may run once."""
-        if not self._as_graph or self.is_graph or self._queue.device in _refusing:
+        if not self._as_graph or not _wanted[-1] or self.is_graph or self._queue.device in _refusing:
             return
         with gate(self._queue.device).capture() as is_alone:
             if is_alone:
@@ -43,7 +57,7 @@ class Sequence:
 
     def run(self) -> None:
         """Launch everything in order."""
-        if self._graph is None:
+        if self._graph is None or not _wanted[-1]:
             for command in self._commands:
                 self._queue.repeat(command)
         else:

@@ -328,7 +328,7 @@ class CpuBackend:
         )  # fmt: skip
         return registration.normal_equations(sums.sum(axis=0), residuals)
 
-    def descend(self, *_: Any, **__: Any) -> None:  # noqa: ANN401
+    def descend(self, *_: Any, **__: Any) -> None:
         """See ``Backend.descend``: the loop is the caller's."""
 
     def sample(

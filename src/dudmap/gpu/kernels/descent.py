@@ -21,9 +21,9 @@ SIZES = {
     "DIMENSIONS": 1, "ORIGIN": 3, "VOXEL": 1, "DAMPING": 1, "LIMIT": 1, "STOP": 1, "STOP_GAIN": 1, "LENGTH": 1,
     "USED": 1, "STATUS": 1, "ACCEPTED": 1,
 }  # fmt: skip
-"""Parts of the state and their lengths: poses (3, 4), row by row; sums of both poses (``registration.NUM_SUMS``); basis (6, m), row by row
-with 6 columns; origin of the window's lattice, voxels; number of linearisations; status; which of the two images of
-residuals belongs to the accepted pose, -1 = neither."""
+"""Parts of the state and their lengths: poses (3, 4), row by row; sums of both poses (``registration.NUM_SUMS``); basis
+(6, m), row by row with 6 columns; origin of the window's lattice, voxels; number of linearisations; status; which of
+the two images of residuals belongs to the accepted pose, -1 = neither."""
 PLACES = dict(zip(SIZES, [sum([*SIZES.values()][:n]) for n in range(len(SIZES))], strict=True))
 """Number of the first element of each part of the state."""
 STATE_SIZE = sum(SIZES.values())
