@@ -111,7 +111,7 @@ class Gpu:
     def __init__(self, monkeypatch, seed):
         self.random = np.random.default_rng(seed)
         self.streams, self.captures, self.launched, self.refusal = [], 0, 0, ""
-        self._contexts = set()
+        self._contexts, self._lock = set(), threading.RLock()
         self.main = self.stream()
         own = {
             "empty": self.empty, "zeros": self.zeros, "full": self.full, "array": self.array, "launch": self.launch,
@@ -133,14 +133,15 @@ class Gpu:
 
     def finish(self, work):
         """Do work that may be done next, of streams drawn by chance, until this is done."""
-        while not work.done:
-            heads = [stream for stream in self.streams if stream.works]
-            heads = [stream for stream in heads if all(other.done for other in stream.works[0].after)]
-            assert heads, "the streams wait for each other"
-            head = heads[self.random.integers(len(heads))].works.pop(0)
-            if head.run:
-                head.run()
-            head.done, head.time = True, time.perf_counter()
+        with self._lock:
+            while not work.done:
+                heads = [stream for stream in self.streams if stream.works]
+                heads = [stream for stream in heads if all(other.done for other in stream.works[0].after)]
+                assert heads, "the streams wait for each other"
+                head = heads[self.random.integers(len(heads))].works.pop(0)
+                if head.run:
+                    head.run()
+                head.done, head.time = True, time.perf_counter()
 
     def check_context(self):
         assert threading.get_ident() in self._contexts, "without a context, events fail without an exception"
@@ -233,10 +234,11 @@ class Gpu:
 
 def checked(real, function):
     """The function, called only with arguments that the one of Warp takes."""
-    signature = inspect.signature(real)
+    signature = inspect.signature(real.__init__ if isinstance(real, type) else real)
+    own = [None] if isinstance(real, type) else []
 
     def call(*arguments, **named):
-        signature.bind(*arguments, **named)
+        signature.bind(*own, *arguments, **named)
         return function(*arguments, **named)
 
     return call

@@ -1,6 +1,8 @@
 """Streams, events, pinned buffers and graphs: the results are those of the CPU device whatever is done first."""
 
+import inspect
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 
 import numpy as np
@@ -11,7 +13,7 @@ from dudmap.gpu.device import make_backend
 wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
-from streamed import NAME, Gpu
+from streamed import NAME, Gpu, Launch, ScopedCapture, Stream
 from test_images import FILTER
 
 from dudmap.config import Config
@@ -49,12 +51,18 @@ def prepared(backend, frame):
     return SimpleNamespace(levels=[small, (depth, shade)], color=np.ascontiguousarray(frame.color))
 
 
-def processed(device, recording):
+def at_once(function, *arguments):
+    """What a thread would do later, as a future."""
+    result = function(*arguments)
+    return SimpleNamespace(result=lambda: result)
+
+
+def processed(device, recording, submit=at_once):
     """Everything that a small run computes; each frame is prepared before the one before it is registered and fused."""
     preparing, volume = WarpBackend(device), TsdfVolume(CAMERA, CONFIG, depth_max=6.0, backend=WarpBackend(device))
-    found, following = [], prepared(preparing, recording[0])
+    found, following = [], submit(prepared, preparing, recording[0])
     for index in range(4):
-        view, following = following, prepared(preparing, recording[index + 1])
+        view, following = following.result(), submit(prepared, preparing, recording[index + 1])
         T = recording.ground_truth.Ts_world_camera[index]
         if index:
             levels = [
@@ -87,6 +95,14 @@ def test_the_order_of_the_streams_changes_no_result(streamed, recording, expecte
     found = processed(NAME, recording)
     assert same(found, expected)
     assert gpu.launched > 4  # the registrations are graphs
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_another_thread_may_prepare(streamed, recording, expected, seed):
+    """Nothing waits while a graph is captured, and the thread has the context of the device."""
+    streamed(seed)
+    with ThreadPoolExecutor(1) as reader:
+        assert same(processed(NAME, recording, reader.submit), expected)
 
 
 def tiles_of_an_image_that_is_gone(device, recording):
@@ -212,6 +228,20 @@ def test_nothing_is_captured_while_another_thread_uses_the_device():
         assert not waited
     late.join(10)
     assert waited == [True]
+
+
+@pytest.mark.parametrize(
+    ("kind", "real", "names"),
+    [
+        (Stream, wp.Stream, ["record_event", "wait_event"]),
+        (Launch, wp.Launch, ["launch", "set_param_by_name"]),
+        (ScopedCapture, wp.ScopedCapture, ["__enter__", "__exit__"]),
+    ],
+)
+def test_methods_of_the_simulated_gpu_are_those_of_warp(kind, real, names):
+    for name in names:
+        own, expected = (list(inspect.signature(getattr(one, name)).parameters) for one in (kind, real))
+        assert own == expected or name == "__exit__"
 
 
 def test_both_queues_have_every_operation():

@@ -1,8 +1,8 @@
 """The back end for GPUs: Warp kernels behind the operations of ``kernels/backend.py``.
 
 The map stays on the device (``memory.py``); images that the device computed are not uploaded again. What is not ported
-is delegated to the CPU's back end by name: ``color_pixels`` and ``footprint_colors``, which are off by default, and the
-division of a mesh into chunks.
+is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs, and the division of a mesh
+into chunks.
 """
 
 # Warp's annotations name float where any type of number is meant
@@ -62,7 +62,7 @@ class WarpBackend:
         self._images = _IMAGES.setdefault(device, Images(device))
         self._queue = main_queue(device)
         self._host = CpuBackend()
-        self.color_pixels, self.footprint_colors = self._host.color_pixels, self._host.footprint_colors
+        self.color_pixels = self._host.color_pixels
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
 
     # -- filter ------------------------------------------------------------------------------------------------------
@@ -80,6 +80,12 @@ class WarpBackend:
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Backend.halve``."""
         return self._preparation.halve(depth, intensity, tolerance)
+
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """See ``Backend.footprint_colors``."""
+        return self._preparation.footprint_colors(color, depth, focal, voxel_size)
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 

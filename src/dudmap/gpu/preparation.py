@@ -14,6 +14,7 @@ from dudmap.gpu.kernels import images as kernels
 from dudmap.gpu.memory import Images
 from dudmap.gpu.staging import WARP_TYPES, ImagePool, Staging
 from dudmap.gpu.streams import gate, main_queue, own_queue
+from dudmap.kernels.antialiasing import SAME_SURFACE
 from dudmap.kernels.parameters import FilterParameters
 
 SHARES = 0.299 / 255, 0.587 / 255, 0.114 / 255
@@ -62,6 +63,16 @@ class Preparation:
             self._queue.launch(kernels.intensities, rgb.shape[:2], self._up(rgb, "raw"), *SHARES, out)
             return self._down(out)
 
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """See ``Backend.footprint_colors``; the result is read-only."""
+        with self._lock, self._gate.use():
+            out = self._pool.take(color.shape, wp.uint8)
+            arguments = self._up(depth, "depth"), self._up(color, "raw"), focal * voxel_size, SAME_SURFACE * voxel_size
+            self._queue.launch(kernels.footprint_means, depth.shape, *arguments, out)
+            return self._down(out)
+
     def halve(
         self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -81,7 +92,7 @@ class Preparation:
             self._staging.upload(array, twin)
         return twin
 
-    def _down(self, image: Any) -> NDArray[np.float32]:  # noqa: ANN401 - an array of Warp
+    def _down(self, image: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
         """A copy in the host's memory, read-only, whose equal on the device is used again when it has gone."""
         array = self._staging.download(image)
         array.flags.writeable = False
