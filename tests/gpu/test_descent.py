@@ -14,7 +14,7 @@ from dudmap.config import Config
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry import se3
-from dudmap.gpu import faults
+from dudmap.gpu import descent, faults
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.kernels import descent as kernels
 from dudmap.gpu.kernels.formulas import Motion
@@ -132,9 +132,8 @@ def advanced(H, b, basis, damping):
     for name, value in (("DIMENSIONS", basis.shape[1]), ("VOXEL", 1), ("DAMPING", damping), ("LIMIT", 1)):
         part(name)[:] = value
     part("STATUS")[:] = kernels.RUNNING
-    array, damped = wp.array(state, device="cpu"), wp.empty((6, 6), dtype=wp.float64, device="cpu")
-    system, motion = wp.empty((6, 7), dtype=wp.float64, device="cpu"), wp.zeros(1, dtype=Motion, device="cpu")
-    wp.launch(kernels.advance, dim=1, inputs=[1, array, damped, system, motion], device="cpu")
+    array, motion = wp.array(state, device="cpu"), wp.zeros(1, dtype=Motion, device="cpu")
+    wp.launch(kernels.advance, dim=1, inputs=[1, array, motion], device="cpu")
     state[:] = array.numpy()
     return part("STEP").copy(), part("TRIAL").reshape(3, 4).copy(), part("STATUS")[0], motion.numpy().reshape(3, 4)
 
@@ -164,10 +163,30 @@ def test_a_rotation_is_that_of_the_host(angle):
 
 
 def test_equations_without_a_solution_are_left_to_the_host():
-    basis = np.eye(6)[:, [0, 1, 1]]  # one direction twice
-    assert advanced(np.eye(6), np.ones(6), basis, 0.1)[2] == kernels.SINGULAR
+    twice = np.eye(6)[:, [0, 1, 1]]  # one direction twice
+    assert advanced(np.eye(6), np.ones(6), twice, 0.1)[2] == kernels.INDEFINITE
+    assert advanced(np.diag([1.0, 1, 1, 1, 1, -1]), np.ones(6), np.eye(6), 0.1)[2] == kernels.INDEFINITE
     assert advanced(np.zeros((6, 6)), np.ones(6), np.eye(6), 0.1)[2] == kernels.EXHAUSTED
-    assert advanced(np.full((6, 6), np.nan), np.ones(6), np.eye(6), 0.1)[2] == kernels.EXHAUSTED
+    assert advanced(np.eye(6), np.full(6, np.nan), np.eye(6), 0.1)[2] == kernels.INDEFINITE
+
+
+def test_the_host_makes_the_steps_that_the_device_does_not(volume, recording, monkeypatch):
+    tracker, levels = tracker_of(), levels_of(recording, 4)
+    T = recording.ground_truth.Ts_world_camera[3]
+    expected = by_the_host(monkeypatch, lambda: tracker.align(volume, levels, T))
+    states = []
+
+    def left(state, name, part=descent._part):
+        if name != "STATUS":
+            return part(state, name)
+        states.append(state)
+        return part(state, name) if len(states) % 2 else np.array([kernels.INDEFINITE])  # read every second time
+
+    monkeypatch.setattr(descent, "_part", left)
+    found = tracker.align(volume, levels, T)
+    assert len(states) == 6
+    np.testing.assert_array_equal(found.T_world_camera, expected.T_world_camera)
+    assert found.iterations == expected.iterations
 
 
 @pytest.mark.parametrize("error", [LOST, FULL])

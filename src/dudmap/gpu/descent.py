@@ -65,7 +65,7 @@ class DeviceDescent:
         damping: Damping,
         parameters: RegistrationParameters,
     ) -> Descent | None:
-        """The steps from a pose (4, 4) on; None where the normal equations have no solution.
+        """The steps from a pose (4, 4) on; None where H is not positive definite, which the host decides upon.
 
         The residuals stay on the device until one of them is read.
         """
@@ -80,7 +80,7 @@ class DeviceDescent:
         return self._result(self._staging.download(self._state))
 
     def _result(self, state: NDArray[np.float64]) -> Descent | None:
-        if _part(state, "STATUS")[0] == kernels.SINGULAR:
+        if _part(state, "STATUS")[0] == kernels.INDEFINITE:
             return None
         T, accepted = np.eye(4), int(_part(state, "ACCEPTED")[0])
         T[:3] = _part(state, "POSE").reshape(3, 4)
@@ -97,17 +97,16 @@ class DeviceDescent:
         threads = -(-self._images[0].size // (PER_THREAD * LANES)) * LANES
         partial = self._empty((NUM_SUMS, threads))
         parts, state = self._empty((NUM_SUMS, GROUPS), wp.float64), self._state
-        work = self._empty((6, 6), wp.float64), self._empty((6, 7), wp.float64)
         motion = wp.zeros(1, dtype=Motion, device=self._queue.device)
         return [
-            self._recorded(kernels.advance, 1, 1, state, *work, motion),
+            self._recorded(kernels.advance, 1, 1, state, motion),
             self._recorded(
                 kernels.linearize_trial, threads, *self._images, camera, motion, lattice, voxel_size, sdf_unit,
                 self._on_device, PER_THREAD, state, self._residuals, partial,
             ),
             self._recorded(kernels.add_up_trial, parts.shape, partial, GROUPS, state, parts),
             self._recorded(kernels.finish_trial, NUM_SUMS, parts, state),
-            self._recorded(kernels.advance, 1, 0, state, *work, motion),
+            self._recorded(kernels.advance, 1, 0, state, motion),
         ]  # fmt: skip
 
     def _recorded(self, kernel: Any, dim: Any, *arguments: Any) -> Any:  # noqa: ANN401

@@ -27,14 +27,16 @@ the two images of residuals belongs to the accepted pose, -1 = neither."""
 PLACES = dict(zip(SIZES, [sum([*SIZES.values()][:n]) for n in range(len(SIZES))], strict=True))
 """Number of the first element of each part of the state."""
 STATE_SIZE = sum(SIZES.values())
-IDLE, RUNNING, SETTLED, EXHAUSTED, SINGULAR = range(5)
+IDLE, RUNNING, SETTLED, EXHAUSTED, INDEFINITE = range(5)
 """Values of the status: nothing to do, going on, ended by a criterion, ended by the limit or without information, and
-normal equations that have no solution."""
+normal equations whose matrix is not positive definite."""
 COST = 27
 """Number of the cost among the sums."""
 
 State = wp.array(dtype=wp.float64)
-Square = wp.array2d(dtype=wp.float64)
+Parts = wp.array2d(dtype=wp.float64)
+Matrix, Vector = wp.types.matrix((6, 6), wp.float64), wp.types.vector(6, wp.float64)
+INFINITE = wp.constant(wp.float64(float("inf")))
 POSE, TRIAL, STEP, SUMS, TRIAL_SUMS, BASIS = (
     wp.constant(PLACES[name]) for name in ("POSE", "TRIAL", "STEP", "SUMS", "TRIAL_SUMS", "BASIS")
 )
@@ -44,8 +46,8 @@ DIMENSIONS, ORIGIN, VOXEL, DAMPING, LIMIT, STOP = (
 STOP_GAIN, LENGTH, USED, STATUS, ACCEPTED = (
     wp.constant(PLACES[name]) for name in ("STOP_GAIN", "LENGTH", "USED", "STATUS", "ACCEPTED")
 )
-GOES_ON, ENDS_SETTLED, ENDS_EXHAUSTED, ENDS_SINGULAR = (
-    wp.constant(wp.float64(value)) for value in (RUNNING, SETTLED, EXHAUSTED, SINGULAR)
+GOES_ON, ENDS_SETTLED, ENDS_EXHAUSTED, ENDS_INDEFINITE = (
+    wp.constant(wp.float64(value)) for value in (RUNNING, SETTLED, EXHAUSTED, INDEFINITE)
 )
 COST_PLACE = wp.constant(COST)
 rotation_elements = warp_function(se3.rotation_elements)
@@ -61,62 +63,69 @@ def element(state: State, i: int, j: int):
 
 
 @wp.func
-def solve(system: Square, m: int):
-    """Solve m equations, whose right sides are in column m, in place by Gaussian elimination with partial pivoting.
-
-    Returns:
-        Whether there is a solution, which then is in column m.
-    """
-    regular = bool(True)
-    for k in range(m):
-        best = int(k)
-        for i in range(k + 1, m):
-            if abs(system[i, k]) > abs(system[best, k]):
-                best = i
-        if system[best, k] == wp.float64(0.0):
-            regular = False
-        else:
-            for j in range(k, m + 1):
-                kept = wp.float64(system[k, j])
-                system[k, j] = system[best, j]
-                system[best, j] = kept
-            for i in range(k + 1, m):
-                share = system[i, k] / system[k, k]
-                for j in range(k, m + 1):
-                    system[i, j] = system[i, j] - share * system[k, j]
-    if regular:
-        for turn in range(m):
-            i = m - 1 - turn
-            total = wp.float64(system[i, m])
-            for j in range(i + 1, m):
-                total -= system[i, j] * system[j, m]
-            system[i, m] = total / system[i, i]
-    return regular
+def damped(state: State, largest: wp.float64):
+    """H at the accepted pose, with the damping on its diagonal."""
+    H = Matrix()
+    for i in range(6):
+        for j in range(6):
+            H[i, j] = element(state, i, j)
+        H[i, i] = H[i, i] + added(H[i, i], largest, wp.float64(state[DAMPING]))
+    return H
 
 
 @wp.func
-def project(state: State, largest: wp.float64, damped: Square, system: Square):
-    """Write the equations B' (H + damping) B y = -B' b of a step B y along the basis B."""
-    m = int(state[DIMENSIONS])
+def factorized(H: Matrix):
+    """Lower triangle of Cholesky's factor of a matrix; NaN or worse on its diagonal where that is not positive."""
+    L = Matrix()
+    for j in range(6):
+        square = wp.float64(H[j, j])
+        for k in range(j):
+            square -= L[j, k] * L[j, k]
+        root = wp.sqrt(square)
+        L[j, j] = root
+        for i in range(j + 1, 6):
+            value = wp.float64(H[i, j])
+            for k in range(j):
+                value -= L[i, k] * L[j, k]
+            L[i, j] = value / root
+    return L
+
+
+@wp.func
+def substituted(L: Matrix, right: Vector):
+    """Solution x of L L' x = right."""
+    x = Vector()
     for i in range(6):
-        for k in range(m):  # (H + damping) B
-            total = wp.float64(0.0)
-            for j in range(6):
-                h = element(state, i, j)
-                if i == j:
-                    h += added(h, largest, state[DAMPING])
-                total += h * state[BASIS + 6 * j + k]
-            damped[i, k] = total
-    for k in range(m):
-        for n in range(m):
-            total = wp.float64(0.0)
-            for i in range(6):
-                total += state[BASIS + 6 * i + k] * damped[i, n]
-            system[k, n] = total
-        right = wp.float64(0.0)
+        value = wp.float64(right[i])
+        for k in range(i):
+            value -= L[i, k] * x[k]
+        x[i] = value / L[i, i]
+    for turn in range(6):
+        i = 5 - turn
+        value = wp.float64(x[i])
+        for k in range(i + 1, 6):
+            value -= L[k, i] * x[k]
+        x[i] = value / L[i, i]
+    return x
+
+
+@wp.func
+def solution(state: State, largest: wp.float64):
+    """Step B y with B' (H + damping) B y = -B' b along the basis B; not finite where H is not positive definite."""
+    H, right, m = damped(state, largest), Vector(), int(state[DIMENSIONS])
+    for i in range(6):
+        right[i] = -state[SUMS + 21 + i]
+    if m < 6:
+        B = Matrix()
         for i in range(6):
-            right -= state[BASIS + 6 * i + k] * state[SUMS + 21 + i]
-        system[k, m] = right
+            for k in range(6):
+                B[i, k] = state[BASIS + 6 * i + k]
+        H = wp.transpose(B) * H * B
+        for k in range(6):
+            if k >= m:  # columns of zeros
+                H[k, k] = wp.float64(1.0)
+        return B * substituted(factorized(H), wp.transpose(B) * right)
+    return substituted(factorized(H), right)
 
 
 @wp.func
@@ -135,7 +144,7 @@ def move(state: State):
 
 
 @wp.func
-def propose(state: State, damped: Square, system: Square):
+def propose(state: State):
     """The next step from the accepted pose, or the end."""
     largest = wp.float64(element(state, 0, 0))
     for i in range(6):
@@ -145,18 +154,14 @@ def propose(state: State, damped: Square, system: Square):
     if state[USED] >= state[LIMIT] or not largest > wp.float64(0.0):
         state[STATUS] = ENDS_EXHAUSTED
         return
-    m = int(state[DIMENSIONS])
-    project(state, largest, damped, system)
-    if not solve(system, m):
-        state[STATUS] = ENDS_SINGULAR
-        return
+    step = solution(state, largest)
     square = wp.float64(0.0)
     for i in range(6):
-        total = wp.float64(0.0)
-        for k in range(m):
-            total += state[BASIS + 6 * i + k] * system[k, m]
-        state[STEP + i] = total
-        square += total * total
+        state[STEP + i] = step[i]
+        square += step[i] * step[i]
+    if not square < INFINITE:
+        state[STATUS] = ENDS_INDEFINITE
+        return
     state[LENGTH] = wp.sqrt(square)
     move(state)
     if state[LENGTH] < state[STOP]:  # too short to need another linearisation
@@ -185,7 +190,7 @@ def judge(state: State):
 
 
 @wp.kernel
-def advance(first: int, state: State, damped: Square, system: Square, motion: wp.array(dtype=Motion)):
+def advance(first: int, state: State, motion: wp.array(dtype=Motion)):
     """Judge the last step, unless this is the first one, and propose the next; ``motion`` brings points of the camera
     to the window's lattice, in voxels."""
     if state[STATUS] != GOES_ON:
@@ -193,7 +198,7 @@ def advance(first: int, state: State, damped: Square, system: Square, motion: wp
     if first == 0:
         judge(state)
     if state[STATUS] == GOES_ON:
-        propose(state, damped, system)
+        propose(state)
     if state[STATUS] == GOES_ON:
         t = Motion()
         for row in range(3):
@@ -225,7 +230,7 @@ def linearize_trial(
 
 
 @wp.kernel
-def add_up_trial(partial: wp.array2d(dtype=wp.float32), groups: int, state: State, out: Square):
+def add_up_trial(partial: wp.array2d(dtype=wp.float32), groups: int, state: State, out: Parts):
     """One level of the sum at the trial pose: see ``surface.add_up``."""
     k, group = wp.tid()
     if state[STATUS] != GOES_ON:
@@ -237,7 +242,7 @@ def add_up_trial(partial: wp.array2d(dtype=wp.float32), groups: int, state: Stat
 
 
 @wp.kernel
-def finish_trial(parts: Square, state: State):
+def finish_trial(parts: Parts, state: State):
     """The last level of the sum at the trial pose."""
     k = wp.tid()
     if state[STATUS] != GOES_ON:
