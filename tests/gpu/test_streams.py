@@ -69,8 +69,11 @@ def processed(device, recording, submit=at_once):
                 SimpleNamespace(camera=CAMERA.scaled(n), depth=depth, intensity=shade)
                 for n, (depth, shade) in zip((1, 0), view.levels, strict=True)
             ]
-            result = TRACKER.align(volume, levels, T)
-            found += [result.T_world_camera, result.residual, result.color_residual, result.iterations]
+            for shift in (0.0, 0.004, -0.003):  # the map grows with each frame, so that the steps are prepared anew
+                T_init = T.copy()
+                T_init[:3, 3] += shift
+                result = TRACKER.align(volume, levels, T_init)
+                found += [result.T_world_camera, result.residual, result.color_residual, result.iterations]
         volume.integrate(SimpleNamespace(depth=view.levels[1][0], color=view.color), T)
         found += [image.copy() for level in view.levels for image in level]
         del view

@@ -26,7 +26,8 @@ def one_by_one() -> Iterator[None]:
 class Sequence:
     """Recorded launches, none of which allocates, or depends on a number that the host reads in between.
 
-    A device that captures no graph, though it works, gets the launches one by one, and that is told.
+    The graph is captured when they are repeated first: many maps are registered to once only. A device that captures no
+    graph, though it works, gets the launches one by one, and that is told.
 
     Args:
         queue: Where they are launched.
@@ -38,6 +39,7 @@ class Sequence:
         self._queue, self._commands = queue, commands
         self._as_graph = queue.is_pinned if as_graph is None else as_graph
         self._graph: Any = None
+        self._was_run = False
 
     @property
     def is_graph(self) -> bool:
@@ -45,8 +47,9 @@ class Sequence:
         return self._graph is not None
 
     def prepare(self) -> None:
-        """Capture the graph, unless there is one, or another thread uses the device. The launches may run once."""
-        if not self._as_graph or not _wanted[-1] or self.is_graph or self._queue.device in _refusing:
+        """Capture the graph, if it is time and no other thread uses the device. The launches may run once meanwhile."""
+        wanted = self._as_graph and self._was_run and _wanted[-1] and self._queue.device not in _refusing
+        if not wanted or self.is_graph:
             return
         with gate(self._queue.device).capture() as is_alone:
             if is_alone:
@@ -57,6 +60,7 @@ class Sequence:
 
     def run(self) -> None:
         """Launch everything in order."""
+        self._was_run = True
         if self._graph is None or not _wanted[-1]:
             for command in self._commands:
                 self._queue.repeat(command)
