@@ -25,6 +25,8 @@ GROWTH = 1.15
 on a device it does."""
 USED = 0.8
 """Share of the rows to use where no more fit: the rest is for blocks that come into view before others can leave."""
+CHECKS = 2
+"""So often the memory is asked for with one size of the map: geometry and colours do not grow at the same moment."""
 PIECE = 4096
 """Rows that are moved at once; their buffers belong to the copy, so that a full device can still be read."""
 
@@ -84,6 +86,7 @@ class RowCopy:
         self._all_stale = False
         self._written: list[NDArray] = []  # rows that the device wrote
         self._value = 0  # of rows that neither side has written
+        self._checked_rows: tuple[int, ...] = ()  # on the device when its memory was asked for last
         self._upload()
         self._numbers = wp.empty(PIECE, dtype=wp.int32, device=device)
         self._buffer = wp.empty((PIECE, self._width), dtype=wp.int32, device=device)
@@ -148,9 +151,16 @@ class RowCopy:
         return self._wide(self._host)[rows, columns]
 
     def max_rows(self) -> int | None:
-        """See ``mirror.DeviceCopy``; it is told that the map has reached the bound."""
-        free, own = free_memory(self.device), 2 * len(self.array) * self._row_bytes()  # geometry and colours
+        """See ``mirror.DeviceCopy``; it is told that the map has reached the bound.
+
+        The device must finish all its work to answer, so that it is asked after the map has grown only.
+        """
+        size = len(self.array)
+        if self._checked_rows == (size,) * CHECKS:
+            return None
+        free, own = free_memory(self.device), 2 * size * self._row_bytes()  # geometry and colours
         if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
+            self._checked_rows = (*self._checked_rows[1 - CHECKS :], size)
             return None
         rows = int(USED * len(self.array))
         faults.tell(
