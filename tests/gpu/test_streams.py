@@ -21,7 +21,7 @@ from dudmap.gpu import backend as backends
 from dudmap.gpu import faults, sequence
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.memory import Images
-from dudmap.gpu.staging import ImagePool, Staging
+from dudmap.gpu.staging import KINDS, ImagePool, Staging
 from dudmap.gpu.streams import CaptureGate, HostQueue, StreamQueue, main_queue, own_queue
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.tracker import Tracker
@@ -148,6 +148,19 @@ def test_a_buffer_is_filled_again_when_it_was_read(streamed, seed):
     assert [staging.download(target)[0, 0] for target in targets] == [*range(7)]
 
 
+@pytest.mark.parametrize("device", ["cpu", NAME])
+def test_few_kinds_of_images_have_buffers(streamed, device):
+    """The memory of buffers that are given up may be used again when their copies are done."""
+    warp = streamed(0).warp if device == NAME else wp
+    staging, targets = Staging(main_queue(device)), []
+    for size in [*range(1, 41), 1, 40]:
+        targets.append(warp.empty(size, dtype=wp.float32, device=device))
+        staging.upload(np.full(size, size, np.float32), targets[-1])
+        assert len(staging._rings) <= KINDS
+    for target in targets:
+        np.testing.assert_array_equal(main_queue(device).download(target), len(target))
+
+
 def test_a_buffer_that_is_filled_too_early_is_found_out(streamed, monkeypatch):
     monkeypatch.setattr(StreamQueue, "finish", lambda self, event: None)
     gpu = streamed(0)
@@ -176,9 +189,9 @@ def test_images_that_are_gone_make_room_for_others(streamed, device):
 
 def test_an_upload_of_the_main_queue_is_not_taken_by_another_one(streamed):
     streamed(0)
-    images, array = Images(NAME), np.zeros((3, 4), np.float32)
+    images, array, staging = Images(NAME), np.zeros((3, 4), np.float32), Staging(main_queue(NAME))
     array.flags.writeable = False
-    assert images.up(array) is images.up(array)
+    assert images.up(array, staging) is images.up(array, staging)
     assert images.twin(array) is None
 
 

@@ -23,6 +23,7 @@ from dudmap.gpu.linearization import Linearization
 from dudmap.gpu.memory import Images, resident, users_of, wrote
 from dudmap.gpu.meshing import extract_surface
 from dudmap.gpu.preparation import Preparation
+from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import main_queue
 from dudmap.kernels import meshing, raycasting, visibility
 from dudmap.kernels.cpu import CpuBackend
@@ -61,6 +62,7 @@ class WarpBackend:
         self.device = device
         self._images = _IMAGES.setdefault(device, Images(device))
         self._queue = main_queue(device)
+        self._staging = Staging(self._queue)
         self._host = CpuBackend()
         self.color_pixels = self._host.color_pixels
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
@@ -354,7 +356,7 @@ class WarpBackend:
         return wp.empty(shape, dtype=dtype, device=self.device)
 
     def _up(self, image: NDArray) -> Any:  # noqa: ANN401
-        return self._images.up(image)
+        return self._images.up(image, self._staging)
 
     def _down(self, array: Any) -> NDArray:  # noqa: ANN401
         return self._queue.download(array)

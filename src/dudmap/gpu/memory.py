@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from dudmap.gpu import faults
 from dudmap.gpu.faults import DeviceFullError
 from dudmap.gpu.kernels import rows as kernels
-from dudmap.gpu.staging import WARP_TYPES
+from dudmap.gpu.staging import WARP_TYPES, Staging
 from dudmap.gpu.streams import Queue, main_queue
 from dudmap.kernels.mirror import Mirror
 
@@ -254,13 +254,13 @@ class Images:
         self.device = device
         self._twins: dict[int, tuple[weakref.ref, Any, bool]] = {}
 
-    def up(self, array: NDArray) -> Any:  # noqa: ANN401 - an array of Warp
-        """The array on the device."""
+    def up(self, array: NDArray, staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
+        """The array on the device, for the main queue, to which the staging belongs."""
         known = self._twins.get(id(array))
         if known is not None and known[0]() is array:
             return known[1]
-        source = np.ascontiguousarray(array)
-        twin = wp.array(source, dtype=WARP_TYPES[source.dtype], device=self.device)
+        twin = wp.empty(array.shape, dtype=WARP_TYPES[array.dtype], device=self.device)
+        staging.upload(array, twin)
         if not array.flags.writeable and array.base is None:
             self.remember(array, twin, uploading=self.device != "cpu")
         return twin

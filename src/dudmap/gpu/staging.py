@@ -5,7 +5,6 @@
 
 from collections import deque
 from dataclasses import dataclass
-from itertools import cycle
 from typing import Any
 
 import numpy as np
@@ -16,6 +15,8 @@ from dudmap.gpu.streams import Queue
 
 BUFFERS = 2
 """Buffers of the host for one kind of image: one that the device reads, one that the host fills meanwhile."""
+KINDS = 16
+"""Kinds of images, by direction, shape and type, that have buffers."""
 WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64, np.dtype(np.int32): wp.int32,
     np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
@@ -35,7 +36,8 @@ class _Buffer:
 class Staging:
     """Copies of images between the host and a device, through pinned buffers, so that they run beside the program.
 
-    A buffer is used again when its last copy is done. The kinds of images, by shape and type, must be few.
+    A buffer is used again when its last copy is done, and the buffers of the kind that was not used for longest are
+    given up for those of a new one beyond ``KINDS``. Not for concurrent calls.
 
     Args:
         queue: Where the copies are made.
@@ -43,7 +45,7 @@ class Staging:
 
     def __init__(self, queue: Queue) -> None:
         self._queue = queue
-        self._rings: dict[tuple[Any, ...], Any] = {}
+        self._rings: dict[tuple[Any, ...], deque[_Buffer]] = {}
 
     def upload(self, array: NDArray, target: Any) -> None:  # noqa: ANN401 - an array of Warp
         """Copy an array to the device; it may be changed when this returns."""
@@ -63,12 +65,18 @@ class Staging:
     def _next(self, way: str, shape: tuple[int, ...], dtype: np.dtype) -> _Buffer:
         """The next buffer of a kind, whose last copy is done."""
         key = way, shape, dtype
-        if key not in self._rings:
-            self._rings[key] = cycle([self._buffer(shape, dtype) for _ in range(BUFFERS)])
-        buffer = next(self._rings[key])
+        ring = self._rings.pop(key, None) or deque(self._buffer(shape, dtype) for _ in range(BUFFERS))
+        self._rings[key] = ring
+        if len(self._rings) > KINDS:
+            for given_up in self._rings.pop(next(iter(self._rings))):
+                self._finish(given_up)
+        ring.rotate()
+        self._finish(ring[0])
+        return ring[0]
+
+    def _finish(self, buffer: _Buffer) -> None:
         if buffer.copied is not None:
             self._queue.finish(buffer.copied)
-        return buffer
 
     def _buffer(self, shape: tuple[int, ...], dtype: np.dtype) -> _Buffer:
         array = wp.empty(shape, dtype=WARP_TYPES[dtype], device="cpu", pinned=self._queue.is_pinned)
