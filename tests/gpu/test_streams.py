@@ -102,7 +102,7 @@ def test_the_order_of_the_streams_changes_no_result(streamed, recording, expecte
 
 @pytest.mark.parametrize("seed", SEEDS)
 def test_another_thread_may_prepare(streamed, recording, expected, seed):
-    """Nothing waits while a graph is captured, and the thread has the context of the device."""
+    """The thread has the context of the device, and its images are ready for the main stream."""
     streamed(seed)
     with ThreadPoolExecutor(1) as reader:
         assert same(processed(NAME, recording, reader.submit), expected)
@@ -219,6 +219,27 @@ def test_a_graph_of_the_cpu_device_gives_the_same(recording, expected, monkeypat
     assert same(processed("cpu", recording), expected)
     assert made
     assert all(one.is_graph for one in made)
+
+
+def test_a_frame_is_prepared_after_a_graph_was_captured(streamed, recording):
+    streamed(0)
+    preparing, queue, rgb = WarpBackend(NAME), main_queue(NAME), np.ascontiguousarray(recording[0].color)
+    thread, waits = threading.Thread(target=preparing.intensity, args=(rgb,)), []
+
+    class Command:
+        def launch(self, stream):
+            if stream is not queue.stream:  # the capture
+                thread.start()
+                thread.join(0.1)
+                waits.append(thread.is_alive())
+
+    steps = sequence.Sequence(queue, [Command()])
+    steps.run()
+    steps.prepare()
+    thread.join(10)
+    assert waits == [True]
+    assert steps.is_graph
+    assert not thread.is_alive()
 
 
 def test_nothing_is_captured_while_another_thread_uses_the_device():
