@@ -27,7 +27,7 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.tracker import Tracker
 from small_maps import CAMERA, CONFIG
 
-SEEDS = range(6)
+SEEDS = range(4)
 TRACKER = Tracker(Config().override(["tracker.widths=[80,160]", "tracker.iterations=[5,4]"]).tracker, Config().sensor)
 
 
