@@ -13,6 +13,7 @@ from dudmap.kernels.damping import added, is_settled, relaxed, tightened
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import Damping, ImageStack, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
 EXPOSURE_NOISE = 0.01
@@ -165,7 +166,18 @@ class Tracker:
         if noise is None or noise.is_exceeded(system.H, least):
             return COMPLETE
         distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
-        return noise.observability(distances.H, system.H, R, least)
+        seen = noise.observability(distances.H, system.H, R, least)
+        if seen.is_complete:
+            return COMPLETE
+        agreement = GradientAgreement(level, system.residuals, weights, R, parameters, self.sensor)
+        step, shown = volume.voxel_size, []
+        for twist in seen.unobservable @ np.kron(np.eye(2), R).T:
+            forth, back = (
+                self.linearize(volume, level, se3.retract(T_world_camera, way * twist), weights, color_weight).residuals
+                for way in (step, -step)
+            )
+            shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
+        return seen.with_shown(np.array(shown), R)
 
     def _optimize(
         self,
