@@ -132,13 +132,17 @@ class Slam:
 
     @property
     def volume(self) -> TsdfVolume:
-        """Map of the current submap; another object after a new submap was started or two were joined."""
+        """Map of the current submap, complete: where it is being rebuilt after a correction, that is done first.
+
+        Another object after a new submap was started or two were joined. ``atlas.volume`` is the map as it is.
+        """
+        self.atlas.complete()
         return self.atlas.volume
 
     @property
     def reference(self) -> TsdfVolume:
         """Map that frames are registered to: the current one, or in a second pass that of the first."""
-        return self.volume if self.prior_map is None else self.prior_map.volume
+        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     @property
     def trajectory(self) -> Trajectory:
@@ -147,7 +151,8 @@ class Slam:
 
     @property
     def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
-        """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
+        """Trajectory and complete map of each submap, that with the most frames first; each has its own world."""
+        self.atlas.complete()
         return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
 
     @property
@@ -185,6 +190,7 @@ class Slam:
 
     def as_prior_map(self) -> PriorMap:
         """The largest submap and what else a second pass over the same recording needs."""
+        self.atlas.complete()
         main = self.atlas.by_size()[0]
         poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
         return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)
@@ -266,6 +272,7 @@ class Slam:
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=self._is_blind(view))
+        self._continue_rebuilding(view)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self._revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
@@ -280,7 +287,7 @@ class Slam:
         uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
             fuse = not (view.blind or uncertain or self.localize)
-            fuse = fuse and not self.redundancy.is_redundant(self.volume, view, estimate)
+            fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
@@ -312,6 +319,12 @@ class Slam:
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
+
+    def _continue_rebuilding(self, view: FrameView) -> None:
+        """Go on with the maps that are being rebuilt since a loop was closed or submaps were joined."""
+        if self.atlas.rebuildings:
+            with view.timer("rebuild"):
+                self.atlas.continue_rebuilding()
 
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
@@ -368,7 +381,7 @@ class Slam:
         )
         if found is None:
             return None
-        self.atlas.current = found.submap
+        self.atlas.switch_to(found.submap)
         self.bootstrap.abandon()
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
         return found.estimate
@@ -431,7 +444,7 @@ class Slam:
             frame = Frame(observation.timestamp, observation.depth, observation.rgb)
             recorded = observation.as_recorded
             self.atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
-            self.redundancy.update(self.volume, view, estimate)
+            self.redundancy.update(self.atlas.volume, view, estimate)
 
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
