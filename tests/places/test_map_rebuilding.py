@@ -89,7 +89,7 @@ def test_the_complete_map_is_that_of_all_stored_frames(max_blocks):
         atlas.continue_rebuilding()
         if atlas.rebuildings:  # back along the wall
             add(atlas, COUNT + frames, at(0.15 * (COUNT - frames), 0.01 * (COUNT - frames)))
-    assert frames == pytest.approx(COUNT / (PER_FRAME - 1), abs=2)
+    assert COUNT / (PER_FRAME - 1) <= frames < 1.5 * COUNT  # one of two is for what is ahead at times
     assert atlas.volume is before  # views of the map stay connected
     assert content(atlas.volume) == content(at_once(atlas))
 

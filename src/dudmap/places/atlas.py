@@ -15,7 +15,7 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.memory_limit import MemoryLimit
+from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
@@ -163,6 +163,14 @@ class Atlas:
             if other != number:
                 volume.page_out()
 
+    def make_room(self) -> None:
+        """Have the current map leave the memory, unless another one of the same view fits beside it."""
+        limit = None if self.volume.pager is None else self.volume.pager.max_blocks
+        if isinstance(limit, MemoryLimit):
+            view = len(self.volume.window.near) * self.volume.blocks.slot_bytes
+            if limit.limit - resident_bytes() < view:
+                self.volume.page_out()
+
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
         """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
         if number in self.rebuildings:
@@ -170,15 +178,15 @@ class Atlas:
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
-        """Go on with the map that is being rebuilt, that of the current submap first; bounded work."""
+        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames."""
         if not self.rebuildings:
             return
         number = self.current if self.current in self.rebuildings else min(self.rebuildings)
-        rebuilding = self.rebuildings[number]
-        if rebuilding.fuse(PER_FRAME):
+        rebuilding, shown, last = self.rebuildings[number], 0, self.poses[-1]
+        if last.submap == number:
+            shown = rebuilding.show(self.volumes[number], last.T_world_camera, 1)
+        if rebuilding.fuse(PER_FRAME - shown):
             self._take(rebuilding)
-        elif self.poses[-1].submap == number:
-            rebuilding.show(self.volumes[number], self.poses[-1].T_world_camera, 1)
 
     def complete(self) -> None:
         """Complete all maps that are being rebuilt."""

@@ -14,17 +14,20 @@ from numpy.typing import NDArray
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
 
-AT_ONCE = 32
+AT_ONCE = 24
 """Stored frames that are fused at once, those nearest to the present view: a map of no more is rebuilt at once."""
 PER_FRAME = 2
-"""Stored frames that are fused with every later frame: at most one is stored meanwhile, so that it comes to an end."""
+"""Stored frames that are fused with every later frame, one of them into the provisional map where one is near. At most
+one is stored meanwhile, and those that are near come to an end, so that the rebuilding does."""
 SHOWN = 8
 """Stored frames that are added to the provisional map at once where a lost camera may be."""
 VIEW_DEPTH = 2.0
 """Depth of the point by which views are compared, metres: the middle of what a camera sees indoors."""
 NEAR = 3.0
-"""Stored frames that are not added to the provisional map have this point farther away from that of the view, metres:
-what they see is out of view, or will be added as the camera goes there."""
+"""Stored frames whose point is farther than this from that of the view are not added to the provisional map, metres:
+what they see is out of view, or is added as the camera goes there."""
+SPACING = 0.3
+"""Nor are those whose point is nearer than this to that of one which was added, metres: they see the same."""
 
 
 class MapRebuilding:
@@ -35,7 +38,8 @@ class MapRebuilding:
         submap: Number of the submap.
         volume: The new map, as far as it is fused.
         fused: Numbers of the stored frames of the submap that it holds.
-        shown: Numbers of those that the provisional map holds; it also gets all frames from now on.
+        shown: Numbers of those that the provisional map holds, or does not need beside them; it also gets all frames
+            from now on.
     """
 
     def __init__(
@@ -68,21 +72,28 @@ class MapRebuilding:
         """Note that the provisional map holds stored frames of these numbers, too."""
         self._shown.update(numbers)
 
-    def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> None:
-        """Add those stored frames to the provisional map, at most ``count``, that see what a camera sees."""
+    def show(self, provisional: TsdfVolume, T_world_camera: NDArray[np.float64], count: int) -> int:
+        """Add those stored frames to the provisional map, at most ``count``, that see what a camera sees; returns how
+        many."""
         older = self.history.submaps[: self._start]
-        unknown = [n for n, submap in enumerate(older) if submap == self.submap and n not in self._shown]
-        numbers = nearest_views(self.history, unknown, T_world_camera, count, NEAR)
-        self.history.reintegrate(provisional, numbers)
-        self._shown.update(numbers)
+        unknown = np.array([n for n, submap in enumerate(older) if submap == self.submap and n not in self._shown], int)
+        points, here = _points_seen(self.history, unknown), _looked_at(T_world_camera)
+        added: list[int] = []
+        while len(unknown) and len(added) < count:
+            distances = np.linalg.norm(points - here, axis=1)
+            nearest = int(np.argmin(distances))
+            if distances[nearest] > NEAR:
+                break
+            added.append(int(unknown[nearest]))
+            same = np.linalg.norm(points - points[nearest], axis=1) < SPACING
+            self._shown.update(unknown[same].tolist())
+            unknown, points = unknown[~same], points[~same]
+        self.history.reintegrate(provisional, sorted(added))
+        return len(added)
 
 
 def nearest_views(
-    history: FrameStore,
-    numbers: Sequence[int],
-    T_world_camera: NDArray[np.float64],
-    count: int,
-    within: float = np.inf,
+    history: FrameStore, numbers: Sequence[int], T_world_camera: NDArray[np.float64], count: int
 ) -> list[int]:
     """The stored frames, in order of time, whose view is nearest to that of a camera.
 
@@ -91,14 +102,15 @@ def nearest_views(
         numbers: Numbers of those to choose from.
         T_world_camera: (4, 4).
         count: Largest number of them.
-        within: Largest distance of the points at ``VIEW_DEPTH``, metres.
     """
-    if not numbers:
-        return []
-    Ts = np.stack([history.Ts_world_camera[n] for n in numbers])
-    distances = np.linalg.norm(_looked_at(Ts) - _looked_at(T_world_camera), axis=-1)
-    order = np.argsort(distances, kind="stable")[:count]
-    return sorted(numbers[i] for i in order if distances[i] <= within)
+    distances = np.linalg.norm(_points_seen(history, numbers) - _looked_at(T_world_camera), axis=1)
+    return sorted(numbers[i] for i in np.argsort(distances, kind="stable")[:count])
+
+
+def _points_seen(history: FrameStore, numbers: Sequence[int] | NDArray[np.int64]) -> NDArray[np.float64]:
+    """Points (n, 3) that stored frames look at."""
+    Ts = [history.Ts_world_camera[n] for n in numbers]
+    return _looked_at(np.reshape(Ts, (-1, 4, 4)))
 
 
 def _looked_at(Ts_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
