@@ -36,7 +36,7 @@ class BlockWindow:
         size = 16 * int(np.ceil(cells / 16))
         self.block_size = block_size
         self.shape = np.array([size, size, size], dtype=np.int64)
-        self.cells = np.full(size**3, -1, dtype=np.int32)
+        self.cells = np.empty(size**3, dtype=np.int32)  # takes no memory before the first ``fill``
         self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)

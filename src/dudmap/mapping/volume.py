@@ -233,7 +233,7 @@ class TsdfVolume:
 
     def page_out(self) -> None:
         """Have all blocks wait on disk, where the map may do so, until they are needed again."""
-        if self.pager is not None:
+        if self.pager is not None and self.blocks.num_entries:
             self.blocks = self.pager.page_out(self.blocks, self._frame_number)
             self._left = self._left if self.window.origin is None else self.window.origin
             self.window = BlockWindow(self.block_size, self._window_cells)

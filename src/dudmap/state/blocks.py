@@ -218,6 +218,7 @@ def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, A
     if index["origin"] is None:
         return
     window.origin = index["origin"]
+    window.cells.fill(-1)
     cells = window.cells.reshape(tuple(window.shape))
     inside = np.empty(blocks.num_entries, dtype=np.int32)
     count = hashing.fill_window(cells, window.origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)

@@ -64,7 +64,7 @@ class LiveView(RunObserver):
         """Begin with an empty page."""
         self._slam = slam
         none = np.zeros(0, dtype=np.int32)
-        slam.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
+        slam.atlas.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
         self._window.set_camera(slam.camera)
         with self._changed:
             self._news = _News(restart=True)
