@@ -12,7 +12,8 @@ from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.saved_map import SavedMap
-from dudmap.synthetic.recording import SyntheticSequence, sequence
+from dudmap.synthetic.recording import SyntheticSequence
+from dudmap.synthetic.setup import sequence
 from dudmap.synthetic.scene import Scene
 from dudmap.tracking.quality_monitor import RegistrationHistory
 

@@ -33,9 +33,9 @@ def test_the_page_names_no_class_that_does_not_exist():
 
 
 def test_a_message_is_one_printable_line():
-    error = errors.DatasetError("cannot read a\nb\x1b[2J\ud800" + "x" * 10_000_000)
+    error = errors.DatasetError("cannot read a\nb\x1b[2J\ud800\xa0\u202e" + "x" * 10_000_000)
     assert str(error).isprintable()
-    assert str(error).startswith(r"cannot read a\nb\x1b[2J\ud800xxx")
+    assert str(error).startswith(r"cannot read a\nb\x1b[2J\ud800\xa0\u202exxx")
     assert len(str(error)) < 3000
 
 

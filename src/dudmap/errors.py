@@ -3,25 +3,23 @@
 A message is one sentence that states what was found, what was expected and how to correct it.
 """
 
-import re
-
 LARGEST_MESSAGE = 2000
 """Characters of a message; a damaged file may hold one line of a hundred megabytes, which messages quote."""
-_UNPRINTABLE = re.compile(r"[\x00-\x1f\x7f-\x9f\u2028\u2029\ud800-\udfff]")
 
 
 class DudmapError(Exception):
     """Base class of all errors of dudmap; the command line prints them without a traceback.
 
-    Control characters in a message, such as a line break or a terminal's escape sequence in the name of a file, are
-    written as escapes, so that it stays one line that shows what it says.
+    Characters of a message that are not printable, such as a line break, a terminal's escape sequence or another
+    direction of writing in the name of a file, are written as escapes, so that it stays one line that shows what it
+    says.
     """
 
     def __init__(self, message: object = "") -> None:
         text = str(message)
         if len(text) > LARGEST_MESSAGE:
             text = f"{text[: LARGEST_MESSAGE // 2]} ... {text[-LARGEST_MESSAGE // 2 :]}"
-        super().__init__(_UNPRINTABLE.sub(lambda found: found[0].encode("unicode_escape").decode(), text))
+        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
 
 
 class ConfigError(DudmapError):

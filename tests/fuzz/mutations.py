@@ -9,6 +9,7 @@ import struct
 import tarfile
 import zipfile
 import zlib
+from functools import cache, lru_cache
 
 NUMBERS = (
     b"0", b"-1", b"1e999", b"-1e308", b"nan", b"inf", b"1e-320", b"1000000000", b"999999999999999999999",
@@ -142,7 +143,7 @@ def line(rng, data):
         lines.insert(k, lines[rng.randrange(len(lines))])
     elif change == 2:
         lines[k] = lines[k].rstrip(b"\n")
-    else:
+    elif len(data) < 2**20:  # not again and again in one input
         lines += [lines[k]] * 500
     return b"".join(lines)
 
@@ -212,7 +213,12 @@ def png_size(rng, data):
 def png_bomb(rng, data):
     side = rng.choice((5000, 30000, 60000))
     header = struct.pack(">II", side, side) + bytes((8, 0, 0, 0, 0))
-    return png([(b"IHDR", header), (b"IDAT", zlib.compress(bytes(2**20))), (b"IEND", b"")])
+    return png([(b"IHDR", header), (b"IDAT", packed_zeros()), (b"IEND", b"")])
+
+
+@cache
+def packed_zeros():
+    return zlib.compress(bytes(2**20))
 
 
 def npy_header(rng, data):
@@ -237,24 +243,37 @@ def npy_header(rng, data):
     return b"\x93NUMPY\1\0" + struct.pack("<H", len(header)) + header + data[128:]
 
 
+@lru_cache(maxsize=4)
 def zip_parts(data):
+    """Names and contents of the members of an archive."""
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            return [(name, archive.read(name)) for name in archive.namelist()]
+            return tuple((name, archive.read(name)) for name in archive.namelist())
     except Exception:  # a variant that is no archive any more is changed as bytes only
-        return []
+        return ()
 
 
 def zipped(parts):
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as archive:
-        for name, body in parts:
-            archive.writestr(zipfile.ZipInfo(name), body, zipfile.ZIP_DEFLATED)
-    return out.getvalue()
+    """Archive of members; unlike the standard library's it packs what was packed before only once."""
+    out, index = b"", b""
+    for name, body in parts:
+        packed, check = deflated(body)
+        raw = name.encode("utf-8", "surrogateescape")
+        size = struct.pack("<5H3I2H", 20, 1 << 11, 8, 0, 33, check, len(packed), len(body), len(raw), 0)
+        index += struct.pack("<4sH", b"PK\1\2", 20) + size + struct.pack("<3H2I", 0, 0, 0, 0, len(out)) + raw
+        out += b"PK\3\4" + size + raw + packed
+    return out + index + struct.pack("<4s4H2IH", b"PK\5\6", 0, 0, len(parts), len(parts), len(index), len(out), 0)
+
+
+@lru_cache(maxsize=64)
+def deflated(body):
+    """Deflated content and its checksum."""
+    packer = zlib.compressobj(1, zlib.DEFLATED, -15)
+    return packer.compress(body) + packer.flush(), zlib.crc32(body)
 
 
 def zip_member(rng, data):
-    parts = zip_parts(data)
+    parts = list(zip_parts(data))
     if not parts:
         return flip(rng, data)
     k = rng.randrange(len(parts))
@@ -269,7 +288,7 @@ def zip_member(rng, data):
 
 
 def zip_bomb(rng, data):
-    parts = zip_parts(data)
+    parts = list(zip_parts(data))
     if not parts:
         return data
     k = rng.randrange(len(parts))
@@ -281,7 +300,7 @@ def zip_bomb(rng, data):
 
 
 def zip_names(rng, data):
-    parts = zip_parts(data)
+    parts = list(zip_parts(data))
     if not parts:
         return data
     k = rng.randrange(len(parts))

@@ -8,13 +8,19 @@ import warnings
 from contextlib import contextmanager
 
 import numpy as np
-from loaders import LOADERS, check_sentence
+from loaders import LOADERS
 from mutations import SPECIAL, mutated, put_special
+from verdict import check_sentence
 
 from dudmap.errors import DudmapError
 
 SECONDS = 10
 """Time that a loader has for one input."""
+
+
+NAMES = "a\nb", "\x1b[2J", "x" * 200, "-0.png", "nan.png"
+"""Names of files that no recorder gives."""
+SECRET = "the content of a file outside"
 
 
 class Finding(Exception):  # noqa: N818
@@ -34,11 +40,15 @@ class Subject:
         self.home = folder / "home"
         self.home.mkdir(parents=True)
         self.secret = folder / "secret.txt"
-        self.secret.write_text("the content of a file outside")
+        self.secret.write_text(SECRET)
         os.environ["DUDMAP_CACHE"] = str(folder / "cache")
+        self.cache = folder / "cache"
         self.path = self.loader.write(self.home)
         self.files = {file: file.read_bytes() for file in sorted(self.home.rglob("*")) if file.is_file()}
-        self.cache = folder / "cache"
+        for file in (*self.files, self.secret):
+            mark(file)
+        self.renamed = []
+        self.valid = self.listed()
 
     def change(self, seed):
         """Make input number ``seed``; returns the files that were changed."""
@@ -49,29 +59,47 @@ class Subject:
             if rng.random() < 0.06:
                 put_special(file, rng.choice(SPECIAL), self.secret)
             elif rng.random() < 0.02:
-                file.rename(
-                    file.with_name(rng.choice(("a\nb", "\x1b[2J", "x" * 200, "-0.png", "nan.png")) + file.suffix)
-                )
+                self.renamed.append(file.rename(file.with_name(rng.choice(NAMES) + file.suffix)))
             else:
                 file.write_bytes(mutated(rng, file.name, self.files[file]))
+                mark(file)
         return chosen
 
-    def restore(self):
-        for file in sorted(self.home.rglob("*"), reverse=True):
-            if file.is_symlink() or not file.is_dir():
-                if file not in self.files or file.is_symlink() or not file.is_file():
-                    file.unlink()
-            elif file in self.files:
+    def restore(self, changed=None):
+        """Make the input valid again, where only the files ``changed`` are not (default: any file)."""
+        for path in sorted(self.listed().keys() - self.valid.keys(), reverse=True) if changed is None else ():
+            os.rmdir(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
+        for file in self.renamed:
+            file.unlink(missing_ok=True)
+        self.renamed = []
+        for file in self.files if changed is None else changed:
+            if file.is_symlink() or file.is_fifo():
+                file.unlink()
+            elif file.is_dir():
                 file.rmdir()
-        for file, data in self.files.items():
-            if not file.exists() or file.read_bytes() != data:
-                file.write_bytes(data)
-        shutil.rmtree(self.cache, ignore_errors=True)
+            file.write_bytes(self.files[file])
+            mark(file)
+        if self.cache.exists():
+            shutil.rmtree(self.cache)
 
     def listed(self):
-        """All paths that exist, to see what a loader has written; devices and pipes are not opened."""
-        places = (path for path in self.folder.rglob("*") if self.cache not in (path, *path.parents))
-        return sorted(str(path) for path in places)
+        """Size and time of all that exists apart from the cache, to see what a loader has written.
+
+        Devices and pipes are not opened, and links are not followed.
+        """
+        found, folders = {}, [str(self.folder)]
+        while folders:
+            with os.scandir(folders.pop()) as entries:
+                for entry in entries:
+                    if entry.is_dir(follow_symlinks=False):
+                        if entry.name == "cache":
+                            continue
+                        folders.append(entry.path)
+                        found[entry.path] = None
+                    else:
+                        status = entry.stat(follow_symlinks=False)
+                        found[entry.path] = status.st_size, status.st_mtime_ns
+        return found
 
     def read(self):
         """Read the input as it is.
@@ -85,12 +113,15 @@ class Subject:
                 warnings.simplefilter("ignore")
                 self.loader.load(self.path)
         except DudmapError as error:
-            check_sentence(error)
+            try:
+                check_sentence(error)
+            except AssertionError as wrong:
+                raise Finding(f"not a sentence: {str(error)[:300]!r}") from wrong
         except BaseException as error:
             if isinstance(error, KeyboardInterrupt):
                 raise
             raise Finding(f"{type(error).__name__}: {str(error)[:300]}") from error
-        if self.listed() != before or self.secret.read_text() != "the content of a file outside":
+        if self.listed() != before:
             raise Finding("a file was written, renamed or removed")
 
     def warm_up(self):
@@ -98,11 +129,27 @@ class Subject:
         self.loader.load(self.path)
 
     def trial(self, seed):
-        self.change(seed)
-        try:
-            self.read()
-        finally:
-            self.restore()
+        """Read input number ``seed``; one that takes too long is read again, as the process may have been held up.
+
+        Raises:
+            Finding: See ``read``.
+        """
+        for attempt in range(2):
+            changed = self.change(seed)
+            try:
+                self.read()
+                break
+            except Finding as finding:
+                changed = None
+                if attempt or not isinstance(finding.__cause__, TooSlow):
+                    raise
+            finally:
+                self.restore(changed)
+
+
+def mark(file):
+    """Give a file the time 0, so that writing to it shows."""
+    os.utime(file, (0, 0))
 
 
 @contextmanager

@@ -149,6 +149,13 @@ def test_camera_inside_and_outside_of_the_window():
     assert np.all(view(empty)[0] == 0)
 
 
+def test_rays_along_an_axis():
+    """With the principal point on a pixel and a pose along the axes, directions of rays have zeros."""
+    camera = Camera(90.0, 90.0, 40.0, 30.0, 80, 60)
+    depth = view(mapped(lambda p: 0.5 - p[..., 2]), camera=camera)[0]
+    assert np.abs(depth[20:40, 20:60] - 0.5).max() < 0.02 * VOXEL
+
+
 def marched(field, T, camera, depth_max, min_weight):
     """Depth by marching in steps of a hundredth of a voxel over the trilinear field, one ray at a time."""
     window, origin, geometry, _ = field

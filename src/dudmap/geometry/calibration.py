@@ -50,7 +50,12 @@ class Calibration:
 
     def __post_init__(self) -> None:
         T = np.asarray(self.T_color_depth, dtype=np.float64)
-        if T.shape != (4, 4) or not np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3):
+        if T.shape != (4, 4) or not (
+            np.isfinite(T).all()
+            and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+            and np.linalg.det(T[:3, :3]) > 0
+            and np.allclose(T[3], (0, 0, 0, 1))
+        ):
             raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
         if not np.all(np.isfinite([self.delay, self.readout])):
             raise DatasetError(f"the delay is {self.delay} s and the readout {self.readout} s; expected finite numbers")

@@ -11,6 +11,11 @@ from dudmap.errors import DatasetError
 Scalar = TypeVar("Scalar", bound=np.floating)
 LARGEST_PIXELS = 2**26
 """Largest number of pixels of an image, 8192x8192; the images of phones have up to 50 million."""
+SMALLEST_FOCAL, LARGEST_COORDINATE = 1e-2, 1e6
+"""Least focal length, and largest focal length and place of the principal point, pixels: views of all but 180 degrees
+and of a thousandth of a degree. Beyond, rays have no distinct 32-bit directions."""
+SMALLEST_SCALE, LARGEST_SCALE = 1e-3, 1e9
+"""Units of depth per metre: a unit is a kilometre or less and a nanometre or more. 16-bit values stay finite then."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +45,16 @@ class Camera:
             raise DatasetError(
                 f"camera has fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}, depth_scale={self.depth_scale}; "
                 "focal lengths and depth scale must be positive finite numbers"
+            )
+        if min(self.fx, self.fy) < SMALLEST_FOCAL or max(map(abs, numbers[:4])) > LARGEST_COORDINATE:
+            raise DatasetError(
+                f"camera has fx={self.fx}, fy={self.fy}, cx={self.cx}, cy={self.cy}; expected focal lengths of "
+                f"{SMALLEST_FOCAL} pixels or more, and all of them up to {LARGEST_COORDINATE:.0e}"
+            )
+        if not SMALLEST_SCALE <= self.depth_scale <= LARGEST_SCALE:
+            raise DatasetError(
+                f"camera has depth_scale={self.depth_scale}; expected units per metre from {SMALLEST_SCALE} to "
+                f"{LARGEST_SCALE:.0e}, such as 1000 for millimetres"
             )
         if self.width < 16 or self.height < 16:
             raise DatasetError(f"camera image is {self.width}x{self.height}; at least 16x16 pixels are needed")

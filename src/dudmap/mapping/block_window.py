@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from dudmap.errors import MapError
 from dudmap.kernels import hashing
 from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.parameters import to_lattice
 from dudmap.mapping.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
 
 MARGIN = 3
@@ -70,9 +71,7 @@ class BlockWindow:
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
         assert self.origin is not None
-        T = T_world_camera[:3] / (self.block_size / BLOCK)
-        T[:, 3] -= self.origin * BLOCK
-        return T.astype(np.float32)
+        return to_lattice(T_world_camera, self.block_size / BLOCK, self.origin)
 
     def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
         """Allocate voxels for cells (n,) that have none."""

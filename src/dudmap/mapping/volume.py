@@ -97,13 +97,14 @@ class TsdfVolume:
                          max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
         extent = depth_max if extent is None else extent
         self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
-        self._window_cells = int(np.ceil(2 * (self._reach + self.band.limit) / self.block_size)) + 8
-        if self._window_cells > MAX_WINDOW:
-            longest = extent * (MAX_WINDOW - 8) / self._window_cells
+        cells = np.ceil(2 * (self._reach + self.band.limit) / self.block_size) + 8
+        if not cells <= MAX_WINDOW:  # also where a field of view of almost 180 degrees makes it infinite
+            longest = extent * (MAX_WINDOW - 8) / cells
             raise MapError(
                 f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
                 f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
             )
+        self._window_cells = int(cells)
         self.clear()
 
     def clear(self) -> None:

@@ -1,5 +1,6 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
+from functools import cache
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -122,6 +123,7 @@ DEPTH_OF_SEARCH = 3
 """Levels of folders below the given one in which a recording is looked for."""
 
 
+@cache
 def readers() -> tuple[Reader, ...]:
     """Readers of all formats, in the order in which they are tried."""
     names = (reader.split(":") for reader in READERS)

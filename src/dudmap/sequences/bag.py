@@ -20,6 +20,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
+from dudmap.sequences.bag_definitions import limit_definitions
 from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
 from dudmap.sequences.bag_limits import check_bag, limit_decompression
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
@@ -309,6 +310,7 @@ def _open(path: Path) -> "AnyReader":
     try:
         check_bag(path)
         limit_decompression()
+        limit_definitions()
         if path.suffix == ".bag":
             warm_index(path)
         reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))

@@ -224,7 +224,9 @@ def read_many(path: Path, places: list[int], size: int) -> list[bytes]:
         with path.open("rb", buffering=0) as file:
             return [file.read(size) for place in part if file.seek(place) >= 0]
 
-    part = -(-len(places) // REQUESTS) or 1
+    if len(places) < REQUESTS:
+        return read(places)
+    part = -(-len(places) // REQUESTS)
     with ThreadPoolExecutor(REQUESTS, thread_name_prefix="dudmap-index") as pool:
         found = pool.map(read, [places[k : k + part] for k in range(0, len(places), part)])
         return [data for each in found for data in each]

@@ -61,7 +61,7 @@ def rigid_trajectory(poses: Iterable[tuple[float, NDArray[np.float64]]]) -> Traj
     kept = []
     for stamp, T in poses:
         R = T[:3, :3]
-        if np.all(np.isfinite(T)) and np.allclose(R @ R.T, np.eye(3), atol=1e-2) and np.linalg.det(R) > 0:
+        if np.all(np.isfinite(T)) and np.abs(R @ R.T - np.eye(3)).max() < 1e-2 and np.linalg.det(R) > 0:
             rigid = np.eye(4)
             rigid[:3, :3], rigid[:3, 3] = se3.nearest_rotation(R), T[:3, 3]
             kept.append((stamp, rigid))

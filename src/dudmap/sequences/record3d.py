@@ -95,8 +95,9 @@ class Record3DRecording:
             raise FrameError(f"{name} unpacks to too much; expected {self.camera.width}x{self.camera.height} floats")
         try:
             data = self._lzfse.decompress(packed)
-        except self._lzfse.error as error:
-            raise FrameError(f"{name} cannot be decompressed: {error}") from error
+        except (self._lzfse.error, MemoryError) as error:
+            # where a block ends too early, the decoder asks for more and more memory, which it does not use
+            raise FrameError(f"{name} cannot be decompressed: {error or 'a block ends too early'}") from error
         if len(data) != 4 * self.camera.width * self.camera.height:
             raise FrameError(f"{name} has {len(data)} bytes; expected {self.camera.width}x{self.camera.height} floats")
         return images.metres(np.frombuffer(data, "<f4").reshape(self.camera.shape), 1.0, name)

@@ -1,0 +1,101 @@
+"""Maps, the stored state of a run, keyframes and depth models, each with a writer of a small valid one."""
+
+import numpy as np
+
+
+def volume():
+    """A small map of a wall."""
+    from dudmap.config import SensorConfig, VolumeConfig
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.mapping.volume import TsdfVolume
+
+    made = TsdfVolume(Camera(20, 20, 15.5, 11.5, 32, 24), VolumeConfig(voxel_size=0.1), SensorConfig(), 3.0)
+    frame = Frame(0.0, np.full((24, 32), 1.5, np.float32), np.full((24, 32, 3), 90, np.uint8))
+    made.integrate(frame, np.eye(4), np.ones((24, 32), bool))
+    return made
+
+
+def map_file(folder):
+    volume().save(folder / "map.npz")
+    return folder / "map.npz"
+
+
+def adaptive_map_file(folder):
+    """A small map of two walls that meet, with smaller voxels at their edge."""
+    from dudmap.config import SensorConfig, VolumeConfig
+    from dudmap.frames.frame import Frame
+    from dudmap.geometry.camera import Camera
+    from dudmap.mapping.adaptive_volume import AdaptiveVolume
+
+    config = VolumeConfig(voxel_size=0.1, adaptive=True, adaptive_bend=0.1)
+    made = AdaptiveVolume(Camera(20, 20, 15.5, 11.5, 32, 24), config, SensorConfig(), 3.0)
+    depth = np.broadcast_to(1.0 / (1 - 0.7 * np.abs(np.arange(32) - 15.5) / 20), (24, 32)).astype(np.float32)
+    for _ in range(3):
+        made.integrate(Frame(0.0, depth, np.full((24, 32, 3), 90, np.uint8)), np.eye(4))
+    assert made.levels[0].blocks.num_voxel_blocks > 0
+    made.save(folder / "map.npz")
+    return folder / "map.npz"
+
+
+def load_map(path):
+    from dudmap.mapping.volume import TsdfVolume
+
+    loaded = TsdfVolume.load(path)
+    loaded.extract_mesh()
+    loaded.raycast(np.eye(4), loaded.camera)
+
+
+def state(folder):
+    from dudmap.state.database import StateDatabase
+    from dudmap.state.system import take_snapshot
+
+    database = StateDatabase(folder / "state.db")
+    database.write(take_snapshot({"volume": volume(), "numbers": np.arange(100.0)}, database), {"next": 1})
+    database.close()
+    return folder / "state.db"
+
+
+def load_state(path):
+    from dudmap.state.database import StateReader
+    from dudmap.state.system import restore
+
+    try:
+        reader = StateReader(path)
+        reader.meta()
+        restore(reader, {"volume": volume()})
+        reader.close()
+    finally:
+        for companion in ("-wal", "-shm"):  # SQLite makes them beside any database that is read while it may be written
+            path.with_name(path.name + companion).unlink(missing_ok=True)
+
+
+def keyframes(folder):
+    from dudmap.places.place_recognition import Keyframe, PlacedFeatures
+    from dudmap.places.saved_map import SavedMap
+
+    rng = np.random.default_rng(0)
+    features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
+    saved = SavedMap(volume(), [Keyframe(float(k), np.eye(4), features) for k in range(2)])
+    saved.save_keyframes(folder / "keyframes.npz")
+    return folder / "keyframes.npz"
+
+
+def load_keyframe_file(path):
+    from dudmap.places.saved_map import load_keyframes
+
+    load_keyframes(path)
+
+
+def depth_model(folder):
+    from dudmap.calibration.depth_model import TERMS, DepthModel
+
+    n = len(TERMS)
+    DepthModel(np.zeros(n), np.eye(n), np.ones(2), 3).save(folder / "depth_model.npz")
+    return folder / "depth_model.npz"
+
+
+def load_depth_model(path):
+    from dudmap.calibration.depth_model import DepthModel
+
+    DepthModel.load(path).correction  # noqa: B018
