@@ -93,7 +93,7 @@ class Table(RunObserver):
         row = float(cpu), float(resident_bytes()), float(max(self._errors, default=np.nan))
         self.rows.append(row)
         size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
-        blocks = self._slam.volume.num_blocks
+        blocks = self._slam.atlas.volume.num_blocks
         print(f"| {frames} | {cpu:.1f} | {ms:.1f} | {row[1] / 1e6:.0f} | {blocks} | {size / 1e6:.0f} | {self.lost} | "
               f"{1000 * row[2]:.1f} |", flush=True)  # fmt: skip
         self._times, self._errors = [], []

@@ -16,6 +16,7 @@ from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
+from dudmap.mapper import Mapper
 from dudmap.slam import Slam
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.motion_model import MotionModel
@@ -393,8 +394,8 @@ def test_a_young_map_with_a_slow_crowd_is_uncertain_and_begins_anew_without_it(c
         "room", coverage=coverage, speed=speed, start_dynamic=True, frames=16, camera=camera, seed=seed
     )
     fused = []
-    integrate = Slam._integrate
-    monkeypatch.setattr(Slam, "_integrate", lambda slam, *args: (fused.append(args), integrate(slam, *args)))
+    integrate = Mapper.integrate
+    monkeypatch.setattr(Mapper, "integrate", lambda mapper, *args: (fused.append(args), integrate(mapper, *args)))
     results = uncertain_frames(sequence)
     assert all(result.uncertain for result in results[4:12])
     assert not any(result.uncertain for result in results[12:])

@@ -37,18 +37,20 @@ class BlockWindow:
         size = 16 * int(np.ceil(cells / 16))
         self.block_size = block_size
         self.shape = np.array([size, size, size], dtype=np.int64)
-        self.cells = np.full(size**3, -1, dtype=np.int32)
+        self.cells = np.empty(size**3, dtype=np.int32)  # takes no memory before the first ``fill``
         self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)
         self.origin: NDArray[np.int64] | None = None
 
-    def moved(self, middle: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
         """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
-        away, so that the window can stay."""
+        away, so that the window can stay. An empty window that replaces one which was ``left`` (3,) goes back there
+        then."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
-        stays = self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN
-        return None if stays else origin
+        last = self.origin if left is None else left
+        stays = last is not None and np.abs(origin - last).max() <= MARGIN
+        return left if stays else origin
 
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""

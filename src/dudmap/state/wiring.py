@@ -3,8 +3,8 @@
 from typing import Any
 
 PACKAGES = (
-    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapping",
-    "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
+    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapper",
+    "mapping", "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
 )  # fmt: skip
 """Parts of this package whose classes hold state; no other class is ever made from a database."""
 REBUILT = {
