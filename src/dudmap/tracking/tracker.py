@@ -16,7 +16,11 @@ from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
 SHORT_STEP = 4
-"""A step shorter than this multiple of the stop tolerance also ends a level if the cost hardly changes."""
+"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
+on the finest level whatever it costs."""
+FINEST_DAMPING = 1e-4
+"""Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
+directions, along which more damping shortens the steps until they are taken for convergence."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
 MIN_READINGS = 100
@@ -136,10 +140,11 @@ class Tracker:
                     system = self.linearize(volume, lit, T, weights, color_weight)
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
-            stop = self.config.stop if finest else self.config.stop_coarse
             if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
                 seen = self._observability(volume, lit, T, weights, system, color_weight)
-            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight, seen)
+            T, system, used, settled = self._optimize(
+                volume, lit, T, weights, system, limit, finest, color_weight, seen
+            )
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
@@ -188,17 +193,22 @@ class Tracker:
         weights: NDArray[np.float32],
         system: LinearSystem,
         limit: int,
-        stop: float,
+        finest: bool,
         color_weight: float | None,
         seen: Observability,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
         accepted if it decreases the cost. It moves only along the directions that are ``seen``.
 
+        A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
+        and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
+        decide which are, and where the registration ends.
+
         Returns:
             Pose, its normal equations, number of linearisations, whether a stop criterion was met.
         """
-        damping, used = self.config.damping, 0
+        stop = self.config.stop if finest else self.config.stop_coarse
+        damping, used = min(self.config.damping, FINEST_DAMPING) if finest else self.config.damping, 0
         for _ in range(limit):
             diagonal = np.diag(system.H)
             if not diagonal.max() > 0:
@@ -210,9 +220,9 @@ class Tracker:
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights, color_weight)
             used += 1
-            gain = abs(trial.cost - system.cost)
-            settled = length < SHORT_STEP * stop and gain < self.config.stop_gain * system.cost
-            if trial.cost < system.cost:
+            short, gain = length < SHORT_STEP * stop, abs(trial.cost - system.cost)
+            settled = short and not finest and gain < self.config.stop_gain * system.cost
+            if trial.cost < system.cost or (short and finest):
                 T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
             else:
                 damping *= 5
