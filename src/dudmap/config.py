@@ -164,7 +164,8 @@ class TrackerConfig(ConfigSection):
     tukey: float = Field(default=0.05, gt=0)
     """Tukey threshold of the distance residual, metres at 1 m depth."""
     damping: float = Field(default=0.02, gt=0)
-    """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1)."""
+    """Initial Levenberg-Marquardt damping, relative to the diagonal of J^T J (thesis eq. 4.42, table 6.1); at most 1e-4
+    on the finest level."""
     color_weight: float = Field(default=0.1325, ge=0)
     """Weight of the squared intensity residual (intensity in [0, 1]) relative to the squared distance residual
     (metres); thesis eq. 4.32, table 6.2."""
@@ -183,7 +184,7 @@ class TrackerConfig(ConfigSection):
     stop_coarse: float = Field(default=1e-3, gt=0)
     """The same for the coarser levels, which only lead to the next."""
     stop_gain: float = Field(default=3e-3, ge=0, lt=1)
-    """Relative decrease of the cost below which a short step also ends a level; 0 disables this criterion."""
+    """Relative change of the cost below which a short step also ends a coarse level; 0 disables this criterion."""
     second_pass: bool = True
     """Register a second time with the dynamic labels (thesis algorithm 4)."""
     constant_velocity: bool = True

@@ -1,5 +1,6 @@
 """The registration against plain NumPy and against numerical derivatives; the tracker's checks."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,7 @@ from dudmap.geometry.se3 import retract
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import Tracker, TrackingResult
+from dudmap.tracking.tracker import LinearSystem, Tracker, TrackingResult
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 
@@ -91,7 +92,7 @@ def test_alignment_finds_a_known_motion(volume):
     assert np.degrees(se3.rotation_angle(error)) < 0.15
 
 
-def test_a_level_that_gains_nothing_more_ends_there(volume):
+def test_a_coarse_level_that_gains_nothing_more_ends_there(volume):
     """Noise makes steps that lead nowhere; poses found in fewer of them are as good."""
     xi = np.array([0.004, -0.003, 0.002, 0.002, -0.003, 0.003])
     found: dict[float, list[TrackingResult]] = {0.0: [], 3e-3: []}
@@ -101,7 +102,9 @@ def test_a_level_that_gains_nothing_more_ends_there(volume):
         intensity = level.intensity + rng.normal(0, 0.1, level.depth.shape)
         noisy = Level(CAMERA, depth.astype(np.float32), intensity.astype(np.float32))
         for stop_gain, results in found.items():
-            config = TrackerConfig(widths=(80,), iterations=(30,), stop=2e-4, stop_gain=stop_gain, exposure=False)
+            config = TrackerConfig(  # of two levels, of which the first is given
+                widths=(80, 160), iterations=(30, 30), stop_coarse=2e-4, stop_gain=stop_gain, exposure=False
+            )
             results.append(Tracker(config, SENSOR).align(volume, [noisy], np.eye(4)))
     iterations = {gain: sum(result.iterations for result in results) for gain, results in found.items()}
     errors = {
@@ -110,6 +113,24 @@ def test_a_level_that_gains_nothing_more_ends_there(volume):
     }
     assert iterations[3e-3] < 0.9 * iterations[0.0]
     assert errors[3e-3] < errors[0.0] + 0.0005
+
+
+def test_the_noise_of_the_cost_does_not_decide_where_the_finest_level_ends(volume, monkeypatch):
+    """Readings that enter and leave the map change the cost by more than short steps do."""
+    tracker = Tracker(TrackerConfig(widths=(80,), iterations=(10,), stop=1e-3, exposure=False), SENSOR)
+    level = level_of(corner(np.array([0.0002, -0.0001, 0.0001, 0.0, 0.0001, 0.0])))
+    quiet = tracker.align(volume, [level], np.eye(4))
+    assert quiet.iterations > 1, "else no cost is compared"
+    linearize, rng = tracker.linearize, np.random.default_rng(0)
+
+    def noisy(*args: Any) -> LinearSystem:
+        system = linearize(*args)
+        return replace(system, cost=system.cost * rng.uniform(1, 2))
+
+    monkeypatch.setattr(tracker, "linearize", noisy)
+    for _ in range(5):
+        found = tracker.align(volume, [level], np.eye(4))
+        np.testing.assert_allclose(found.T_world_camera, quiet.T_world_camera, rtol=0, atol=1e-7)
 
 
 def test_pixels_of_weight_zero_have_no_say(volume):

@@ -127,7 +127,8 @@ def _state(grid: VoxelGrid, T_world_camera: NDArray[np.float64], damping: Dampin
     _part(state, "ORIGIN")[:] = grid.origin * BLOCK
     numbers = {
         "DIMENSIONS": m, "VOXEL": grid.voxel_size, "DAMPING": damping.damping, "LIMIT": damping.limit,
-        "STOP": damping.stop, "STOP_GAIN": damping.stop_gain, "STATUS": kernels.RUNNING, "ACCEPTED": -1,
+        "STOP": damping.stop, "STOP_GAIN": damping.stop_gain, "TAKEN": damping.taken,
+        "STATUS": kernels.RUNNING, "ACCEPTED": -1,
     }  # fmt: skip
     for name, value in numbers.items():
         _part(state, name)[:] = value

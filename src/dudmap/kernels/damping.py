@@ -4,7 +4,8 @@ Plain functions of float64 numbers: the host calls them, and Warp compiles the s
 """
 
 SHORT_STEP = 4.0
-"""A step shorter than this multiple of the stop tolerance also ends a level if the cost hardly changes."""
+"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
+on the finest level whatever it costs."""
 FLOOR = 1e-9
 """Share of the largest diagonal element that is always added, so that a direction without information stays still."""
 FACTOR, LEAST = 5.0, 1e-6
@@ -21,11 +22,16 @@ def is_settled(length, cost, trial_cost, stop, stop_gain):
     return length < SHORT_STEP * stop and abs(trial_cost - cost) < stop_gain * cost
 
 
+def is_accepted(length, cost, trial_cost, taken):
+    """Whether a step of a length is made: if it decreases the cost, or is shorter than ``taken``."""
+    return trial_cost < cost or length < taken
+
+
 def relaxed(damping):
-    """Damping after a step that has decreased the cost."""
+    """Damping after a step that was accepted."""
     return max(damping / FACTOR, LEAST)
 
 
 def tightened(damping):
-    """Damping after a step that has not."""
+    """Damping after a step that was not."""
     return damping * FACTOR

@@ -307,6 +307,7 @@ class Damping(NamedTuple):
         limit: Largest number of steps that are tried.
         stop: Norm of a step (m, rad) below which it is the last one.
         stop_gain: Relative change of the cost below which a short step is.
+        taken: Norm of a step below which it is made whatever it costs.
     """
 
     H: NDArray[np.float64]
@@ -317,6 +318,7 @@ class Damping(NamedTuple):
     limit: int
     stop: float
     stop_gain: float
+    taken: float
 
 
 class Descent(NamedTuple):

@@ -9,13 +9,16 @@ from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels.damping import added, is_settled, relaxed, tightened
+from dudmap.kernels.damping import SHORT_STEP, added, is_accepted, is_settled, relaxed, tightened
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import Damping, ImageStack, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
+FINEST_DAMPING = 1e-4
+"""Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
+directions, along which more damping shortens the steps until they are taken for convergence."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
 MIN_READINGS = 100
@@ -135,10 +138,11 @@ class Tracker:
                     system = self.linearize(volume, lit, T, weights, color_weight)
                     iterations += 1
             finest = first_level + index == len(self.config.iterations) - 1
-            stop = self.config.stop if finest else self.config.stop_coarse
             if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
                 seen = self._observability(volume, lit, T, weights, system, color_weight)
-            T, system, used, settled = self._optimize(volume, lit, T, weights, system, limit, stop, color_weight, seen)
+            T, system, used, settled = self._optimize(
+                volume, lit, T, weights, system, limit, finest, color_weight, seen
+            )
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
@@ -187,20 +191,25 @@ class Tracker:
         weights: NDArray[np.float32],
         system: LinearSystem,
         limit: int,
-        stop: float,
+        finest: bool,
         color_weight: float | None,
         seen: Observability,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
         accepted if it decreases the cost. It moves only along the directions that are ``seen``.
 
+        A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
+        and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
+        decide which are, and where the registration ends.
+
         Returns:
             Pose, its normal equations, number of linearisations, whether a stop criterion was met.
         """
-        found = self._descended(volume, level, T, weights, system, limit, stop, color_weight, seen)
+        rules = self._damping(system, limit, finest, seen)
+        found = self._descended(volume, level, T, weights, system, rules, color_weight)
         if found is not None:
             return found
-        damping, used = self.config.damping, 0
+        damping, used = rules.damping, 0
         for _ in range(limit):
             diagonal = np.diag(system.H)
             if not diagonal.max() > 0:
@@ -208,18 +217,26 @@ class Tracker:
             damped = system.H + np.diag(added(diagonal, diagonal.max(), damping))
             step = seen.step(damped, system.b)
             T_trial, length = se3.retract(T, step), np.linalg.norm(step)
-            if length < stop:  # too short to need another linearisation
+            if length < rules.stop:  # too short to need another linearisation
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights, color_weight)
             used += 1
-            settled = is_settled(length, system.cost, trial.cost, stop, self.config.stop_gain)
-            if trial.cost < system.cost:
+            settled = is_settled(length, system.cost, trial.cost, rules.stop, rules.stop_gain)
+            if is_accepted(length, system.cost, trial.cost, rules.taken):
                 T, system, damping = T_trial, trial, relaxed(damping)
             else:
                 damping = tightened(damping)
             if settled:
                 return T, system, used, True
         return T, system, used, False
+
+    def _damping(self, system: LinearSystem, limit: int, finest: bool, seen: Observability) -> Damping:
+        """Beginning and rules of the steps of a level."""
+        config, first = self.config, (system.H, system.b, system.cost, seen.observable)
+        if finest:
+            damping = min(config.damping, FINEST_DAMPING)
+            return Damping(*first, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
+        return Damping(*first, config.damping, limit, config.stop_coarse, config.stop_gain, taken=0.0)
 
     def _descended(
         self,
@@ -228,16 +245,12 @@ class Tracker:
         T: NDArray[np.float64],
         weights: NDArray[np.float32],
         system: LinearSystem,
-        limit: int,
-        stop: float,
+        rules: Damping,
         color_weight: float | None,
-        seen: Observability,
     ) -> tuple[NDArray[np.float64], LinearSystem, int, bool] | None:
         """What ``_optimize`` returns, found by the compute device alone; None where it does not run the loop."""
         found = volume.backend.descend(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T,
-            Damping(system.H, system.b, system.cost, seen.observable, self.config.damping, limit, stop,
-                    self.config.stop_gain),
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T, rules,
             self._parameters(volume, color_weight),
         )  # fmt: skip
         if found is None:

@@ -18,8 +18,8 @@ wp.set_module_options({"enable_backward": False})
 
 SIZES = {
     "POSE": 12, "TRIAL": 12, "STEP": 6, "SUMS": registration.NUM_SUMS, "TRIAL_SUMS": registration.NUM_SUMS, "BASIS": 36,
-    "DIMENSIONS": 1, "ORIGIN": 3, "VOXEL": 1, "DAMPING": 1, "LIMIT": 1, "STOP": 1, "STOP_GAIN": 1, "LENGTH": 1,
-    "USED": 1, "STATUS": 1, "ACCEPTED": 1,
+    "DIMENSIONS": 1, "ORIGIN": 3, "VOXEL": 1, "DAMPING": 1, "LIMIT": 1, "STOP": 1, "STOP_GAIN": 1, "TAKEN": 1,
+    "LENGTH": 1, "USED": 1, "STATUS": 1, "ACCEPTED": 1,
 }  # fmt: skip
 """Parts of the state and their lengths: poses (3, 4), row by row; sums of both poses (``registration.NUM_SUMS``); basis
 (6, m), row by row with 6 columns; origin of the window's lattice, voxels; number of linearisations; status; which of
@@ -43,15 +43,16 @@ POSE, TRIAL, STEP, SUMS, TRIAL_SUMS, BASIS = (
 DIMENSIONS, ORIGIN, VOXEL, DAMPING, LIMIT, STOP = (
     wp.constant(PLACES[name]) for name in ("DIMENSIONS", "ORIGIN", "VOXEL", "DAMPING", "LIMIT", "STOP")
 )
-STOP_GAIN, LENGTH, USED, STATUS, ACCEPTED = (
-    wp.constant(PLACES[name]) for name in ("STOP_GAIN", "LENGTH", "USED", "STATUS", "ACCEPTED")
+STOP_GAIN, TAKEN, LENGTH, USED, STATUS, ACCEPTED = (
+    wp.constant(PLACES[name]) for name in ("STOP_GAIN", "TAKEN", "LENGTH", "USED", "STATUS", "ACCEPTED")
 )
 GOES_ON, ENDS_SETTLED, ENDS_EXHAUSTED, ENDS_INDEFINITE = (
     wp.constant(wp.float64(value)) for value in (RUNNING, SETTLED, EXHAUSTED, INDEFINITE)
 )
 COST_PLACE = wp.constant(COST)
 rotation_elements = warp_function(se3.rotation_elements)
-added, is_settled = warp_function(damping.added), warp_function(damping.is_settled)
+added = warp_function(damping.added)
+is_settled, is_accepted = warp_function(damping.is_settled), warp_function(damping.is_accepted)
 relaxed, tightened = warp_function(damping.relaxed), warp_function(damping.tightened)
 
 
@@ -176,7 +177,7 @@ def judge(state: State):
     state[USED] = state[USED] + wp.float64(1.0)
     cost, trial = state[SUMS + COST_PLACE], state[TRIAL_SUMS + COST_PLACE]
     settled = is_settled(state[LENGTH], cost, trial, state[STOP], state[STOP_GAIN])
-    if trial < cost:
+    if is_accepted(state[LENGTH], cost, trial, state[TAKEN]):
         for i in range(12):
             state[POSE + i] = state[TRIAL + i]
         for k in range(NUM_SUMS):
