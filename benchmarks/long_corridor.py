@@ -65,17 +65,21 @@ def main() -> None:
             if result.corrected:
                 corrected.append(number)
             if (number + 1) % tenth == 0:
-                away = 0 if slam.volume.pager is None else slam.volume.pager.num_blocks
+                volume = slam.atlas.volume
+                away = 0 if volume.pager is None else volume.pager.num_blocks
                 medians.append(float(np.median(times[WARM_UP if len(medians) == 0 else -tenth :][-tenth:])))
                 print(
                     f"| {number * options.speed / options.fps:.0f} | {medians[-1]:.1f} | "
                     f"{resident_bytes() / 1e6:.0f} | "
-                    f"{slam.volume.blocks.num_voxel_blocks} | {away} | {lost} | {len(corrected)} |", flush=True,
+                    f"{volume.blocks.num_voxel_blocks} | {away} | {lost} | {len(corrected)} |", flush=True,
                 )  # fmt: skip
     found = accuracy(slam.trajectory, corridor.ground_truth)
     print(f"\ntime per frame, last tenth over first: {medians[-1] / medians[0]:.2f}; slowest frame {max(times):.0f} ms")
     print(f"peak memory {peak_rss_mb()} MB; ATE {100 * found['ate_rmse_m']:.1f} cm; "
           f"corrected at frames {corrected}")  # fmt: skip
+    start, missing = time.perf_counter(), sum(len(one.missing) for one in slam.atlas.rebuildings.values())
+    _ = slam.volume
+    print(f"kept frames missing in the map at the end: {missing}, fused in {time.perf_counter() - start:.1f} s")
     for total, number, stage, most in reversed(slowest):
         print(f"slow: frame {number}, {total:.0f} ms, of which {stage} {most:.0f} ms")
     for reason, numbers in reasons.items():

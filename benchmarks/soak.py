@@ -25,6 +25,7 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.mapping.memory_limit import resident_bytes
 from dudmap.pipeline.environment import machine
+from dudmap.pipeline.frame_source import FrameRead
 from dudmap.pipeline.observer import RunObserver
 from dudmap.pipeline.run import run
 from dudmap.pipeline.storing import Storing
@@ -75,7 +76,7 @@ class Table(RunObserver):
         print("| frames | processor ms per frame, median | ms | memory MB | blocks | folder MB | lost | error mm |")
         print("|---|---|---|---|---|---|---|---|")
 
-    def frame(self, index: int, read: Frame, result: FrameResult, ms: float) -> None:  # noqa: D102
+    def frame(self, index: int, read: FrameRead, result: FrameResult, ms: float) -> None:  # noqa: D102
         self._times.append((1000 * (time.process_time() - self._recording.rendered), ms))
         if result.T_world_camera is None:
             self.lost += 1
@@ -92,7 +93,7 @@ class Table(RunObserver):
         row = float(cpu), float(resident_bytes()), float(max(self._errors, default=np.nan))
         self.rows.append(row)
         size = sum(file.stat().st_size for file in self._out.rglob("*") if file.is_file())
-        blocks = self._slam.volume.num_blocks
+        blocks = self._slam.atlas.volume.num_blocks
         print(f"| {frames} | {cpu:.1f} | {ms:.1f} | {row[1] / 1e6:.0f} | {blocks} | {size / 1e6:.0f} | {self.lost} | "
               f"{1000 * row[2]:.1f} |", flush=True)  # fmt: skip
         self._times, self._errors = [], []

@@ -12,8 +12,9 @@ from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.saved_map import SavedMap
-from dudmap.synthetic.recording import SyntheticSequence, sequence
+from dudmap.synthetic.recording import SyntheticSequence
 from dudmap.synthetic.scene import Scene
+from dudmap.synthetic.setup import sequence
 from dudmap.tracking.quality_monitor import RegistrationHistory
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

@@ -131,6 +131,7 @@ def test_every_written_file_and_figure_is_described(run_folder):
     with (run_folder / "timings.csv").open(encoding="utf-8") as file:
         columns = next(csv.reader(file))
     assert columns[:6] == ["timestamp", "state", "fused", "dynamic_share", "reading", "total"]
+    assert set(columns[6:]) <= described, "docs/files.md lacks a stage"
 
 
 def test_continuous_integration_is_make_test():

@@ -1,5 +1,7 @@
 """A run with a memory limit has the result of a run without one."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -22,21 +24,32 @@ def corridor():
     return ring_corridor(40, speed=1.2, camera=DEFAULT_CAMERA.resized(160, 120))
 
 
-def processed(corridor, max_blocks=None):
-    config = Config().override(["volume.voxel_size=0.01", "preprocess.depth_max=3", "loops.keep_distance=0.3"])
+def processed(corridor, max_blocks=None, dark=(), settings=()):
+    config = Config().override(
+        ["volume.voxel_size=0.01", "preprocess.depth_max=3", "loops.keep_distance=0.3", *settings]
+    )
     slam, most = Slam(corridor.camera, config, max_blocks=max_blocks), 0
     for index in range(FRAMES):
-        slam.process(corridor[index])
-        most = max(most, slam.volume.blocks.num_voxel_blocks)
+        frame = corridor[index]
+        slam.process(replace(frame, depth=np.zeros_like(frame.depth)) if index in dark else frame)
+        most = max(most, sum(volume.blocks.num_voxel_blocks for volume in slam.atlas.volumes.values()))
     return slam, most
 
 
-def test_the_result_is_that_of_a_run_in_memory(corridor):
-    (whole, all_blocks), (paged, most) = processed(corridor), processed(corridor, max_blocks=6000)
+@pytest.mark.parametrize("submaps", [1, 2])
+def test_the_result_is_that_of_a_run_in_memory(corridor, submaps):
+    """Also with a second submap, begun in the dark: the first then waits on disk as a whole."""
+    dark = range(34, 42) if submaps == 2 else ()
+    nothing_is_recognised = ["relocalization.max_distance=1e-6", "submaps.patience=0.2"]
+    options = {"dark": dark, "settings": nothing_is_recognised if submaps == 2 else ()}
+    whole, all_blocks = processed(corridor, **options)
+    paged, most = processed(corridor, max_blocks=6000, **options)
     assert most < 0.9 * all_blocks
-    assert len(whole.trajectory) > FRAMES // 2
-    assert np.array_equal(paged.trajectory.Ts_world_camera, whole.trajectory.Ts_world_camera)
-    assert np.array_equal(triangles(paged.volume.extract_mesh()), triangles(whole.volume.extract_mesh()))
+    assert len(whole.maps) == len(paged.maps) == submaps
+    assert min(len(trajectory) for trajectory, _ in whole.maps) > 10
+    for (path, volume), (expected_path, expected) in zip(paged.maps, whole.maps, strict=True):
+        assert np.array_equal(path.Ts_world_camera, expected_path.Ts_world_camera)
+        assert np.array_equal(triangles(volume.extract_mesh()), triangles(expected.extract_mesh()))
 
 
 def test_a_limit_is_met_by_what_is_left_for_the_map():

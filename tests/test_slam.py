@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -37,6 +38,17 @@ def errors(sequence, results) -> np.ndarray:
             if result.T_world_camera is not None
         ]
     )
+
+
+def test_the_stages_make_up_the_time_of_a_frame(recording):
+    sequence, frames = recording
+    slam, shares = Slam(sequence.camera), []
+    for frame in frames:
+        start = time.perf_counter()
+        result = slam.process(frame)
+        shares.append(sum(result.timings.values()) / (1000 * (time.perf_counter() - start)))
+    assert max(shares) <= 1
+    assert np.median(shares[4:]) > 0.85
 
 
 def test_a_static_room_is_followed(recording):

@@ -197,9 +197,9 @@ class TrackerConfig(ConfigSection):
     """Smallest ratio of the smallest to the largest eigenvalue of the scaled J^T J of a tracked frame."""
     min_information: float = Field(default=2.3, ge=0)
     """Smallest information on a direction of motion, in multiples of what the noise of the gradients alone gives, from
-    which on the registration moves along it; else it keeps the predicted motion and reports it. Above 2, which an
-    endless tunnel gives where only noise shows the way along it; some corridors with texture at 320x240 give less, too.
-    0 moves along all directions."""
+    which on the registration moves along it in any case. Below, it does so only where map and image have the same
+    texture along it; else it keeps the predicted motion and reports it. Above 2, which an endless tunnel gives where
+    only noise shows the way along it; some corridors with texture at 320x240 give less, too. 0 moves along all."""
     max_speed: float = Field(default=5.0, gt=0)
     """Largest plausible speed of the camera, m/s."""
     max_turn_deg: float = Field(default=360.0, gt=0)

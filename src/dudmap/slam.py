@@ -2,18 +2,17 @@
 
 import time
 from dataclasses import replace
-from pathlib import Path
 from typing import Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.bootstrap import Bootstrap, StartFrame
+from dudmap.bootstrap import Bootstrap
 from dudmap.calibration.depth_model import DepthModel
 from dudmap.color_calibration import ColorCalibration
 from dudmap.config import Config
 from dudmap.dynamics.detector import DynamicDetector
-from dudmap.dynamics.masks import full_mask, grown_mask
+from dudmap.dynamics.masks import full_mask
 from dudmap.errors import ConfigError
 from dudmap.frames.depth_correction import DepthCorrection
 from dudmap.frames.frame import Frame, FrameArrays
@@ -22,24 +21,23 @@ from dudmap.frames.pyramid import Pyramid
 from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.gpu.device import make_backend
+from dudmap.gpu.device import make_backend, make_clock
+from dudmap.mapper import Mapper
 from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.objects.moving_objects import MovingObjects
-from dudmap.objects.object_map import RigidObject
 from dudmap.objects.object_tracker import Mover
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.loop_closing import LoopCloser
 from dudmap.places.loop_verification import LoopQuery
 from dudmap.places.place_recognition import KeyframeDatabase
-from dudmap.places.prior_map import PriorMap
 from dudmap.places.redundancy import RedundantViews
 from dudmap.places.relocalizer import Relocalizer
 from dudmap.places.saved_map import SavedMap
 from dudmap.result import FrameResult
+from dudmap.slam_results import SlamResults
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.color_motion import ColorMotion
 from dudmap.tracking.depth_noise import DepthNoise
@@ -54,7 +52,7 @@ from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
 from dudmap.tracking.tracker import Tracker
 
 
-class Slam:
+class Slam(SlamResults):
     """Dense RGB-D SLAM in scenes where things move.
 
     Args:
@@ -125,93 +123,19 @@ class Slam:
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
+        self.mapper = Mapper(
+            config, self.camera, self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy,
+            localize=localize,
+        )  # fmt: skip
         if saved_map is not None:
             self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.restore(saved_map.registrations)
             self.relocalizer.start_in_saved_map()
 
     @property
-    def volume(self) -> TsdfVolume:
-        """Map of the current submap; another object after a new submap was started or two were joined."""
-        return self.atlas.volume
-
-    @property
     def reference(self) -> TsdfVolume:
         """Map that frames are registered to: the current one, or in a second pass that of the first."""
-        return self.volume if self.prior_map is None else self.prior_map.volume
-
-    @property
-    def trajectory(self) -> Trajectory:
-        """Poses of all frames tracked so far in the submap with the most frames, after all corrections."""
-        return self.atlas.trajectory(self.atlas.by_size()[0])
-
-    @property
-    def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
-        """Trajectory and map of each submap, that with the most frames first; each has its own world frame."""
-        return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
-
-    @property
-    def saved_map(self) -> SavedMap:
-        """The main map as a later run goes on in it."""
-        return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
-
-    @property
-    def calibration(self) -> Calibration:
-        """Calibration of the colour camera in use."""
-        return self.color_calibration.current
-
-    @property
-    def rigid_objects(self) -> list[RigidObject]:
-        """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
-        return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
-
-    def learnt_depth_model(self) -> DepthModel:
-        """Distortion of the depth, beyond the given model, that the frames kept for the rebuilding of the map show.
-
-        Raises:
-            ConfigError: No frames are kept, since ``relocalization``, or both ``loops`` and ``submaps`` are off.
-        """
-        from dudmap.calibration.depth_estimator import DepthView, estimate_distortion
-
-        store = self.atlas.history
-        if store is None:
-            raise ConfigError("the depth model is learnt from kept frames; enable relocalization, and loops or submaps")
-        main = self.atlas.by_size()[0]
-        views = [
-            DepthView.of(np.where(kept.static, kept.frame.depth, np.float32(0)), self.camera, kept.T_world_camera)
-            for kept, submap in zip(store, store.submaps, strict=True) if submap == main
-        ]  # fmt: skip
-        return estimate_distortion(views, self.camera, self.config.sensor)
-
-    def as_prior_map(self) -> PriorMap:
-        """The largest submap and what else a second pass over the same recording needs."""
-        main = self.atlas.by_size()[0]
-        poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
-        return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)
-
-    def save(self, path: str | Path) -> None:
-        """Write the whole state, from which ``resume`` goes on, replacing an older file at the end.
-
-        Raises:
-            StateError: The file cannot be written.
-        """
-        from dudmap.state.system import save_system
-
-        save_system(self, Path(path))
-
-    @classmethod
-    def resume(cls, path: str | Path, device: str | None = None) -> "Slam":
-        """A system in the state that ``save`` wrote: the frames that follow give the same results, bit for bit.
-
-        With another ``device`` than that of the run the results differ by roundings. The file stays open and must stay
-        as it is while the system lives: stored frames are read from it.
-
-        Raises:
-            StateError: The file is missing, damaged, or was written by another version.
-        """
-        from dudmap.state.system import resume_system
-
-        return resume_system(Path(path), device)
+        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
 
     def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
         """The part of the work on a frame that needs no other frame, as input of ``process``.
@@ -232,7 +156,7 @@ class Slam:
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
-            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
+            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)}, make_clock(self.device))
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
@@ -260,14 +184,17 @@ class Slam:
             FrameError: The images do not fit the camera or each other; the frame changed nothing.
         """
         view = self.prepare(self._given(frame, arrays), dynamic_mask)
-        if rejection := self.stream.rejection(view.observation):
+        with view.timer("check"):
+            rejection = self.stream.rejection(view.observation)
+        if rejection:
             return self._reject(view, rejection)
         view = self.color_motion.predicted(self._resumed(view))
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=self._is_blind(view))
+        self._continue_rebuilding(view)
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
-        self._revise_start(view, prediction)
+        self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
         reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
         relocalized = self._relocalize(view, prediction) if reason else None
@@ -275,16 +202,16 @@ class Slam:
         if reason and not relocalized:
             return self._lose(view, estimate, reason)
         view = self.color_motion.registered(view, estimate.T_world_camera)
-        self._recolor_first_frame(view, estimate)
+        self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
         with view.timer("similarity"):
             fuse = not (view.blind or uncertain or self.localize)
-            fuse = fuse and not self.redundancy.is_redundant(self.volume, view, estimate)
+            fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
         balance = self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
-        self._extend_map(view, estimate, mask, fuse=fuse)
+        self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
         return self._result(
@@ -313,6 +240,12 @@ class Slam:
             self.front_end.lose(view.timestamp)
         return view
 
+    def _continue_rebuilding(self, view: FrameView) -> None:
+        """Go on with the maps that are being rebuilt since a loop was closed or submaps were joined."""
+        if self.atlas.rebuildings:
+            with view.timer("rebuild"):
+                self.atlas.continue_rebuilding()
+
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
         return (view.textureless or self.stream.color_is_frozen) and not self.bootstrap.textureless
@@ -328,7 +261,7 @@ class Slam:
         self.motion.restart(view.timestamp, estimate.T_world_camera)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
-        self._extend_map(view, estimate, mask, fuse=True)
+        self.mapper.extend(view, estimate, mask, fuse=True)
         self.bootstrap.start(view, mask)
         self.color_motion.start(view)
         if self.config.dynamics.method == "em":
@@ -337,25 +270,6 @@ class Slam:
         self.predictor.update(view, estimate)
         self.monitor.images.update(view, estimate)
         return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
-
-    def _revise_start(self, view: FrameView, prediction: PosePrediction) -> None:
-        """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
-        can be seen, fuse the frames that were held back until then."""
-        self._begin_anew(self.bootstrap.revised(prediction.moving_before), view)
-        if not self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
-            for frame in self.bootstrap.released():
-                self._integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
-
-    def _recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
-        """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
-        first = self.color_motion.first_frame(view.timestamp, estimate.T_world_camera)
-        self._begin_anew(None if first is None else self.bootstrap.recolored(first), view)
-
-    def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:
-        """Empty the map and fuse its first frame again; None leaves it as it is."""
-        if first is not None:
-            self.atlas.clear_map()
-            self._integrate(replace(first.view, timer=view.timer), first.estimate, first.dynamic_mask)
 
     def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
         """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
@@ -368,7 +282,7 @@ class Slam:
         )
         if found is None:
             return None
-        self.atlas.current = found.submap
+        self.atlas.switch_to(found.submap)
         self.bootstrap.abandon()
         self.motion.restart(view.timestamp, found.estimate.T_world_camera)
         return found.estimate
@@ -410,29 +324,6 @@ class Slam:
                 mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
             return mask if view.known_dynamic is None else mask | view.known_dynamic
 
-    def _extend_map(
-        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool
-    ) -> None:
-        """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
-        if self.config.relocalization.enabled and not (view.blind or self.localize):
-            with view.timer("keyframe"):
-                T_world_camera = estimate.T_world_camera
-                self.atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self.atlas.current)
-        if fuse:
-            self._integrate(view, estimate, dynamic_mask)
-        if self.predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
-            self.bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
-
-    def _integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
-        observation = view.observation
-        with view.timer("integrate"):
-            static = ~grown_mask(dynamic_mask, self.config.dynamics.margin_px * self.camera.width // 640)
-            frame = Frame(observation.timestamp, observation.depth, observation.rgb)
-            recorded = observation.as_recorded
-            self.atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
-            self.redundancy.update(self.volume, view, estimate)
-
     def _close_loop(
         self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], bool]:
@@ -447,6 +338,7 @@ class Slam:
             correction = self.loops.close(query, self.monitor)
         if correction is None:
             return T_world_camera, False
+        self.bootstrap.abandon()  # frames held back have poses of before
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
         return correction @ T_world_camera, True
@@ -477,7 +369,7 @@ class Slam:
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.times(),
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable,

@@ -16,6 +16,7 @@ from dudmap.frames.optical_flow import consistent_with_static
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
+from dudmap.mapper import Mapper
 from dudmap.slam import Slam
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.motion_model import MotionModel
@@ -62,10 +63,33 @@ def test_the_refining_step_is_that_of_least_squares():
     near = np.linalg.norm(residual, axis=1) < 2 * NOISE_PX
     assert 20 < np.count_nonzero(near) < 180
     J = flow_jacobian(points @ guess[:3, :3].T + guess[:3, 3], CAMERA)[near].reshape(-1, 6)
-    H, gradient, count = consensus.normal_equations(points, targets, guess, CAMERA.intrinsics, 2 * NOISE_PX)
-    assert count == np.count_nonzero(near)
+    found = correspondences(points, targets, np.eye(4))
+    H, gradient, inliers = consensus.linearized(np.stack([guess] * 8), found, np.full(8, 2 * NOISE_PX))
+    assert set(inliers) == {np.count_nonzero(near)}
     expected = np.linalg.lstsq(J, residual[near].reshape(-1), rcond=None)[0]
-    np.testing.assert_allclose(np.linalg.solve(H, gradient), expected, rtol=1e-5, atol=1e-9)
+    for g in (0, 7):
+        np.testing.assert_allclose(np.linalg.solve(H[g], gradient[g]), expected, rtol=1e-5, atol=1e-9)
+    assert not any(values.any() for values in consensus.linearized(guess[None], found, np.zeros(1)))
+
+
+def test_the_scores_of_motions_are_those_of_the_formula():
+    rng = np.random.default_rng(6)
+    points, expected = rng.uniform([-1, -1, 0.5], [1, 1, 5], (150, 3)), se3.exp(0.02 * rng.normal(size=6))
+    motions = se3.exp_all(0.01 * rng.normal(size=(70, 6)))
+    targets = reproject(motions[0], points, CAMERA) + rng.normal(0, 1, (150, 2))
+    params = consensus.ConsensusParams((1.5, 0.8), (3.0, 4.0), 5.0)
+    scores = consensus.msac_scores(motions, correspondences(points, targets, expected), params)
+    for T, found in zip(motions, scores, strict=True):
+        pixels = reproject(T, points, CAMERA)
+        d = np.linalg.norm(pixels - reproject(expected, points, CAMERA), axis=1).mean() / 5.0
+        for score, inlier_px, gain in zip(found, (1.5, 0.8), (3.0, 4.0), strict=True):
+            square = np.minimum(np.sum((pixels - targets) ** 2, axis=1) / inlier_px**2, 1)
+            assert score == pytest.approx(gain * np.sum(points[:, 2] ** 2 * (1 - square)) * (0.5 + 0.5 / (1 + d**2)))
+
+
+def correspondences(points, targets, T_expected):
+    by_axis = (np.ascontiguousarray(values.T) for values in (points, targets, reproject(T_expected, points, CAMERA)))
+    return consensus.Correspondences(*by_axis, points[:, 2] ** 2, CAMERA.intrinsics)
 
 
 SLOW = se3.exp(np.array([0.002, -0.001, 0.003, 0.001, 0.002, -0.001]))
@@ -370,8 +394,8 @@ def test_a_young_map_with_a_slow_crowd_is_uncertain_and_begins_anew_without_it(c
         "room", coverage=coverage, speed=speed, start_dynamic=True, frames=16, camera=camera, seed=seed
     )
     fused = []
-    integrate = Slam._integrate
-    monkeypatch.setattr(Slam, "_integrate", lambda slam, *args: (fused.append(args), integrate(slam, *args)))
+    integrate = Mapper.integrate
+    monkeypatch.setattr(Mapper, "integrate", lambda mapper, *args: (fused.append(args), integrate(mapper, *args)))
     results = uncertain_frames(sequence)
     assert all(result.uncertain for result in results[4:12])
     assert not any(result.uncertain for result in results[12:])

@@ -27,6 +27,13 @@ def test_exp_is_the_matrix_exponential(xi):
 
 
 @QUICK
+@given(st.lists(twists, max_size=4), st.floats(0, 1e-4))
+def test_motions_of_many_twists_are_those_of_each(xis, size):
+    xis = np.array([*xis, np.zeros(6), *(size * xi for xi in xis)])
+    assert np.allclose(se3.exp_all(xis), [se3.exp(xi) for xi in xis], rtol=0, atol=1e-14)
+
+
+@QUICK
 @given(twists)
 def test_log_undoes_exp(xi):
     assert np.allclose(se3.log(se3.exp(xi)), xi, atol=1e-7)

@@ -39,6 +39,15 @@ def test_intensity_and_halving_are_those_of_the_cpu(cpu, gpu, recording, depth):
         np.testing.assert_allclose(a, b, atol=1e-6)
 
 
+@pytest.mark.parametrize("voxel_size", [0.001, 0.03, 0.3])
+def test_mean_colours_are_those_of_the_cpu(cpu, gpu, recording, depth, voxel_size):
+    """Sums of bytes are exact; a mean may be rounded otherwise on a processor that fuses its last operations."""
+    arguments = np.ascontiguousarray(recording[0].color), depth, 130.0, voxel_size
+    expected, found = cpu.footprint_colors(*arguments), gpu.footprint_colors(*arguments)
+    assert (found != expected).mean() < 1e-4
+    assert (expected != arguments[0]).any() == (voxel_size > 0.01)
+
+
 def test_weights_of_readings_are_equal(cpu, gpu, depth):
     arguments = cpu.filter(depth, FILTER), CAMERA.intrinsics, SensorNoise(0.001, 0.0019), 16.0
     expected, found = cpu.reading_weights(*arguments), gpu.reading_weights(*arguments)

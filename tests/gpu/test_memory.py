@@ -10,6 +10,7 @@ from dudmap.kernels.mirror import Mirror
 wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
+from dudmap.gpu import faults, memory
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.memory import resident, wrote
 
@@ -80,3 +81,26 @@ def test_the_back_end_has_every_operation():
     wanted = [name for name in vars(Backend) if not name.startswith("_")]
     assert len(wanted) > 12
     assert [name for name in wanted if not callable(getattr(backend, name, None))] == []
+
+
+def test_memory_is_asked_for_when_the_map_has_grown(mirror, monkeypatch):
+    """To answer, the device must finish its work, also on the next frame."""
+    asked = []
+    monkeypatch.setattr(memory, "free_memory", lambda device: asked.append(device) or 1 << 40)
+    resident(mirror, "cpu")
+    asked.clear()
+    assert [mirror.max_rows for _ in range(5)] == [None] * 5
+    assert len(asked) == 2
+    mirror.grow(6, -1)
+    mirror.use(6)
+    resident(mirror, "cpu")
+    asked.clear()
+    assert [mirror.max_rows for _ in range(5)] == [None] * 5
+    assert len(asked) == 2
+    monkeypatch.setattr(memory, "free_memory", lambda device: 10)
+    mirror.grow(9, -1)
+    mirror.use(9)
+    monkeypatch.setattr(memory, "has_room", lambda num_bytes, device: True)
+    resident(mirror, "cpu")
+    with faults.told_to(lambda sentence: None):
+        assert mirror.max_rows is not None

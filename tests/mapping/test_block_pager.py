@@ -159,6 +159,28 @@ def test_a_paged_map_is_stored_and_goes_on(tmp_path):
     database.close()
 
 
+def test_a_map_that_has_left_the_memory_is_stored_and_goes_on(tmp_path):
+    """All its blocks leave between two checkpoints; some have come back into other slots since."""
+    volume = TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=MAX_BLOCKS)
+    database = StateDatabase(tmp_path / "state.db")
+    for number in range(8):
+        volume.integrate(*frame(number))
+    database.write(take_snapshot({"map": volume}, database), {})
+    volume.page_out()
+    assert volume.blocks.num_voxel_blocks == 0 < volume.num_blocks
+    for came_back in (False, True):
+        if came_back:
+            volume.look_at(frame(2)[1])
+        database.write(take_snapshot({"map": volume}, database), {})
+        again = restore(StateReader(tmp_path / "state.db"), {"map": None})["map"]
+        assert content(again) == content(volume)
+        if not came_back:
+            volume.page_out()
+    for each in (volume, again):
+        each.integrate(*frame(3))
+    assert content(again) == content(volume)
+
+
 def scattered(*starts):
     """Blocks, each in a region of its own along x, 20 regions from each start (block coordinates)."""
     blocks = VoxelBlocks()

@@ -56,6 +56,7 @@ def relocalizer(candidates=(), *, current=1, prior_map=None, num_features=100, h
     atlas = SimpleNamespace(
         keyframes=Places(candidates, num_features),
         volumes={0: "map 0", 1: "map 1"},
+        volume_around=lambda number, T_world_camera: f"map {number}",
         current=current,
         history=object() if history else None,
     )

@@ -6,7 +6,9 @@ import pytest
 from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.places.pose_graph import Edge
 from dudmap.slam import Slam
 from dudmap.state.database import StateDatabase
 from dudmap.state.system import differences, take_snapshot
@@ -65,6 +67,35 @@ def test_a_stored_system_is_the_same_and_goes_on_the_same(tmp_path, case):
     assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
     for frame in frames[stop:]:
         assert_same_results(slam.process(frame), again.process(frame))
+    mesh, other = slam.volume.extract_mesh(), again.volume.extract_mesh()
+    for name in ("vertices", "faces", "colors", "normals"):
+        np.testing.assert_array_equal(getattr(mesh, name), getattr(other, name))
+
+
+def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch):
+    """A loop says that the camera is 3 mm farther; the map of the 24 frames stored is rebuilt over the next 20."""
+    for module in ("atlas", "loop_correction"):
+        monkeypatch.setattr(f"dudmap.places.{module}.AT_ONCE", 4)
+    sequence, frames = scene(movers=(), frames=48)
+    slam = Slam(sequence.camera, Config().override(["loops.keep_gap=1", "loops.min_age=100"]))
+    for frame in frames[:24]:
+        slam.process(frame)
+    Ts = slam.atlas.history.Ts_world_camera
+    farther = se3.exp(np.array([0, 0, 0.003, 0, 0, 0]))
+    last = len(Ts) - 1
+    edge = Edge(0, last, farther @ se3.inverse(Ts[0]) @ Ts[last], 0.005, 0.003)
+    correction = slam.loops.corrector.correct(edge)
+    assert correction is not None
+    slam.motion.apply_correction(correction)
+    for frame in frames[24:28]:
+        slam.process(frame)
+    assert len(slam.atlas.rebuildings[0].missing) > 10
+    slam.save(tmp_path / "state.db")
+    again = Slam.resume(tmp_path / "state.db")
+    assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
+    for frame in frames[28:]:
+        assert_same_results(slam.process(frame), again.process(frame))
+    assert not slam.atlas.rebuildings
     mesh, other = slam.volume.extract_mesh(), again.volume.extract_mesh()
     for name in ("vertices", "faces", "colors", "normals"):
         np.testing.assert_array_equal(getattr(mesh, name), getattr(other, name))

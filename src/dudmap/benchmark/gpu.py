@@ -24,12 +24,16 @@ from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 BYTES_PER_THREAD = {
     "limit_depth": 8, "drop_mixed": 8, "fill_holes": 8, "bilateral_line": 8, "intensities": 7, "halve": 40,
-    "tile_ranges": 268, "reading_weights": 5, "pack_pixels": 16, "integrate": 8, "linearize": 288, "sample": 17,
+    "tile_ranges": 268, "reading_weights": 5, "pack_pixels": 16, "integrate": 8, "linearize": 288,
+    "linearize_trial": 288, "sample": 17,
     "first_spins": 8, "mean_field_sweep": 20, "probabilities": 8, "trace": 19, "classify": 9, "find_vertices": 10,
     "scatter": 8, "gather": 8,
 }  # fmt: skip
 """Bytes that each thread of a kernel must read and write at least: its elements of each image and each sum once, and
 the words of the voxels that belong to it alone; not those of the map that neighbouring pixels share."""
+KERNELS_EVERY = 4
+"""Every so many frames the kernels are measured, launched one by one, and in the others the frames and their stages:
+events around each kernel take time, and kernels in a graph have none."""
 COPY_BYTES = 1 << 28
 """Size of the array whose copy measures the bandwidth of the device."""
 
@@ -119,13 +123,16 @@ def _measured(name: str, recording: Sequence, frames: int, voxel: float, device:
         times, stages, kernels, moved = [], [], [], []
         for index in range(min(frames, len(recording))):
             frame = recording[index]
-            with _kernel_times(device) as (measured, threads):
+            if device.startswith("cuda") and index % KERNELS_EVERY == 0:
+                with _kernel_times(device) as (measured, threads):
+                    slam.process(frame)
+                kernels.append(measured)
+                moved.append({key: count * BYTES_PER_THREAD.get(key, 0) for key, count in threads.items()})
+            else:
                 start = time.perf_counter()
                 result = slam.process(frame)
                 times.append(1000 * (time.perf_counter() - start))
-            stages.append(result.timings)
-            kernels.append(measured)
-            moved.append({key: count * BYTES_PER_THREAD.get(key, 0) for key, count in threads.items()})
+                stages.append(result.timings)
         pose = slam.trajectory.Ts_world_camera[-1]
         slam.volume.extract_mesh(1)
         mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
@@ -134,8 +141,8 @@ def _measured(name: str, recording: Sequence, frames: int, voxel: float, device:
     except MapError as error:
         return DeviceRun(name, voxel, device, error=str(error))
     warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
-    per_kernel = _medians(kernels[warm])
-    shares = _shares(per_kernel, _medians(moved[warm]), device)
+    per_kernel = _medians(kernels[-len(kernels) // 2 :])  # the first frames load the kernels
+    shares = _shares(per_kernel, _medians(moved[-len(moved) // 2 :]), device)
     return DeviceRun(
         name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
         slam.volume.num_bytes / 1e6, _peak_megabytes(device), per_kernel, shares,
@@ -162,8 +169,10 @@ def _kernel_times(device: str) -> Iterator[tuple[dict[str, float], dict[str, int
         return
     import warp as wp  # pyright: ignore[reportMissingImports]
 
+    from dudmap.gpu.sequence import one_by_one
+
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
-    with counted_launches(threads):
+    with counted_launches(threads), one_by_one():
         yield times, threads
     add_up(wp.timing_end(), times)
 
@@ -180,9 +189,9 @@ def counted_launches(threads: dict[str, int]) -> Iterator[None]:
             threads[kernel.key] = threads.get(kernel.key, 0) + int(np.prod(dim))
         return launch(kernel, dim, *arguments, **named)
 
-    def repeated(command: Any, *arguments: Any) -> None:  # noqa: ANN401
+    def repeated(command: Any, *arguments: Any, **named: Any) -> None:  # noqa: ANN401
         threads[command.kernel.key] = threads.get(command.kernel.key, 0) + command.bounds.size
-        repeat(command, *arguments)
+        repeat(command, *arguments, **named)
 
     wp.launch, wp.Launch.launch = counted, repeated  # pyright: ignore[reportAttributeAccessIssue]
     try:

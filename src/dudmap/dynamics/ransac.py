@@ -74,51 +74,29 @@ def rigid_motion(
     ])  # fmt: skip
     A = J[draws].reshape(-1, 6, 6)
     A = A + 1e-9 * np.eye(6)  # samples with a repeated point are degenerate; their hypotheses have no support
-    twists = np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64)
-    scores = consensus.msac_scores(twists, J, flow, expected - start, areas, params)
-    best, best_score = T_expected, -np.inf
-    for k, limit in enumerate(params.inlier_px):
-        highest = np.argpartition(scores[:, k], -REFINED)[-REFINED:]
-        for T in (T_expected, *(se3.exp(twists[number]) for number in highest)):
-            refined = _refined(T, points, targets, camera, limit)
-            score = _score(reproject(refined, points, camera), targets, expected, areas, params)
-            if score > best_score:
-                best, best_score = refined, score
-    return best
+    motions = se3.exp_all(np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64))
+    points, targets, expected = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
+    found = consensus.Correspondences(points, targets, expected, areas, camera.intrinsics)
+    scores = consensus.msac_scores(motions, found, params)
+    best = np.argpartition(scores, -REFINED, axis=0)[-REFINED:]
+    levels = [np.concatenate([T_expected[None], motions[highest]]) for highest in best.T]
+    refined = _refined(np.concatenate(levels), np.repeat(params.inlier_px, REFINED + 1), found)
+    return refined[consensus.msac_scores(refined, found, params).max(axis=1).argmax()]
 
 
 def _refined(
-    T: NDArray[np.float64],
-    points: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    camera: Camera,
-    inlier_px: float,
+    motions: NDArray[np.float64], inlier_px: NDArray[np.float64], found: consensus.Correspondences
 ) -> NDArray[np.float64]:
-    """Least-squares motion of the inliers of a motion near it, by Gauss-Newton; arguments as above."""
-    for scale in (2.0, 1.0, 1.0):  # the hypothesis comes from three noisy corners: begin with a wider inlier threshold
-        limit = scale * inlier_px
-        H, gradient, count = consensus.normal_equations(points, targets, T, camera.intrinsics, limit)
-        if count < 6:
-            break
-        T = se3.exp(np.linalg.solve(H + 1e-9 * np.trace(H) * np.eye(6), gradient)) @ T
-    return T
-
-
-def _score(
-    pixels: NDArray[np.float64],
-    targets: NDArray[np.float64],
-    expected: NDArray[np.float64],
-    areas: NDArray[np.float64],
-    params: ConsensusParams,
-) -> float:
-    """Score, at the best noise level, of a motion that reprojects the points to ``pixels`` (n, 2)."""
-    square = np.sum((pixels - targets) ** 2, axis=1)
-    sums = [
-        gain * (areas * (1 - np.minimum(square / limit**2, 1))).sum()
-        for limit, gain in zip(params.inlier_px, params.gain, strict=True)
-    ]
-    distance = np.linalg.norm(pixels - expected, axis=1).mean() / params.prior_px
-    return float(max(sums) * consensus.motion_prior(distance))
+    """Least-squares motions (g, 4, 4) of the inliers of motions near them, by Gauss-Newton; ``inlier_px`` (g,) is the
+    reprojection error from which on a correspondence is an outlier of each."""
+    for scale in (2.0, 1.0, 1.0):  # a hypothesis comes from three noisy corners: begin with a wider inlier threshold
+        H, gradient, inliers = consensus.linearized(motions, found, scale * inlier_px)
+        determined = inliers >= 6
+        H = H[determined]
+        damped = H + 1e-9 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        steps = np.linalg.solve(damped, gradient[determined][..., None])[..., 0]
+        motions[determined] = se3.exp_all(steps) @ motions[determined]
+    return motions
 
 
 def pixels_at_width(distance: float, camera: Camera) -> float:

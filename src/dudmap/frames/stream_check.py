@@ -172,6 +172,9 @@ def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach
         return 1.0
     before, after = before.reshape(-1)[both], after.reshape(-1)[both]
     ratios = after / before
+    usual = np.count_nonzero((ratios < SMALLEST_FACTOR) & (ratios > 1 / SMALLEST_FACTOR))
+    if 2 * usual > len(ratios):  # so is the median, which takes longer
+        return 1.0
     factor = float(np.median(ratios))
     if max(factor, 1 / factor) < SMALLEST_FACTOR:
         return 1.0

@@ -10,6 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
+ONE, HALF, FOUR, SIX = 1.0, 0.5, 4.0, 6.0
+SMALL = 1e-8
+"""Squared angle below which a rotation is that of the Taylor series."""
 
 
 def hat(omega: Matrix) -> Matrix:
@@ -41,22 +44,46 @@ def exp(xi: Matrix) -> Matrix:
     return T
 
 
+def exp_all(twists: Matrix) -> Matrix:
+    """Rigid motions (n, 4, 4) of twists (n, 6), each as by ``exp``."""
+    v, omega = twists[:, :3, None], twists[:, 3:]
+    theta_squared = np.sum(omega * omega, axis=1)[:, None, None]
+    W = np.zeros((len(twists), 3, 3))
+    W[:, (2, 0, 1), (1, 2, 0)] = omega
+    W[:, (1, 2, 0), (2, 0, 1)] = -omega
+    small = theta_squared < 1e-8  # Taylor series: the closed forms are 0/0 there
+    square = np.where(small, 1.0, theta_squared)
+    theta = np.sqrt(square)
+    a = np.where(small, 1 - theta_squared / 6, np.sin(theta) / theta)
+    b = np.where(small, 0.5 - theta_squared / 24, (1 - np.cos(theta)) / square)
+    c = np.where(small, 1 / 6 - theta_squared / 120, (1 - a) / square)
+    WW = W @ W
+    T = np.tile(np.eye(4), (len(twists), 1, 1))
+    T[:, :3, :3] += a * W + b * WW
+    T[:, :3, 3:] = v + b * (W @ v) + c * (WW @ v)
+    return T
+
+
 def exp_rotation(omega: Matrix) -> Matrix:
     """Rotation matrix (3, 3) of a rotation vector (3,), radians (Rodrigues)."""
-    x, y, z = (float(value) for value in omega)
+    return np.array(rotation_elements(*(float(value) for value in omega))).reshape(3, 3)
+
+
+def rotation_elements(x, y, z):  # noqa: ANN001, ANN201 - plain numbers; Warp compiles the same text
+    """Elements (9,), row by row, of the rotation matrix of a rotation vector (Rodrigues)."""
     theta_squared = x * x + y * y + z * z
-    if theta_squared < 1e-8:
-        a, b = 1 - theta_squared / 6, 0.5 - theta_squared / 24
-    else:
+    a, b = (
+        ONE - theta_squared / SIX,
+        HALF - theta_squared / (FOUR * SIX),
+    )  # Taylor series: the closed forms are 0/0 at 0
+    if theta_squared >= SMALL:
         theta = math.sqrt(theta_squared)
-        a, b = math.sin(theta) / theta, (1 - math.cos(theta)) / theta_squared
-    return np.array(
-        [
-            [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-            [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
-            [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
-        ]
-    )
+        a, b = math.sin(theta) / theta, (ONE - math.cos(theta)) / theta_squared
+    return (
+        ONE - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
+        b * x * y + a * z, ONE - b * (x * x + z * z), b * y * z - a * x,
+        b * x * z - a * y, b * y * z + a * x, ONE - b * (x * x + y * y),
+    )  # fmt: skip
 
 
 def log(T: Matrix) -> Matrix:

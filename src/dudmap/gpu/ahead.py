@@ -5,7 +5,7 @@ from pathlib import Path
 
 import warp as wp  # pyright: ignore[reportMissingImports]
 
-MODULES = tuple(f"dudmap.gpu.kernels.{name}" for name in ("images", "fusion", "surface", "cubes", "rows"))
+MODULES = tuple(f"dudmap.gpu.kernels.{name}" for name in ("images", "fusion", "surface", "descent", "cubes", "rows"))
 """Modules that hold kernels."""
 
 

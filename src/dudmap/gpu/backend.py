@@ -1,32 +1,39 @@
 """The back end for GPUs: Warp kernels behind the operations of ``kernels/backend.py``.
 
 The map stays on the device (``memory.py``); images that the device computed are not uploaded again. What is not ported
-is delegated to the CPU's back end by name: ``color_pixels`` and ``footprint_colors``, which are off by default, and the
-division of a mesh into chunks.
+is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs, and the division of a mesh
+into chunks.
 """
 
 # Warp's annotations name float where any type of number is meant
 # pyright: reportArgumentType=false, reportReturnType=false
 
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.gpu.descent import DeviceDescent
 from dudmap.gpu.kernels import fusion, images, surface
 from dudmap.gpu.kernels.formulas import Motion
 from dudmap.gpu.kernels.structs import Camera, Lattice, struct
 from dudmap.gpu.linearization import Linearization
 from dudmap.gpu.memory import Images, resident, users_of, wrote
 from dudmap.gpu.meshing import extract_surface
+from dudmap.gpu.preparation import Preparation
+from dudmap.gpu.staging import Staging
+from dudmap.gpu.streams import main_queue
 from dudmap.kernels import meshing, raycasting, visibility
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     BLOCK,
+    Damping,
     DepthTiles,
     DepthView,
+    Descent,
     FilterParameters,
     FusedBlocks,
     FusionParameters,
@@ -54,39 +61,33 @@ class WarpBackend:
     def __init__(self, device: str) -> None:
         self.device = device
         self._images = _IMAGES.setdefault(device, Images(device))
+        self._queue = main_queue(device)
+        self._staging = Staging(self._queue)
         self._host = CpuBackend()
-        self.color_pixels, self.footprint_colors = self._host.color_pixels, self._host.footprint_colors
+        self.color_pixels = self._host.color_pixels
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
 
     # -- filter ------------------------------------------------------------------------------------------------------
 
     def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
         """See ``Backend.filter``."""
-        p, shape = parameters, depth.shape
-        image = self._run(images.limit_depth, shape, self._up(depth), p.depth_min, p.depth_max)
-        if p.drop_mixed:
-            image = self._run(images.drop_mixed, shape, image, p.alpha, p.hole_noise, p.steepest)
-        if p.fill_holes:
-            image = self._run(images.fill_holes, shape, image, p.alpha, p.hole_noise)
-        if p.smooth:
-            weights = wp.array(p.spatial_weights, device=self.device)
-            image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 1, 0)
-            image = self._run(images.bilateral_line, shape, image, p.alpha, weights, 0, 1)
-        return self._images.down(image)
+        return self._preparation.filter(depth, parameters)
 
     def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
         """See ``Backend.intensity``."""
-        shares = 0.299 / 255, 0.587 / 255, 0.114 / 255
-        return self._images.down(self._run(images.intensities, rgb.shape[:2], self._up(rgb), *shares))
+        return self._preparation.intensity(rgb)
 
     def halve(
         self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """See ``Backend.halve``."""
-        shape = depth.shape[0] // 2, depth.shape[1] // 2
-        out = self._empty(shape), self._empty(shape)
-        self._launch(images.halve, shape, self._up(depth), self._up(intensity), tolerance, *out)
-        return self._images.down(out[0]), self._images.down(out[1])
+        return self._preparation.halve(depth, intensity, tolerance)
+
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """See ``Backend.footprint_colors``."""
+        return self._preparation.footprint_colors(color, depth, focal, voxel_size)
 
     # -- integrate ---------------------------------------------------------------------------------------------------
 
@@ -134,7 +135,7 @@ class WarpBackend:
             _motion(view.T_grid_camera / np.float32(BLOCK)), stride, lattice, self._bytes(grid.free_count), free_after,
             struct(p.band), BLOCK * p.voxel_size, marks,
         )  # fmt: skip
-        return self._marked(marks).numpy().copy()
+        return self._down(self._marked(marks))
 
     def fuse(
         self,
@@ -162,7 +163,7 @@ class WarpBackend:
         images_ = self._up(view.depth), self._up(color), self._up(weights)
         self._launch(fusion.pack_pixels, (height, width), *images_, p, pixels)
         occupied = wp.zeros(len(visible), dtype=wp.int32, device=self.device)
-        written = candidates[visible.numpy()]
+        written = candidates[self._down(visible)]
         # Nothing may fail for lack of memory from here on: the CPU would fuse the frame a second time.
         self._launch(
             fusion.integrate, (len(visible), BLOCK**3), visible, slots, repeats, float(count), coords, t, camera,
@@ -171,7 +172,7 @@ class WarpBackend:
         )  # fmt: skip
         wrote(grid.geometry, self.device, written)
         wrote(grid.colors, self.device, written)
-        return FusedBlocks(written, occupied.numpy().copy())
+        return FusedBlocks(written, self._down(occupied))
 
     def observe_free(
         self,
@@ -191,8 +192,8 @@ class WarpBackend:
             height, width, BLOCK * p.voxel_size, view.tiles.nearest, view.tiles.valid, struct(p.band), p.depth_max,
             counts, count, free_after, marks,
         )  # fmt: skip
-        found = self._marked(marks).numpy().copy()
-        grid.free_count[:] = counts.numpy()
+        found = self._down(self._marked(marks))
+        grid.free_count[:] = self._down(counts)
         return found
 
     # -- read the map ------------------------------------------------------------------------------------------------
@@ -216,10 +217,34 @@ class WarpBackend:
         recorded = users.get(key)
         if recorded is None or recorded.lattice.cells is not lattice.cells:
             recorded = users[key] = Linearization(
-                self.device, images, _camera(intrinsics), lattice, parameters, float(grid.voxel_size),
+                self._queue, images, _camera(intrinsics), lattice, parameters, float(grid.voxel_size),
                 float(grid.sdf_unit),
             )  # fmt: skip
         return recorded(images, parameters, T_grid_camera)
+
+    def descend(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_world_camera: NDArray[np.float64],
+        damping: Damping,
+        parameters: RegistrationParameters,
+    ) -> Descent | None:
+        """See ``Backend.descend``; the images can no longer be written to."""
+        for image in (depth, intensity, weights):
+            image.flags.writeable = False
+        images, lattice = (self._up(depth), self._up(intensity), self._up(weights)), self._lattice(grid)
+        key = "descend", depth.shape, *intrinsics.tolist(), grid.voxel_size, grid.sdf_unit, damping.limit
+        users = users_of(grid.geometry)
+        steps = users.get(key)
+        if steps is None or steps.lattice.cells is not lattice.cells:
+            steps = users[key] = DeviceDescent(
+                self._queue, depth.shape, _camera(intrinsics), lattice, grid, damping.limit
+            )
+        return steps(images, grid, T_world_camera, damping, parameters)
 
     def sample(
         self,
@@ -237,7 +262,7 @@ class WarpBackend:
             _motion(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count), free_after,
             *out,
         )  # fmt: skip
-        return MapSample(*(image.numpy().copy() for image in out))
+        return MapSample(*(self._down(image) for image in out))
 
     def label(
         self,
@@ -252,7 +277,7 @@ class WarpBackend:
         spin = self._run(images.first_spins, shape, evidence)
         for _ in range(sweeps):
             spin = self._run(images.mean_field_sweep, shape, evidence, z, step, coupling / 8, spin)
-        return self._run(images.probabilities, shape, spin).numpy().copy()
+        return self._down(self._run(images.probabilities, shape, spin))
 
     def raycast(
         self,
@@ -279,7 +304,7 @@ class WarpBackend:
             surface.trace, size, lattice, resident(grid.colors, self.device), camera, _motion(to_lattice), near, far,
             *limits, grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1), depth, color, normals,
         )  # fmt: skip
-        return RaycastResult(depth.numpy().copy(), color.numpy().copy(), normals.numpy().copy())
+        return RaycastResult(self._down(depth), self._down(color), self._down(normals))
 
     def extract_mesh(
         self,
@@ -309,13 +334,17 @@ class WarpBackend:
 
     # -- helpers -----------------------------------------------------------------------------------------------------
 
+    @cached_property
+    def _preparation(self) -> Preparation:
+        """Made at its first use: only a preprocessor's back end has a queue of its own."""
+        return Preparation(self.device, self._images)
+
     def _surface(self, *arguments: Any) -> tuple[NDArray, ...]:  # noqa: ANN401
         """Vertices, faces, colours, normals and first face of each block, as ``meshing.surface`` gives them."""
         return extract_surface(self.device, *arguments)
 
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
-        if np.prod(dim) > 0:
-            wp.launch(kernel, dim=dim, inputs=list(arguments), device=self.device)
+        self._queue.launch(kernel, dim, *arguments)
 
     def _run(self, kernel: Any, shape: tuple[int, ...], *arguments: Any) -> Any:  # noqa: ANN401
         """A float32 image that a kernel, whose last argument it is, computes."""
@@ -327,7 +356,10 @@ class WarpBackend:
         return wp.empty(shape, dtype=dtype, device=self.device)
 
     def _up(self, image: NDArray) -> Any:  # noqa: ANN401
-        return self._images.up(image)
+        return self._images.up(image, self._staging)
+
+    def _down(self, array: Any) -> NDArray:  # noqa: ANN401
+        return self._queue.download(array)
 
     def _bytes(self, array: NDArray[np.uint8]) -> Any:  # noqa: ANN401
         """A copy on the device, also where host and device share their memory: kernels may write to it."""
@@ -351,7 +383,7 @@ class WarpBackend:
             return wp.empty(0, dtype=wp.int32, device=self.device)
         ends = self._empty(marks.size, wp.int32)
         wp.utils.array_scan(marks, ends, inclusive=True)
-        out = self._empty(int(ends[-1:].numpy()[0]), wp.int32)
+        out = self._empty(int(self._down(ends[-1:])[0]), wp.int32)
         self._launch(fusion.compact, marks.size, marks, ends, out)
         return out
 

@@ -16,6 +16,7 @@ from dudmap.extras import need
 from dudmap.gpu import faults
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.stage_timer import Clock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -55,6 +56,20 @@ def make_backend(device: str) -> Backend:
     from dudmap.gpu.fallback import FallbackBackend
 
     return cast("Backend", FallbackBackend(in_warp))
+
+
+def make_clock(device: str) -> Clock | None:
+    """What measures the stages of the processing on a device: the events of a GPU; None for the program's clock.
+
+    Args:
+        device: As of ``make_backend``, which has been called.
+    """
+    name = resolve(device)
+    if not name.startswith("cuda") or faults.is_lost(name):
+        return None
+    from dudmap.gpu.clock import DeviceClock
+
+    return DeviceClock(name)
 
 
 @cache

@@ -12,7 +12,15 @@ from dudmap.gpu.memory import OnDevice
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
-from dudmap.kernels.parameters import DepthView, FusedBlocks, ImageStack, NormalEquations, VoxelGrid
+from dudmap.kernels.parameters import (
+    DepthView,
+    Descent,
+    FusedBlocks,
+    ImageStack,
+    NormalEquations,
+    VoxelGrid,
+    to_lattice,
+)
 
 KEPT_EVERY = 100
 """Fused frames after which the host takes over what the device has written, some ten megabytes for the blocks in view:
@@ -43,6 +51,12 @@ class FallbackBackend:
                 result = getattr(self._on_device, name)(*arguments)
                 if isinstance(result, NormalEquations):
                     return result._replace(residuals=_Residuals(self, result.residuals, arguments))
+                if isinstance(result, Descent) and result.equations is not None:
+                    grid, *images, _damping, parameters = arguments
+                    T_grid_camera = to_lattice(result.T_world_camera, grid.voxel_size, grid.origin)
+                    again = grid, *images[:-1], T_grid_camera, parameters
+                    residuals = _Residuals(self, result.equations.residuals, again)
+                    return result._replace(equations=result.equations._replace(residuals=residuals))
                 if isinstance(result, FusedBlocks):
                     self._keep(arguments[0])
                 return result

@@ -16,6 +16,7 @@ from dudmap.gpu.kernels import surface
 from dudmap.gpu.kernels.formulas import Motion
 from dudmap.gpu.kernels.structs import struct
 from dudmap.gpu.memory import OnDevice
+from dudmap.gpu.streams import Queue
 from dudmap.kernels.parameters import NormalEquations, RegistrationParameters
 from dudmap.kernels.registration import NUM_SUMS, normal_equations
 
@@ -31,7 +32,7 @@ class Linearization:
     """Linearisations of images of one camera with one map.
 
     Args:
-        device: Name of the device.
+        queue: Where they are made.
         images: Depth, intensity and weights (h, w) on the device, of which others may follow.
         camera, lattice: Structures of Warp.
         parameters: Of the cost, of which others may follow.
@@ -40,7 +41,7 @@ class Linearization:
 
     def __init__(
         self,
-        device: str,
+        queue: Queue,
         images: Images,
         camera: Any,  # noqa: ANN401 - structures of Warp
         lattice: Any,  # noqa: ANN401
@@ -48,7 +49,8 @@ class Linearization:
         voxel_size: float,
         sdf_unit: float,
     ) -> None:
-        self.lattice, self._device, self._shape = lattice, device, images[0].shape
+        self.lattice, self._queue, self._shape = lattice, queue, images[0].shape
+        device = queue.device
         self._images, self._parameters = images, parameters
         threads = -(-images[0].size // (PER_THREAD * surface.LANES)) * surface.LANES
         self._partial = wp.empty((NUM_SUMS, threads), dtype=wp.float32, device=device)
@@ -68,7 +70,7 @@ class Linearization:
         self, images: Images, parameters: RegistrationParameters, T_grid_camera: NDArray[np.float32]
     ) -> NormalEquations:
         """Normal equations at a pose (3, 4), whose residuals stay on the device until one of them is read."""
-        residuals = wp.empty((2, *self._shape), dtype=wp.float32, device=self._device)
+        residuals = wp.empty((2, *self._shape), dtype=wp.float32, device=self._queue.device)
         for name, image, last in zip(("depth", "intensity", "weights"), images, self._images, strict=True):
             if image is not last:
                 self._first.set_param_by_name(name, image)
@@ -77,10 +79,9 @@ class Linearization:
         self._images, self._parameters = images, parameters  # the recorded launch holds addresses only
         self._first.set_param_by_name("t", Motion(*T_grid_camera.reshape(-1).tolist()))
         self._first.set_param_by_name("residuals", residuals)
-        self._first.launch()
-        for launch in self._others:
-            launch.launch()
-        return normal_equations(self._sums.numpy().copy(), OnDevice(residuals))
+        for launch in (self._first, *self._others):
+            self._queue.repeat(launch)
+        return normal_equations(self._queue.download(self._sums), OnDevice(residuals, self._queue))
 
     def _recorded(self, kernel: Any, dim: Any, *arguments: Any) -> Any:  # noqa: ANN401
-        return wp.launch(kernel, dim=dim, inputs=list(arguments), device=self._device, record_cmd=True)
+        return wp.launch(kernel, dim=dim, inputs=list(arguments), device=self._queue.device, record_cmd=True)

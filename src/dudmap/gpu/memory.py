@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportReturnType=false
 
 import weakref
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -13,13 +14,9 @@ from numpy.typing import NDArray
 from dudmap.gpu import faults
 from dudmap.gpu.faults import DeviceFullError
 from dudmap.gpu.kernels import rows as kernels
+from dudmap.gpu.staging import WARP_TYPES, Staging
+from dudmap.gpu.streams import Queue, main_queue
 from dudmap.kernels.mirror import Mirror
-
-WARP_TYPES = {
-    np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64, np.dtype(np.int32): wp.int32,
-    np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
-}  # fmt: skip
-
 
 SPARE = 1.2
 """Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
@@ -28,6 +25,8 @@ GROWTH = 1.15
 on a device it does."""
 USED = 0.8
 """Share of the rows to use where no more fit: the rest is for blocks that come into view before others can leave."""
+CHECKS = 2
+"""So often the memory is asked for with one size of the map: geometry and colours do not grow at the same moment."""
 PIECE = 4096
 """Rows that are moved at once; their buffers belong to the copy, so that a full device can still be read."""
 
@@ -87,6 +86,7 @@ class RowCopy:
         self._all_stale = False
         self._written: list[NDArray] = []  # rows that the device wrote
         self._value = 0  # of rows that neither side has written
+        self._checked_rows: tuple[int, ...] = ()  # on the device when its memory was asked for last
         self._upload()
         self._numbers = wp.empty(PIECE, dtype=wp.int32, device=device)
         self._buffer = wp.empty((PIECE, self._width), dtype=wp.int32, device=device)
@@ -135,7 +135,7 @@ class RowCopy:
     def _pull(self, rows: NDArray[np.int32], host: NDArray[np.int32]) -> None:
         wp.copy(self._numbers, wp.array(rows, dtype=wp.int32, device="cpu", copy=False), count=len(rows))
         self._move(kernels.gather, self._numbers, self._rows(), self._buffer, len(rows))
-        host[rows] = self._buffer[: len(rows)].numpy()
+        host[rows] = main_queue(self.device).download(self._buffer[: len(rows)])
 
     def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.int32]:
         """See ``mirror.DeviceCopy``."""
@@ -144,16 +144,23 @@ class RowCopy:
                 places = wp.array(np.stack([rows, columns], axis=1).astype(np.int32), device=self.device)
                 out = wp.empty(len(rows), dtype=wp.int32, device=self.device)
                 wp.launch(kernels.take, dim=len(rows), inputs=[places, self.current], outputs=[out], device=self.device)
-                return out.numpy().copy()
+                return main_queue(self.device).download(out)
             except Exception as error:
                 faults.handle(error, self.device, "reading the map")
         self.pull(self._host)
         return self._wide(self._host)[rows, columns]
 
     def max_rows(self) -> int | None:
-        """See ``mirror.DeviceCopy``; it is told that the map has reached the bound."""
-        free, own = free_memory(self.device), 2 * len(self.array) * self._row_bytes()  # geometry and colours
+        """See ``mirror.DeviceCopy``; it is told that the map has reached the bound.
+
+        The device must finish all its work to answer, so that it is asked after the map has grown only.
+        """
+        size = len(self.array)
+        if self._checked_rows == (size,) * CHECKS:
+            return None
+        free, own = free_memory(self.device), 2 * size * self._row_bytes()  # geometry and colours
         if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
+            self._checked_rows = (*self._checked_rows[1 - CHECKS :], size)
             return None
         rows = int(USED * len(self.array))
         faults.tell(
@@ -245,44 +252,72 @@ class Images:
 
     def __init__(self, device: str) -> None:
         self.device = device
-        self._twins: dict[int, tuple[weakref.ref, Any]] = {}
+        self._twins: dict[int, tuple[weakref.ref, Any, bool]] = {}
 
-    def up(self, array: NDArray) -> Any:  # noqa: ANN401 - an array of Warp
-        """The array on the device."""
+    def up(self, array: NDArray, staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
+        """The array on the device, for the main queue, to which the staging belongs."""
         known = self._twins.get(id(array))
         if known is not None and known[0]() is array:
             return known[1]
-        source = np.ascontiguousarray(array)
-        twin = wp.array(source, dtype=WARP_TYPES[source.dtype], device=self.device)
+        twin = wp.empty(array.shape, dtype=WARP_TYPES[array.dtype], device=self.device)
+        staging.upload(array, twin)
         if not array.flags.writeable and array.base is None:
-            self._remember(array, twin)
+            self.remember(array, twin, uploading=self.device != "cpu")
         return twin
 
     def down(self, twin: Any) -> NDArray:  # noqa: ANN401
         """A copy in the host's memory, read-only, so that the device's array stays its equal."""
-        array = twin.numpy()
-        if self.device == "cpu":
-            array = array.copy()  # NumPy and Warp would share the memory
+        array = main_queue(self.device).download(twin)
         array.flags.writeable = False
-        self._remember(array, twin)
+        self.remember(array, twin)
         return array
 
-    def _remember(self, array: NDArray, twin: Any) -> None:  # noqa: ANN401
+    def twin(self, array: NDArray) -> Any:  # noqa: ANN401
+        """The device's equal of an array of the host that is ready for every queue; None where there is none."""
+        known = self._twins.get(id(array))
+        return None if known is None or known[0]() is not array or known[2] else known[1]
+
+    def remember(
+        self,
+        array: NDArray,
+        twin: Any,  # noqa: ANN401
+        give_back: Callable[[Any], None] | None = None,
+        *,
+        uploading: bool = False,
+    ) -> None:
+        """The arrays are equal as long as that of the host exists; the device's is given back afterwards.
+
+        Args:
+            array, twin: Of the host and of the device.
+            give_back: Receives the device's array.
+            uploading: The main queue may still be copying.
+        """
         key = id(array)
-        self._twins[key] = weakref.ref(array, lambda _: self._twins.pop(key, None)), twin
+
+        def forget(_: object) -> None:
+            self._twins.pop(key, None)
+            if give_back is not None:
+                give_back(twin)
+
+        self._twins[key] = weakref.ref(array, forget), twin, uploading
 
 
 class OnDevice:
-    """Images (n, h, w) on a device, of which each is downloaded when it is asked for."""
+    """Images (n, h, w) on a device, of which each is downloaded when it is asked for.
 
-    def __init__(self, images: Any) -> None:  # noqa: ANN401
-        self._images = images
+    Args:
+        images: An array of Warp.
+        queue: What writes it.
+    """
+
+    def __init__(self, images: Any, queue: Queue) -> None:  # noqa: ANN401
+        self._images, self._queue = images, queue
         self._read: dict[int, NDArray] = {}
 
     def __getitem__(self, number: int) -> NDArray:
         if number not in self._read:
-            self._read[number] = np.array(self._images[number].numpy())
+            self._read[number] = self._queue.download(self._images[number])
         return self._read[number]
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:  # noqa: ANN401
-        return np.asarray(self._images.numpy(), dtype)
+        return np.asarray(self._queue.download(self._images), dtype)

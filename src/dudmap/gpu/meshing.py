@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.gpu.kernels import cubes
 from dudmap.gpu.memory import resident
+from dudmap.gpu.streams import Queue, main_queue
 from dudmap.kernels.links import links
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import MeshParameters
@@ -31,9 +32,10 @@ def extract_surface(
     n = len(slots)
     slots, near, behind, row_of = links(slots, neighbours, len(coords))
 
+    queue = main_queue(device)
+
     def launch(kernel: Any, rows: int, *arguments: Any) -> None:  # noqa: ANN401
-        if rows:
-            wp.launch(kernel, dim=(rows, 512), inputs=list(arguments), device=device)
+        queue.launch(kernel, (rows, 512), *arguments)
 
     def up(array: NDArray) -> Any:  # noqa: ANN401
         return wp.array(array, device=device)
@@ -49,8 +51,8 @@ def extract_surface(
     jump = int(min(parameters.max_jump / parameters.sdf_unit, 1 << 20))
     launch(cubes.classify, num_meshed, words, near_, least, jump, count, cases, triangles)
     launch(cubes.find_vertices, n, words, near_, behind_, cases, flags, owned)
-    first, num_vertices = _offsets(owned)
-    first_face, num_faces = _offsets(triangles)
+    first, num_vertices = _offsets(owned, queue)
+    first_face, num_faces = _offsets(triangles, queue)
     vertices = wp.empty((num_vertices, 3), dtype=wp.float32, device=device)
     normals = wp.empty((num_vertices, 3), dtype=wp.float32, device=device)
     paints = wp.empty((num_vertices, 3), dtype=wp.uint8, device=device)
@@ -60,15 +62,15 @@ def extract_surface(
         first, float(parameters.voxel_size), vertices, paints, normals,
     )  # fmt: skip
     launch(cubes.write_faces, num_meshed, near_, rows, cases, flags, first, first_face, count, table, faces)
-    begin = first_face.numpy()[:, 0].astype(np.int64) if n else np.zeros(0, np.int64)
-    arrays = (array.numpy().copy() for array in (vertices, faces, paints, normals))
+    begin = queue.download(first_face)[:, 0].astype(np.int64) if n else np.zeros(0, np.int64)
+    arrays = (queue.download(array) for array in (vertices, faces, paints, normals))
     return *arrays, np.concatenate([begin, [num_faces]]).astype(np.int64)
 
 
-def _offsets(counts: Any) -> tuple[Any, int]:  # noqa: ANN401
+def _offsets(counts: Any, queue: Queue) -> tuple[Any, int]:  # noqa: ANN401
     """Number of the first item of each element of (n, 512) counts, and the number of all items."""
     out = wp.zeros_like(counts)
     if counts.size == 0:
         return out, 0
     wp.utils.array_scan(counts.reshape((counts.size,)), out.reshape((out.size,)), inclusive=False)
-    return out, int(out.numpy()[-1, -1] + counts.numpy()[-1, -1])
+    return out, int(queue.download(out[-1])[-1] + queue.download(counts[-1])[-1])

@@ -8,9 +8,11 @@ from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGri
 from dudmap.kernels.pixel import ray
 from dudmap.kernels.raycasting import (
     BAND,
+    FAR,
     INFINITE,
     TILE,
     corner_gradient,
+    inside_window,
     motions,
     step_length,
     tile_depths,
@@ -21,8 +23,6 @@ from dudmap.kernels.threads import bands, kernel, run_bands
 from dudmap.kernels.voxel import sdf_steps
 
 f32 = np.float32
-FAR = f32(2)
-"""Distance from the surface, voxels, beyond which the nearest voxel's value replaces the interpolated one."""
 
 
 @kernel
@@ -56,13 +56,7 @@ def _trace(window, shape, tree, voxels, o, d, t, end, unit, least, corners):
         one / d[0] if d[0] != zero else INFINITE, one / d[1] if d[1] != zero else INFINITE,
         one / d[2] if d[2] != zero else INFINITE,
     )  # fmt: skip
-    for axis in range(3):  # stay inside the window
-        last = f32(8 * shape[axis] - 1)
-        if d[axis] != zero:
-            a, b = -o[axis] / d[axis], (last - o[axis]) / d[axis]
-            t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
-        elif o[axis] < zero or o[axis] >= last:
-            return -one
+    t, end = inside_window(shape, o, d, t, end, nudge)
     t_before, before = -one, -one
     while t < end:
         x, y, z = o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2]

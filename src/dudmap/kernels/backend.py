@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
+    Damping,
     DepthView,
+    Descent,
     FilterParameters,
     FusedBlocks,
     FusionParameters,
@@ -195,6 +197,26 @@ class Backend(Protocol):
             intrinsics: (4,) float32 fx, fy, cx, cy.
             T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
             parameters: Of the cost.
+        """
+        ...
+
+    def descend(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_world_camera: NDArray[np.float64],
+        damping: Damping,
+        parameters: RegistrationParameters,
+    ) -> Descent | None:
+        """Levenberg-Marquardt steps from a pose (4, 4) on, without the host between them.
+
+        Images and parameters as of ``linearize``; the steps are those of ``Tracker``.
+
+        Returns:
+            None where a device does not run the loop: then the caller does, with ``linearize``.
         """
         ...
 

@@ -7,8 +7,8 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.threads import bands, kernel, run_bands
 
-BAND = 64
-"""Hypotheses that one thread scores in one go."""
+BAND, LINEARIZED_BAND = 64, 6
+"""Motions that one thread scores, and linearises, in one go."""
 
 
 class ConsensusParams(NamedTuple):
@@ -25,111 +25,122 @@ class ConsensusParams(NamedTuple):
     prior_px: float
 
 
-@kernel
-def inlier_score(squared_error):
-    """MSAC score 1 - min(e^2, 1) of a squared error in units of the inlier threshold (Torr and Zisserman 2000)."""
-    return 1.0 - min(squared_error, 1.0)
+class LinearizedMotions(NamedTuple):
+    """Reprojection errors of motions, linearised at each of them.
 
-
-@kernel
-def motion_prior(distance):
-    """Prior 0.5 + 0.5 / (1 + d^2) of a motion whose image positions lie ``d prior_px`` off the expected ones."""
-    return 0.5 + 0.5 / (1.0 + distance * distance)
-
-
-def msac_scores(
-    twists: NDArray[np.floating],
-    jacobian: NDArray[np.float64],
-    flow: NDArray[np.float64],
-    expected_flow: NDArray[np.float64],
-    weights: NDArray[np.float64],
-    params: ConsensusParams,
-) -> NDArray[np.float64]:
-    """Scores (g, k) of motion hypotheses at each noise level.
-
-    They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) times the prior of the motion.
-
-    The error e_n is the distance of the linearised flow ``J_n twist`` from the measured one, the argument of the prior
-    the mean distance of ``J_n twist`` from the expected flow.
-
-    Args:
-        twists: (g, 6) hypotheses (v, omega), metres and radians.
-        jacobian: (n, 2, 6) derivative of the pixels of n points by a twist.
-        flow: (n, 2) measured displacement of their pixels.
-        expected_flow: (n, 2) displacement by the expected motion, pixels.
-        weights: (n,) weight of each point.
-        params: Scales of errors and prior.
+    Attributes:
+        H: (g, 6, 6), and gradient: (g, 6) normal equations of the inliers, whose solution ``solve(H, gradient)`` is the
+            twist (v, omega) of the update exp(twist) @ T.
+        inliers: (g,) int64, number of the inliers.
     """
-    by_axis = np.ascontiguousarray(jacobian.transpose(1, 2, 0))
-    measured, expected = np.ascontiguousarray(flow.T), np.ascontiguousarray(expected_flow.T)
-    twists = np.ascontiguousarray(twists)
-    scores = np.empty((len(twists), len(params.gain)))
+
+    H: NDArray[np.float64]
+    gradient: NDArray[np.float64]
+    inliers: NDArray[np.int64]
+
+
+class Correspondences(NamedTuple):
+    """Points and where they are found after a motion.
+
+    Attributes:
+        points: (3, n) float64, metres, first camera's frame.
+        targets: (2, n) float64, their pixels in the second image.
+        expected: (2, n) float64, their pixels there by the expected motion.
+        weights: (n,) float64, weight of each point in a score.
+        intrinsics: (4,) fx, fy, cx, cy.
+    """
+
+    points: NDArray[np.float64]
+    targets: NDArray[np.float64]
+    expected: NDArray[np.float64]
+    weights: NDArray[np.float64]
+    intrinsics: NDArray[np.float32]
+
+
+def msac_scores(motions: NDArray[np.float64], found: Correspondences, params: ConsensusParams) -> NDArray[np.float64]:
+    """MSAC scores (g, k) of motions (g, 4, 4) at each noise level (Torr and Zisserman 2000), times a prior.
+
+    They are gain * sum_n w_n (1 - min(e_n^2 / inlier_px^2, 1)) * (0.5 + 0.5 / (1 + (d / prior_px)^2)), where e_n is the
+    reprojection error and d the mean distance of the pixels from the expected ones.
+    """
+    scores = np.empty((len(motions), len(params.gain)))
     run_bands(
-        lambda start, stop: _score_band(start, stop, twists, by_axis, measured, expected, weights, params, scores),
-        bands(len(twists), BAND),
+        lambda start, stop: _score_band(start, stop, motions, *found, params, scores),
+        bands(len(motions), BAND),
     )
     return scores
 
 
-@kernel
-def _score_band(start, stop, twists, jacobian, flow, expected_flow, weights, params, scores):
-    """Scores of the hypotheses ``start`` to ``stop``; jacobian (2, 6, n), flows (2, n)."""
-    levels = scores.shape[1]
-    by_square = np.empty(levels)
-    for k in range(levels):
-        by_square[k] = 1.0 / (params.inlier_px[k] * params.inlier_px[k])
-    for g in range(start, stop):
-        a, b, c = twists[g, 0], twists[g, 1], twists[g, 2]
-        d, e, f = twists[g, 3], twists[g, 4], twists[g, 5]
-        distance = 0.0
-        scores[g] = 0.0
-        for n in range(weights.size):
-            u = jacobian[0, 0, n] * a + jacobian[0, 1, n] * b + jacobian[0, 2, n] * c
-            u += jacobian[0, 3, n] * d + jacobian[0, 4, n] * e + jacobian[0, 5, n] * f
-            v = jacobian[1, 0, n] * a + jacobian[1, 1, n] * b + jacobian[1, 2, n] * c
-            v += jacobian[1, 3, n] * d + jacobian[1, 4, n] * e + jacobian[1, 5, n] * f
-            du, dv = u - flow[0, n], v - flow[1, n]
-            square = du * du + dv * dv
-            for k in range(levels):
-                scores[g, k] += weights[n] * inlier_score(square * by_square[k])
-            du, dv = u - expected_flow[0, n], v - expected_flow[1, n]
-            distance += np.sqrt(du * du + dv * dv)
-        prior = motion_prior(distance / (params.prior_px * weights.size))
-        for k in range(levels):
-            scores[g, k] *= params.gain[k] * prior
+def linearized(
+    motions: NDArray[np.float64], found: Correspondences, inlier_px: NDArray[np.float64]
+) -> LinearizedMotions:
+    """Normal equations of the reprojection error of motions (g, 4, 4); points are left out of them from an error of
+    ``inlier_px`` (g,) on, pixels."""
+    g = len(motions)
+    out = LinearizedMotions(np.zeros((g, 6, 6)), np.zeros((g, 6)), np.zeros(g, np.int64))
+    run_bands(
+        lambda start, stop: _linearize_band(
+            start, stop, motions, inlier_px, found.points, found.targets, found.intrinsics, *out
+        ),
+        bands(g, LINEARIZED_BAND),
+    )
+    return out
 
 
 @kernel
-def normal_equations(points, targets, T, intrinsics, inlier_px):
-    """Gauss-Newton normal equations of the reprojection error of the inliers of a motion.
-
-    Args:
-        points: (n, 3) float64, metres, first camera's frame.
-        targets: (n, 2) float64, their pixels in the second image.
-        T: (4, 4) float64, the motion.
-        intrinsics: (4,) fx, fy, cx, cy.
-        inlier_px: Reprojection error from which on a point is left out, pixels.
-
-    Returns:
-        H (6, 6) and g (6,), whose solution ``solve(H, g)`` is the twist (v, omega) of the update exp(twist) @ T, and
-        the number of inliers.
-    """
+def _score_band(start, stop, motions, points, targets, expected, weights, intrinsics, params, scores):
+    """Scores of the motions ``start`` to ``stop``."""
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    H, gradient = np.zeros((6, 6)), np.zeros(6)
-    count = 0
-    for n in range(points.shape[0]):
-        a, b, c = points[n, 0], points[n, 1], points[n, 2]
-        z = max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
-        x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) / z
-        y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) / z
-        du, dv = targets[n, 0] - fx * x - cx, targets[n, 1] - fy * y - cy
-        if not du * du + dv * dv < inlier_px * inlier_px:
-            continue
-        count += 1
-        along_u = (fx / z, 0.0, -fx * x / z, -fx * x * y, fx * (1.0 + x * x), -fx * y)
-        along_v = (0.0, fy / z, -fy * y / z, -fy * (1.0 + y * y), fy * x * y, fy * x)
+    square = np.empty(weights.size)
+    for g in range(start, stop):
+        T, distance = motions[g], 0.0
+        for n in range(weights.size):
+            a, b, c = points[0, n], points[1, n], points[2, n]
+            by_z = 1.0 / max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
+            u = fx * (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) * by_z + cx
+            v = fy * (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) * by_z + cy
+            du, dv = u - targets[0, n], v - targets[1, n]
+            square[n] = du * du + dv * dv
+            du, dv = u - expected[0, n], v - expected[1, n]
+            distance += np.sqrt(du * du + dv * dv)
+        distance /= params.prior_px * weights.size
+        prior = 0.5 + 0.5 / (1.0 + distance * distance)
+        for k in range(scores.shape[1]):
+            by_square, total = 1.0 / (params.inlier_px[k] * params.inlier_px[k]), 0.0
+            for n in range(weights.size):
+                total += weights[n] * (1.0 - min(square[n] * by_square, 1.0))
+            scores[g, k] = total * params.gain[k] * prior
+
+
+@kernel
+def _linearize_band(start, stop, motions, inlier_px, points, targets, intrinsics, H, gradient, inliers):
+    """Write what ``LinearizedMotions`` holds of the motions ``start`` to ``stop``."""
+    fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
+    size = points.shape[1]
+    rows = np.zeros((7, 2, size))  # derivatives of the pixels u, v by the twist, and their errors; of outliers 0
+    products = rows.reshape(7, 2 * size)
+    for g in range(start, stop):
+        T, limit, count = motions[g], inlier_px[g] * inlier_px[g], 0.0
+        for n in range(size):
+            a, b, c = points[0, n], points[1, n], points[2, n]
+            by_z = 1.0 / max(T[2, 0] * a + T[2, 1] * b + T[2, 2] * c + T[2, 3], 1e-6)
+            x = (T[0, 0] * a + T[0, 1] * b + T[0, 2] * c + T[0, 3]) * by_z
+            y = (T[1, 0] * a + T[1, 1] * b + T[1, 2] * c + T[1, 3]) * by_z
+            du, dv = targets[0, n] - fx * x - cx, targets[1, n] - fy * y - cy
+            inlier = 1.0 if du * du + dv * dv < limit else 0.0
+            count += inlier
+            p, q = inlier * fx, inlier * fy
+            rows[0, 0, n], rows[2, 0, n], rows[3, 0, n] = p * by_z, -p * x * by_z, -p * x * y
+            rows[4, 0, n], rows[5, 0, n], rows[6, 0, n] = p * (1.0 + x * x), -p * y, du
+            rows[1, 1, n], rows[2, 1, n], rows[3, 1, n] = q * by_z, -q * y * by_z, -q * (1.0 + y * y)
+            rows[4, 1, n], rows[5, 1, n], rows[6, 1, n] = q * x * y, q * x, dv
+        inliers[g] = np.int64(count)
         for i in range(6):
-            gradient[i] += along_u[i] * du + along_v[i] * dv
-            for j in range(6):
-                H[i, j] += along_u[i] * along_u[j] + along_v[i] * along_v[j]
-    return H, gradient, count
+            for j in range(i, 7):
+                total = 0.0
+                for n in range(2 * size):
+                    total += products[i, n] * products[j, n]
+                if j == 6:
+                    gradient[g, i] = total
+                else:
+                    H[g, i, j] = H[g, j, i] = total

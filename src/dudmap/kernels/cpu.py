@@ -3,6 +3,8 @@
 Bands do not depend on the number of threads, and sums are added in their order (``threads.py``).
 """
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -325,6 +327,9 @@ class CpuBackend:
             ranges, list(sums),
         )  # fmt: skip
         return registration.normal_equations(sums.sum(axis=0), residuals)
+
+    def descend(self, *_: Any, **__: Any) -> None:
+        """See ``Backend.descend``: the loop is the caller's."""
 
     def sample(
         self,

@@ -13,12 +13,17 @@ i64 = np.int64
 
 
 @kernel
+def _slot_at(window, shape, bx, by, bz):
+    """Slot of a block of the window, -1 outside of it; negative where there is none."""
+    if bx < 0 or by < 0 or bz < 0 or bx >= shape[0] or by >= shape[1] or bz >= shape[2]:
+        return np.int32(-1)
+    return window[(bx * shape[1] + by) * shape[2] + bz]
+
+
+@kernel
 def _half_word(window, shape, children1, voxels1, i, j, k):
     """Word of the voxel (i, j, k) of the lattice with half the spacing; 0 = none."""
-    bx, by, bz = i >> 4, j >> 4, k >> 4
-    if bx < 0 or by < 0 or bz < 0 or bx >= shape[0] or by >= shape[1] or bz >= shape[2]:
-        return np.int32(0)
-    slot = window[(bx * shape[1] + by) * shape[2] + bz]
+    slot = _slot_at(window, shape, i >> 4, j >> 4, k >> 4)
     if slot < 0 or slot >= len(children1):
         return np.int32(0)
     child = children1[slot, 4 * ((i >> 3) & 1) + 2 * ((j >> 3) & 1) + ((k >> 3) & 1)]
@@ -28,10 +33,7 @@ def _half_word(window, shape, children1, voxels1, i, j, k):
 @kernel
 def _quarter_word(window, shape, children1, children2, voxels2, i, j, k):
     """Word of the voxel (i, j, k) of the lattice with a quarter of the spacing; 0 = none."""
-    bx, by, bz = i >> 5, j >> 5, k >> 5
-    if bx < 0 or by < 0 or bz < 0 or bx >= shape[0] or by >= shape[1] or bz >= shape[2]:
-        return np.int32(0)
-    slot = window[(bx * shape[1] + by) * shape[2] + bz]
+    slot = _slot_at(window, shape, i >> 5, j >> 5, k >> 5)
     if slot < 0 or slot >= len(children1):
         return np.int32(0)
     child = children1[slot, 4 * ((i >> 4) & 1) + 2 * ((j >> 4) & 1) + ((k >> 4) & 1)]

@@ -213,6 +213,15 @@ class VoxelGrid(NamedTuple):
         return self._replace(window=window, geometry=geometry, colors=colors)
 
 
+def to_lattice(
+    T_world_camera: NDArray[np.float64], voxel_size: float, origin: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Camera to the lattice of a window (3, 4) float32: voxels, origin at the first voxel of its first block (3,)."""
+    T = T_world_camera[:3] / voxel_size
+    T[:, 3] -= origin * BLOCK
+    return T.astype(np.float32)
+
+
 class DepthTiles(NamedTuple):
     """Nearest and farthest reading and share of pixels with one, per tile of 8x8 pixels.
 
@@ -286,6 +295,44 @@ class NormalEquations(NamedTuple):
     weight: float
     chi_square: float
     residuals: ImageStack
+
+
+class Damping(NamedTuple):
+    """Where the Levenberg-Marquardt steps of a registration begin, and when they end (``kernels/damping.py``).
+
+    Attributes:
+        H, b, cost: Normal equations at the first pose, as of ``NormalEquations``.
+        basis: (6, m) directions along which the pose may move.
+        damping: First damping.
+        limit: Largest number of steps that are tried.
+        stop: Norm of a step (m, rad) below which it is the last one.
+        stop_gain: Relative change of the cost below which a short step is.
+    """
+
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    cost: float
+    basis: NDArray[np.float64]
+    damping: float
+    limit: int
+    stop: float
+    stop_gain: float
+
+
+class Descent(NamedTuple):
+    """Result of the Levenberg-Marquardt steps of a registration.
+
+    Attributes:
+        T_world_camera: (4, 4) the last accepted pose.
+        equations: Normal equations of the last accepted step; None where they are the first ones.
+        iterations: Number of linearisations.
+        settled: Whether a stop criterion was met.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    equations: NormalEquations | None
+    iterations: int
+    settled: bool
 
 
 class MapSample(NamedTuple):

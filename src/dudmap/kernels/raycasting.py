@@ -115,6 +115,21 @@ def to_block_boundary(p, d, inverse):
     return (block + np.float32(8) - p) * inverse if d >= np.float32(0) else (block - p) * inverse
 
 
+@kernel
+def inside_window(shape, o, d, t, end, nudge):
+    """Part of the ray ``o + t d`` between ``t`` and ``end`` that lies in the window less its last voxels and
+    ``nudge``; its end is before its beginning if there is none."""
+    zero = np.float32(0)
+    for axis in range(3):
+        last = np.float32(8 * shape[axis] - 1)
+        if d[axis] != zero:
+            a, b = -o[axis] / d[axis], (last - o[axis]) / d[axis]
+            t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
+        elif o[axis] < zero or o[axis] >= last:
+            end = -INFINITE
+    return t, end
+
+
 @written_out
 def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
     """Gradient of the trilinear interpolation of eight corners, 4 dx + 2 dy + dz, at (fx, fy, fz) in [0, 1]^3."""
@@ -148,13 +163,7 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
     speed = np.sqrt(dx * dx + dy * dy + dz * dz)
     per_voxel = one / speed
     nudge = np.float32(1e-2) * per_voxel
-    for axis in range(3):  # stay inside the window
-        last = np.float32(8 * shape[axis] - 1)
-        if d[axis] != zero:
-            a, b = -o[axis] / d[axis], (last - o[axis]) / d[axis]
-            t, end = max(t, min(a, b) + nudge), min(end, max(a, b) - nudge)
-        elif o[axis] < zero or o[axis] >= last:
-            return np.float32(-1)
+    t, end = inside_window(shape, o, d, t, end, nudge)
     rx = one / dx if dx != zero else INFINITE
     ry = one / dy if dy != zero else INFINITE
     rz = one / dz if dz != zero else INFINITE

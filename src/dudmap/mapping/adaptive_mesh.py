@@ -9,13 +9,11 @@ from dudmap.geometry.mesh import Mesh
 from dudmap.kernels.dual_contouring import contour_blocks, split_polygons
 from dudmap.kernels.parameters import MeshParameters
 from dudmap.kernels.threads import bands, run_bands
-from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood, two_levels
+from dudmap.mapping.voxel_blocks import VoxelBlocks
 
 BAND = 64
 """Blocks of one band."""
-NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
-NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
 
 
 def extract_groups(
@@ -67,17 +65,13 @@ def _contours(
     row_of = np.full(len(blocks.entry_of) + 1, -1, dtype=np.int32)
     row_of[slots] = np.arange(len(slots), dtype=np.int32)
     rows = row_of[near]  # -1 is the last element
-    fine = [level.blocks for level in levels]
-    geometry, colors = blocks.geometry, blocks.colors
-    geometry1, geometry2 = [*(level.geometry for level in fine), NO_VOXELS, NO_VOXELS][:2]
-    colors1, colors2 = [*(level.colors for level in fine), NO_VOXELS, NO_VOXELS][:2]
-    children1, children2 = [*(level.children for level in levels), NO_CHILDREN, NO_CHILDREN][:2]
+    (children1, children2), (geometry1, geometry2), (colors1, colors2) = two_levels(levels)
     coords = np.ascontiguousarray(blocks.slot_coords[slots])
     least = max(int(parameters.min_weight), 1)
     parts = run_bands(
         lambda start, stop: contour_blocks(
-            start, stop, slots, near, rows, meshed, coords, geometry, geometry1, geometry2, children1, children2,
-            colors, colors1, colors2, least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
+            start, stop, slots, near, rows, meshed, coords, blocks.geometry, geometry1, geometry2, children1, children2,
+            blocks.colors, colors1, colors2, least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
             np.float32(parameters.max_jump),
         ),
         bands(len(slots), BAND),

@@ -18,8 +18,8 @@ from dudmap.kernels.adaptive_raycasting import raycast
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
-from dudmap.mapping.adaptive_mesh import NO_CHILDREN, NO_VOXELS, extract_groups
-from dudmap.mapping.fine_blocks import FineBlocks
+from dudmap.mapping.adaptive_mesh import extract_groups
+from dudmap.mapping.fine_blocks import FineBlocks, two_levels
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.map_file import MapContent
 from dudmap.mapping.memory_limit import MemoryLimit
@@ -221,9 +221,7 @@ class AdaptiveVolume(TsdfVolume):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        tree = (*(level.children for level in self.levels), NO_CHILDREN)[:2]
-        geometry = (*(level.blocks.geometry for level in self.levels), NO_VOXELS)[:2]
-        colors = (*(level.blocks.colors for level in self.levels), NO_VOXELS)[:2]
+        tree, geometry, colors = two_levels(self.levels)
         return raycast(self.grid, tree, geometry, colors, T_world_camera, camera.intrinsics, camera.shape, parameters)
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from dudmap.errors import MapError
 from dudmap.kernels import hashing
 from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.parameters import to_lattice
 from dudmap.mapping.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
 
 MARGIN = 3
@@ -36,18 +37,20 @@ class BlockWindow:
         size = 16 * int(np.ceil(cells / 16))
         self.block_size = block_size
         self.shape = np.array([size, size, size], dtype=np.int64)
-        self.cells = np.full(size**3, -1, dtype=np.int32)
+        self.cells = np.empty(size**3, dtype=np.int32)  # takes no memory before the first ``fill``
         self.mirror = Mirror(self.cells)
         self.stamps = np.zeros(size**3, dtype=np.int32)
         self.near = np.empty(0, dtype=np.int32)
         self.origin: NDArray[np.int64] | None = None
 
-    def moved(self, middle: NDArray[np.float64]) -> NDArray[np.int64] | None:
+    def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
         """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
-        away, so that the window can stay."""
+        away, so that the window can stay. An empty window that replaces one which was ``left`` (3,) goes back there
+        then."""
         origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
-        stays = self.origin is not None and np.abs(origin - self.origin).max() <= MARGIN
-        return None if stays else origin
+        last = self.origin if left is None else left
+        stays = last is not None and np.abs(origin - last).max() <= MARGIN
+        return left if stays else origin
 
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""
@@ -68,9 +71,7 @@ class BlockWindow:
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
         assert self.origin is not None
-        T = T_world_camera[:3] / (self.block_size / BLOCK)
-        T[:, 3] -= self.origin * BLOCK
-        return T.astype(np.float32)
+        return to_lattice(T_world_camera, self.block_size / BLOCK, self.origin)
 
     def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
         """Allocate voxels for cells (n,) that have none."""

@@ -1,12 +1,17 @@
 """Blocks of half the voxel size inside the blocks of a coarser level of the map."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.mirror import grown
 from dudmap.kernels.parameters import VoxelGrid
-from dudmap.mapping.voxel_blocks import VoxelBlocks
+from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
+NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
+NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
+"""Stand for a level that a map does not have."""
 OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
 """Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
 NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
@@ -122,3 +127,12 @@ def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.i
     """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
     coords = blocks.slot_coords[slots][:, None] + NEIGHBOURHOOD
     return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
+
+
+def two_levels(levels: Sequence[FineBlocks]) -> tuple[tuple[NDArray[np.int32], NDArray[np.int32]], ...]:
+    """Children (slots, 8), voxels (slots, 512) and colours (slots, 512) of two levels each, as the kernels take them;
+    those of a level that does not exist have no children."""
+    missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
+    arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels] + missing
+    first, second = arrays
+    return tuple(zip(first, second, strict=True))

@@ -113,6 +113,7 @@ class TsdfVolume:
         self.blocks = VoxelBlocks() if self.pager is None else self.pager.new_blocks()
         if self.pager is not None:
             self.pager.clear()
+        self._left: NDArray[np.int64] | None = None  # where the window was when all blocks left the memory
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
 
@@ -203,7 +204,7 @@ class TsdfVolume:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
-        self._frame_number, self.map_id = other._frame_number, other.map_id
+        self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
 
     def for_camera(
         self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
@@ -233,15 +234,17 @@ class TsdfVolume:
 
     def page_out(self) -> None:
         """Have all blocks wait on disk, where the map may do so, until they are needed again."""
-        if self.pager is not None:
+        if self.pager is not None and self.blocks.num_entries:
             self.blocks = self.pager.page_out(self.blocks, self._frame_number)
+            self._left = self._left if self.window.origin is None else self.window.origin
             self.window = BlockWindow(self.block_size, self._window_cells)
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
-        origin = self.window.moved(middle)
+        origin = self.window.moved(middle, self._left)
         if origin is not None:
+            self._left = None
             self._place_window(origin)
 
     # -- reading -----------------------------------------------------------------------------------------------------

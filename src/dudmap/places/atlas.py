@@ -4,7 +4,7 @@ Submaps are joined when one is recognised from another: Elvira, Tardos and Monti
 """
 
 from bisect import bisect_left
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,9 +15,10 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.memory_limit import MemoryLimit
+from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_store import FrameStore
+from dudmap.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.places.saved_map import SavedMap
 from dudmap.tracking.motion_model import VELOCITY_LIFETIME
@@ -42,7 +43,8 @@ class Atlas:
         number: Number of the first submap.
 
     Attributes:
-        volumes: Maps by the numbers of their submaps.
+        volumes: Maps by the numbers of their submaps; while one is rebuilt, its provisional map.
+        rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
         current: Number of the submap that is tracked.
         poses: Poses of all tracked frames, in order of time.
         saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
@@ -60,6 +62,7 @@ class Atlas:
         self.keyframes = keyframes
         self.history = history
         self.volumes = {number: make_volume()}
+        self.rebuildings: dict[int, MapRebuilding] = {}
         self.current = number
         self.poses: list[TimedPose] = []
         self.saved: int | None = None
@@ -109,12 +112,14 @@ class Atlas:
         A saved map keeps its colours: not all its frames are stored.
         """
         assert self.history is not None
+        self.complete()
         for number, volume in self.volumes.items():
             if number == self.saved:
                 continue
             painted = self.make_volume()
             self.history.reintegrate(painted, self.nodes(number))
             volume.take_colors(painted)
+        self.switch_to(self.current)
 
     def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
         """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
@@ -131,6 +136,7 @@ class Atlas:
 
     def as_saved_map(self) -> SavedMap:
         """The main map and its keyframes; how well frames fit it is left to the caller."""
+        self.complete()
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
@@ -146,8 +152,56 @@ class Atlas:
 
     def start_submap(self) -> None:
         """Make a new, empty submap the current one."""
-        self.current = max(self.volumes) + 1
-        self.volumes[self.current] = self.make_volume()
+        number = max(self.volumes) + 1
+        self.switch_to(number)
+        self.volumes[number] = self.make_volume()
+
+    def switch_to(self, number: int) -> None:
+        """Make a submap the current one; the maps of the others leave the memory where they may."""
+        self.current = number
+        for other, volume in self.volumes.items():
+            if other != number:
+                volume.page_out()
+
+    def make_room(self) -> None:
+        """Have the current map leave the memory, unless another one of the same view fits beside it."""
+        limit = None if self.volume.pager is None else self.volume.pager.max_blocks
+        if isinstance(limit, MemoryLimit):
+            view = len(self.volume.window.near) * self.volume.blocks.slot_bytes
+            if limit.limit - resident_bytes() < view:
+                self.volume.page_out()
+
+    def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
+        """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
+        if number in self.rebuildings:
+            self.rebuildings[number].show(self.volumes[number], T_world_camera, SHOWN)
+        return self.volumes[number]
+
+    def continue_rebuilding(self) -> None:
+        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames."""
+        if not self.rebuildings:
+            return
+        number = self.current if self.current in self.rebuildings else min(self.rebuildings)
+        rebuilding, shown, last = self.rebuildings[number], 0, self.poses[-1]
+        if last.submap == number:
+            shown = rebuilding.show(self.volumes[number], last.T_world_camera, 1)
+        if rebuilding.fuse(PER_FRAME - shown):
+            self._take(rebuilding)
+
+    def complete(self) -> None:
+        """Complete all maps that are being rebuilt."""
+        for rebuilding in list(self.rebuildings.values()):
+            self.volumes[rebuilding.submap].clear()  # makes room
+            rebuilding.fuse()
+            self._take(rebuilding)
+
+    def _take(self, rebuilding: MapRebuilding) -> None:
+        """Use a complete map."""
+        volume = self.volumes[rebuilding.submap]
+        volume.take_over(rebuilding.volume)
+        del self.rebuildings[rebuilding.submap]
+        if rebuilding.submap != self.current:
+            volume.page_out()
 
     def by_size(self) -> list[int]:
         """Numbers of the submaps: the saved one, then those with more tracked frames first."""
@@ -166,7 +220,13 @@ class Atlas:
             return []
         return [n for n, number in enumerate(self.history.submaps) if number == submap]
 
-    def correct(self, nodes: list[int], Ts_new: NDArray[np.float64], volume: TsdfVolume) -> NDArray[np.float64]:
+    def correct(
+        self,
+        nodes: list[int],
+        Ts_new: NDArray[np.float64],
+        volume: TsdfVolume,
+        fused: Sequence[int] | None = None,
+    ) -> NDArray[np.float64]:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
         Trajectory and keyframes receive the correction interpolated in time between the stored frames.
@@ -174,7 +234,8 @@ class Atlas:
         Args:
             nodes: Numbers of all stored frames of the submap, in order of time.
             Ts_new: (n, 4, 4) their new poses.
-            volume: The map built from them.
+            volume: The map built from them, or from some of them.
+            fused: Numbers of the latter; the map is used until another one, of all, is complete. None = all.
 
         Returns:
             (4, 4) motion of the newest stored frame.
@@ -192,19 +253,50 @@ class Atlas:
         for n, T in zip(nodes, Ts_new, strict=True):
             self.history.Ts_world_camera[n] = T
         self.volume.take_over(volume)
+        self.rebuildings.pop(self.current, None)  # of an earlier correction
+        if fused is not None and len(fused) < len(nodes):
+            new = self.make_volume()
+            self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
         return corrections[-1]
 
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
-        nodes = self.nodes(source)
+        moved_nodes, kept_nodes = self.nodes(source), self.nodes(target)
         for moved in (*self.poses, *self.keyframes.keyframes):
             if moved.submap == source:
                 moved.T_world_camera = T_target_source @ moved.T_world_camera
                 moved.submap = target
-        for n in nodes:
+        for n in moved_nodes:
             self.history.Ts_world_camera[n] = T_target_source @ self.history.Ts_world_camera[n]
             self.history.submaps[n] = target
-        self.history.reintegrate(self.volumes[target], nodes)
         del self.volumes[source]
-        self.current = target
+        self.rebuildings.pop(source, None)
+        if len(moved_nodes) <= AT_ONCE or target == self.saved:  # not all frames of a saved map are stored
+            self.history.reintegrate(self.volumes[target], moved_nodes)
+            if target in self.rebuildings:
+                self.rebuildings[target].add_shown(moved_nodes)
+        else:
+            self._fuse_gradually(target, kept_nodes)
+        self.switch_to(target)
+
+    def _fuse_gradually(self, target: int, kept_nodes: list[int]) -> None:
+        """Add the stored frames of a submap that its map lacks over the frames to come.
+
+        Args:
+            target: Number of the submap.
+            kept_nodes: Numbers of the stored frames that its map, or the one that replaces it, holds or is to hold
+                first.
+        """
+        assert self.history is not None
+        running = self.rebuildings.pop(target, None)
+        if running is None:
+            volume = self.make_volume()
+            volume.take_over(self.volumes[target])
+            volume.page_out()
+            running = MapRebuilding(self.history, target, volume, kept_nodes, [])
+        provisional = self.make_volume()
+        near = nearest_views(self.history, self.nodes(target), self.poses[-1].T_world_camera, AT_ONCE)
+        self.history.reintegrate(provisional, near)
+        self.volumes[target].take_over(provisional)
+        self.rebuildings[target] = running.restarted(near)

@@ -83,7 +83,7 @@ class LoopCloser:
         self._frame = 0
         self._next_search = 0
         self._failures = 0
-        self._num_keyframes = 0
+        self._newest_keyframe: float | None = None  # timestamp; their number ends at ``max_keyframes``
         self._search: LoopSearch | None = None
         self._executor: ThreadPoolExecutor | None = None
         self._pending: PendingCorrection | None = None
@@ -106,7 +106,8 @@ class LoopCloser:
             if search.submap == self.atlas.current:
                 return self._evaluate(search, monitor)
         keyframes = self.atlas.keyframes.keyframes
-        new_keyframe, self._num_keyframes = len(keyframes) > self._num_keyframes, len(keyframes)
+        newest = keyframes[-1].timestamp if keyframes else None
+        new_keyframe, self._newest_keyframe = newest != self._newest_keyframe, newest
         if not new_keyframe and self._frame % CHECK_INTERVAL:
             return None
         now = query.observation.timestamp

@@ -11,7 +11,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.atlas import Atlas
-from dudmap.places.loop_correction import path_length
+from dudmap.places.loop_correction import step_lengths
 from dudmap.places.place_recognition import PlaceMatch
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import Tracker, TrackingResult
@@ -69,7 +69,8 @@ class LoopVerifier:
             for pose in self.atlas.poses
             if pose.submap == self.atlas.current and pose.timestamp >= place.keyframe.last_seen
         ]
-        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path_length(since[::3])  # every third: less jitter
+        path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
+        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
         return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
 

@@ -116,7 +116,8 @@ class Relocalizer:
         num_readings = max(np.count_nonzero(view.labelled.depth), 1)
         for candidate in candidates:
             submap, T_features = candidate.keyframe.submap, candidate.T_world_camera
-            volume = self.atlas.volumes[submap] if self.prior_map is None else self.prior_map
+            prior = self.prior_map
+            volume = self.atlas.volume_around(submap, T_features) if prior is None else prior
             estimate = register(volume, T_features)
             tracking, labels = estimate.tracking, estimate.labels
             static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings

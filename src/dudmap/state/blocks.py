@@ -95,8 +95,13 @@ class StoredMaps:
             number, (slots, _) = stored.number, volume.written_since(stored.frame)
         blocks = volume.blocks
         keys = np.where(blocks.entry_of[slots] >= 0, block_keys(number, blocks.slot_coords[slots]), -1)
-        voxels = np.empty((len(slots), VOXELS), np.int32)
-        voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :] = blocks.geometry[slots], blocks.colors[slots]
+        if stored is not None:  # slots that are no longer there since all blocks have left the memory
+            vacated = blocks.num_slots + np.flatnonzero(stored.keys[blocks.num_slots :] >= 0).astype(np.int32)
+            slots, keys = np.append(slots, vacated), np.append(keys, np.full(len(vacated), -1))
+        voxels = np.zeros((len(slots), VOXELS), np.int32)
+        kept = slots[slots < blocks.num_slots]
+        voxels[: len(kept), : VOXELS // 2] = blocks.geometry[kept]
+        voxels[: len(kept), VOXELS // 2 :] = blocks.colors[kept]
         away, known = {}, {} if stored is None else stored.regions
         regions = []
         if volume.pager is not None:
@@ -171,9 +176,9 @@ def restore_map(
     Raises:
         StateError: The rows do not fit the index.
     """
-    frame_number = volume._frame_number
+    frame_number, left = volume._frame_number, volume._left
     TsdfVolume.clear(volume)  # not what a subclass has besides, which is in the tree
-    volume._frame_number = frame_number
+    volume._frame_number, volume._left = frame_number, left
     n, m = len(index["coords"]), len(index["entry_of"])
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
     owned = np.flatnonzero(index["entry_of"] >= 0)
@@ -213,6 +218,7 @@ def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, A
     if index["origin"] is None:
         return
     window.origin = index["origin"]
+    window.cells.fill(-1)
     cells = window.cells.reshape(tuple(window.shape))
     inside = np.empty(blocks.num_entries, dtype=np.int32)
     count = hashing.fill_window(cells, window.origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)

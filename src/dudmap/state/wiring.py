@@ -3,8 +3,8 @@
 from typing import Any
 
 PACKAGES = (
-    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapping",
-    "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
+    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapper",
+    "mapping", "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
 )  # fmt: skip
 """Parts of this package whose classes hold state; no other class is ever made from a database."""
 REBUILT = {
@@ -24,6 +24,7 @@ REBUILT = {
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
+    "StageTimer": ("_clock", "_marks", "_inner"),  # of a device, and only until the frame is done
     "Slam": ("device",),  # a run may be continued on another one
     "TsdfVolume": ("blocks", "window", "map_id"),  # the blocks have a table; the number is one of this process
 }

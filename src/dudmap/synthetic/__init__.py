@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from dudmap.synthetic.faults import SensorFaults
-    from dudmap.synthetic.recording import sequence
+    from dudmap.synthetic.setup import sequence
 
 __all__ = ["SensorFaults", "names", "sequence"]
 
-_MODULES = {"SensorFaults": "dudmap.synthetic.faults", "sequence": "dudmap.synthetic.recording"}
+_MODULES = {"SensorFaults": "dudmap.synthetic.faults", "sequence": "dudmap.synthetic.setup"}
 
 
 def __getattr__(name: str) -> object:

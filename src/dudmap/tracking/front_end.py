@@ -72,8 +72,7 @@ class FrontEnd:
         arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
         if arrived and not self.monitor.is_unusual(tracking):
             return estimate
-        with view.timer("parallax"):
-            T_image = prediction.image_pose()
+        T_image = prediction.image_pose()
         if T_image is None or agree(T_image, tracking.T_world_camera, *SAME_POSE):
             return estimate
         other = self.register_from(volume, view, prediction, T_image)
@@ -123,10 +122,12 @@ class FrontEnd:
         self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
         self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
         self.monitor.accept(tracking)
-        self.monitor.images.update(view, estimate)
+        with view.timer("check"):
+            self.monitor.images.update(view, estimate)
         if labels is None or view.blind:
             return
-        self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
+        with view.timer("label"):
+            self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
 
     def lose(self, timestamp: float) -> None:
         """A frame was not tracked; after some time what the previous frames showed is no longer used."""

@@ -45,6 +45,13 @@ class Observability:
         """Whether every direction is determined."""
         return len(self.unobservable) == 0
 
+    def with_shown(self, shown: NDArray[np.bool_], R_world_camera: NDArray[np.float64]) -> "Observability":
+        """The same with those of the k unobservable directions that are ``shown`` (k,) among the observable ones."""
+        if shown.all():
+            return COMPLETE
+        more = np.kron(np.eye(2), R_world_camera) @ self.unobservable[shown].T
+        return Observability(np.hstack([self.observable, more]), self.unobservable[~shown])
+
     def step(self, H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
         """Solution (6,) of ``H step = -b`` that does not move along directions that are not determined (the solution
         remapping of Zhang et al., with the directions orthogonal under the noise of H)."""

@@ -137,9 +137,10 @@ class PosePredictor:
         if view.blind:
             self.ego_motion.reset()
             return
-        dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
-        T = estimate.T_world_camera
-        self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+        with view.timer("parallax"):
+            dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
+            T = estimate.T_world_camera
+            self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
 
     def _slow_motion(
         self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
@@ -163,8 +164,9 @@ class PosePredictor:
         """Motion of the static world from the previous image to this one."""
         if self.ego_motion.seconds == 0:
             return None
-        T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
-        return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
+        with view.timer("parallax"):
+            T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
+            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
 
     def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
         return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)

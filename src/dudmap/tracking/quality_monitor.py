@@ -88,15 +88,16 @@ class QualityMonitor:
         the last image, seen from the new pose. ``image_pose`` computes the pose that two images alone predict.
         """
         tracking, labels = estimate.tracking, estimate.labels
-        crowded = labels is not None and is_majority_dynamic(labels.dynamic, view.labelled)
-        return (
-            tracking.reason
-            or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
-            or (self.motion.drift_reason(view.timestamp) if len(tracking.unobservable) else "")
-            or self.deviation(tracking, crowded=crowded)
-            or self._undetermined(view, estimate)
-            or self.images.contradicts(view, estimate, image_pose)
-        )
+        with view.timer("check"):
+            crowded = labels is not None and is_majority_dynamic(labels.dynamic, view.labelled)
+            return (
+                tracking.reason
+                or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
+                or (self.motion.drift_reason(view.timestamp) if len(tracking.unobservable) else "")
+                or self.deviation(tracking, crowded=crowded)
+                or self._undetermined(view, estimate)
+                or self.images.contradicts(view, estimate, image_pose)
+            )
 
     def deviation(self, tracking: TrackingResult, *, recognized: bool = False, crowded: bool = False) -> str:
         """Sentence on what is much worse than in the previous frames, empty if nothing is.

@@ -9,13 +9,13 @@ from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
+from dudmap.kernels.damping import added, is_settled, relaxed, tightened
 from dudmap.kernels.median import median
-from dudmap.kernels.parameters import ImageStack, RegistrationParameters
+from dudmap.kernels.parameters import Damping, ImageStack, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
-SHORT_STEP = 4
-"""A step shorter than this multiple of the stop tolerance also ends a level if the cost hardly changes."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
 MIN_READINGS = 100
@@ -166,7 +166,18 @@ class Tracker:
         if noise is None or noise.is_exceeded(system.H, least):
             return COMPLETE
         distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
-        return noise.observability(distances.H, system.H, R, least)
+        seen = noise.observability(distances.H, system.H, R, least)
+        if seen.is_complete:
+            return COMPLETE
+        agreement = GradientAgreement(level, system.residuals, weights, R, parameters, self.sensor)
+        step, shown = volume.voxel_size, []
+        for twist in seen.unobservable @ np.kron(np.eye(2), R).T:
+            forth, back = (
+                self.linearize(volume, level, se3.retract(T_world_camera, way * twist), weights, color_weight).residuals
+                for way in (step, -step)
+            )
+            shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
+        return seen.with_shown(np.array(shown), R)
 
     def _optimize(
         self,
@@ -186,27 +197,54 @@ class Tracker:
         Returns:
             Pose, its normal equations, number of linearisations, whether a stop criterion was met.
         """
+        found = self._descended(volume, level, T, weights, system, limit, stop, color_weight, seen)
+        if found is not None:
+            return found
         damping, used = self.config.damping, 0
         for _ in range(limit):
             diagonal = np.diag(system.H)
             if not diagonal.max() > 0:
                 break
-            damped = system.H + np.diag(damping * diagonal + 1e-9 * diagonal.max())
+            damped = system.H + np.diag(added(diagonal, diagonal.max(), damping))
             step = seen.step(damped, system.b)
             T_trial, length = se3.retract(T, step), np.linalg.norm(step)
             if length < stop:  # too short to need another linearisation
                 return T_trial, system, used, True
             trial = self.linearize(volume, level, T_trial, weights, color_weight)
             used += 1
-            gain = abs(trial.cost - system.cost)
-            settled = length < SHORT_STEP * stop and gain < self.config.stop_gain * system.cost
+            settled = is_settled(length, system.cost, trial.cost, stop, self.config.stop_gain)
             if trial.cost < system.cost:
-                T, system, damping = T_trial, trial, max(damping / 5, 1e-6)
+                T, system, damping = T_trial, trial, relaxed(damping)
             else:
-                damping *= 5
+                damping = tightened(damping)
             if settled:
                 return T, system, used, True
         return T, system, used, False
+
+    def _descended(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: LinearSystem,
+        limit: int,
+        stop: float,
+        color_weight: float | None,
+        seen: Observability,
+    ) -> tuple[NDArray[np.float64], LinearSystem, int, bool] | None:
+        """What ``_optimize`` returns, found by the compute device alone; None where it does not run the loop."""
+        found = volume.backend.descend(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T,
+            Damping(system.H, system.b, system.cost, seen.observable, self.config.damping, limit, stop,
+                    self.config.stop_gain),
+            self._parameters(volume, color_weight),
+        )  # fmt: skip
+        if found is None:
+            return None
+        equations = found.equations
+        system = system if equations is None else LinearSystem(*equations)
+        return found.T_world_camera, system, found.iterations, found.settled
 
     def linearize(
         self,

@@ -64,7 +64,7 @@ class LiveView(RunObserver):
         """Begin with an empty page."""
         self._slam = slam
         none = np.zeros(0, dtype=np.int32)
-        slam.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
+        slam.atlas.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
         self._window.set_camera(slam.camera)
         with self._changed:
             self._news = _News(restart=True)
@@ -74,14 +74,14 @@ class LiveView(RunObserver):
         start = time.perf_counter()
         assert self._slam is not None
         images = None if isinstance(read.frame, FrameError) else FrameImages.of(read.frame, result)
-        self._feed.offer(self._slam.volume)
+        self._feed.offer(self._slam.atlas.volume)
         self._put(FrameFigures.of(result, ms), images, self._poses() if result.corrected else None)
         self.costs.append(1000 * (time.perf_counter() - start))
 
     def finish(self, out: Path) -> None:
         """Show the final trajectory and mesh."""
         if self._slam is not None and self._error is None:
-            self._feed.offer(self._slam.volume, now=True)
+            self._feed.offer(self._slam.atlas.volume, now=True)
             self._put(None, None, self._poses())
 
     def close(self) -> None:

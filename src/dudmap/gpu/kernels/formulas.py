@@ -6,6 +6,7 @@ language lacks is defined here: the conjunction of two booleans by ``&``, and th
 """
 
 import inspect
+import math
 import types
 import typing
 
@@ -60,21 +61,21 @@ def upper_half(word: wp.int32):
 
 _NUMPY = types.SimpleNamespace(
     float32=wp.float32, float64=wp.float64, int32=wp.int32, int64=wp.int32, uint8=wp.uint8,
-    floor=wp.floor, ceil=wp.ceil, sqrt=wp.sqrt, exp=wp.exp,
+    floor=wp.floor, ceil=wp.ceil, sqrt=wp.sqrt, exp=wp.exp, sin=wp.sin, cos=wp.cos,
 )  # fmt: skip
-"""What the formulas use of NumPy. Indices of 64 bits fit into 32 there."""
+"""What the formulas use of NumPy, and of ``math``. Indices of 64 bits fit into 32 there."""
 _OF_NUMPY = {
     np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.floor: wp.floor, np.sqrt: wp.sqrt,
     np.exp: wp.exp,
 }  # fmt: skip
 _OWN = {"bits": bits, "upper_half": upper_half}
-_compiled: dict[Dispatcher, wp.Function] = {}
+_compiled: dict[Dispatcher | types.FunctionType, wp.Function] = {}
 
 
-def warp_function(formula: Dispatcher) -> wp.Function:
-    """The function of Warp with the text of a formula that Numba compiles, and of all that it calls."""
+def warp_function(formula: Dispatcher | types.FunctionType) -> wp.Function:
+    """The function of Warp with the text of a formula that Numba compiles, or a plain one, and of all that it calls."""
     if formula not in _compiled:
-        function = formula.py_func
+        function = formula.py_func if isinstance(formula, Dispatcher) else formula
         names = {**function.__globals__, "bit_and": bit_and, "bit_or": bit_or, **_OWN}
         for name in function.__code__.co_names:
             if name in function.__globals__ and name not in _OWN:
@@ -90,11 +91,11 @@ def _counterpart(value: object) -> object:
     """What Warp has for a global of a formula."""
     if isinstance(value, Dispatcher):
         return warp_function(value)
-    if value is np:
+    if value is np or value is math:
         return _NUMPY
     if isinstance(value, np.float32):
         return wp.constant(wp.float32(float(value)))
-    if isinstance(value, np.float64):
+    if isinstance(value, float):  # also one of NumPy
         return wp.constant(wp.float64(float(value)))
     return _OF_NUMPY.get(value, value) if isinstance(value, type | np.ufunc) else value
 
