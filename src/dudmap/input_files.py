@@ -12,6 +12,7 @@ import math
 import os
 import stat
 import struct
+import sys
 import tokenize
 import tomllib
 import zipfile
@@ -264,6 +265,9 @@ def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
     data = file.read(expected)
     if len(data) != expected:
         raise ValueError(f"{name} is cut off: it holds {len(data)} of {expected} bytes")
+    codes = np.frombuffer(data, np.dtype("u4").newbyteorder(kind.byteorder)) if kind.kind == "U" else np.empty(0)
+    if codes.max(initial=0) > sys.maxunicode:
+        raise ValueError(f"{name} holds text with characters that do not exist")
     return np.frombuffer(bytearray(data), kind).reshape(shape, order="F" if by_columns else "C")
 
 

@@ -134,16 +134,24 @@ def fits(part, name):
 
 
 def campaign(names, inputs, seconds, seed, memory, out):
-    """Fuzz these loaders one after another; returns the number of findings."""
+    """Fuzz these loaders one after another, from input ``seed`` on or, if that is None, from where ``out`` ends.
+
+    Returns the number of findings.
+    """
     print(HEAD)
     total = 0
     for name in names:
         before, begin = len(lines_of(out)), time.time()
-        count, deaths = fuzz(name, inputs, seconds, seed, memory, out)
+        parts = last_parts([line for line in lines_of(out) if "inputs" in line], name)
+        first = seed if seed is not None else sum(part["inputs"] for part in parts)
+        left = inputs if seed is not None else inputs - first
+        if left <= 0:
+            continue
+        count, deaths = fuzz(name, left, seconds, first, memory, out)
         found = len(lines_of(out)) - before
         total += found
         result = {
-            "loader": name, "first": seed, "inputs": count, "deaths": deaths, "findings": found,
+            "loader": name, "first": first, "inputs": count, "deaths": deaths, "findings": found,
             "seconds": round(time.time() - begin, 1), "date": time.strftime("%Y-%m-%d"),
             "python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores",
         }  # fmt: skip
@@ -165,20 +173,29 @@ def lines_of(path):
     return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
 
+def last_parts(results, name):
+    """Results of a loader, one after the other by their numbers; one that begins anew replaces what it begins with."""
+    parts = []
+    for line in results:
+        if line["loader"] == name:
+            parts = [part for part in parts if part["first"] < line["first"]] + [line]
+    return parts
+
+
 def table(paths):
     """Counts of the files of one or several campaigns, as text in Markdown.
 
-    Of readings of a loader from the same first number on, the last counts: the others are from before a mend.
+    Of readings of an input the last counts: the others are from before a mend.
     """
     results = [line for path in paths for line in lines_of(path) if "inputs" in line]
-    last = {(line["loader"], line["first"]): line for line in results}
-    rows = []
+    last, rows = [], []
     for name in LOADERS:
-        parts = [line for (loader, _), line in last.items() if loader == name]
+        parts = last_parts(results, name)
+        last += parts
         sums = {key: sum(line[key] for line in parts) for key in ("inputs", "seconds", "deaths", "findings")}
         rows.append({"loader": name, **sums})
     total = {key: sum(line[key] for line in rows) for key in ("inputs", "seconds", "deaths", "findings")}
-    where = sorted({f"{line['date']}, Python {line['python']}, {line['machine']}" for line in last.values()})
+    where = sorted({f"{line['date']}, Python {line['python']}, {line['machine']}" for line in last})
     return "\n".join([*where, "", HEAD, *map(row, [*rows, {"loader": "all", **total}])])
 
 
@@ -188,6 +205,7 @@ def main():
     parser.add_argument("--seconds", type=float, default=60, help="that a loader is given at most")
     parser.add_argument("--loaders", default="", help="parts of names, commas between them; default: all")
     parser.add_argument("--seed", type=int, default=0, help="number of the first input")
+    parser.add_argument("--continue", dest="seed", action="store_const", const=None, help="after those in --out")
     parser.add_argument("--memory", type=float, default=2.0, help="GiB that a loader may take")
     parser.add_argument("--only", help="LOADER:NUMBER, repeat one input and show what happens")
     parser.add_argument("--keep", nargs=2, help="LOADER:NUMBER and a folder, write the input")

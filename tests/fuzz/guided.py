@@ -7,6 +7,8 @@ is written to the folder of the call as ``crash-...``; the corpus lives in a tem
 file.
 """
 
+import importlib
+import pkgutil
 import shutil
 import sys
 import tempfile
@@ -15,18 +17,27 @@ from pathlib import Path
 
 import atheris
 
+import dudmap.kernels
+
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-with atheris.instrument_imports(include=["dudmap", "rosbags"], exclude=["dudmap.kernels"]):
+for kernels in pkgutil.iter_modules(dudmap.kernels.__path__):  # compiled from the code as it is
+    importlib.import_module(f"dudmap.kernels.{kernels.name}")
+
+with atheris.instrument_imports(include=["dudmap", "rosbags"]):
+    import dudmap.calibration.depth_model
     import dudmap.config
     import dudmap.evaluation.files
     import dudmap.exporting.run_content
     import dudmap.geometry.mesh
+    import dudmap.mapping.adaptive_volume
     import dudmap.mapping.volume
     import dudmap.places.saved_map
     import dudmap.sequences
     import dudmap.sequences.camera_json
     import dudmap.sequences.masks
+    import dudmap.state.database
+    import dudmap.state.system
     import dudmap.viewing.run_files
 
     dudmap.sequences.readers()

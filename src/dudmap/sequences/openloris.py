@@ -80,15 +80,20 @@ def _open(path: Path) -> "cv2.FileStorage":
 
 
 def _matrix(node: "cv2.FileNode", key: str) -> NDArray[np.float64] | None:
-    """Matrix under a key of a node; None if there is none."""
-    import cv2
+    """Matrix of up to 16 numbers under a key of a node; None if there is none.
 
+    ``FileNode.mat`` is not used: it writes outside of its memory where the size is not that of the data (OpenCV 4).
+    """
     if not node.isMap() or not node.getNode(key).isMap():
         return None
-    try:
-        return np.asarray(node.getNode(key).mat(), dtype=np.float64)
-    except cv2.error:  # the count of numbers is not that of rows and columns
+    rows, columns, data = (node.getNode(key).getNode(name) for name in ("rows", "cols", "data"))
+    if not (rows.isInt() and columns.isInt() and data.isSeq() and data.size() <= 16):
         return None
+    numbers = [data.at(k) for k in range(data.size())]
+    shape = int(rows.real()), int(columns.real())
+    if min(shape) < 1 or shape[0] * shape[1] != len(numbers) or not all(n.isInt() or n.isReal() for n in numbers):
+        return None
+    return np.array([number.real() for number in numbers], dtype=np.float64).reshape(shape)
 
 
 def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
