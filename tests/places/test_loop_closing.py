@@ -187,7 +187,7 @@ def test_a_loop_takes_the_drift_out(round_trip):
         print(f"loops {enabled}: end off by {gaps[enabled][0]:.3f} m, {gaps[enabled][1]:.2f} deg; map off by "
               f"{maps[enabled].accuracy.mean:.3f} m, ghosts {maps[enabled].ghost_share:.1%}")  # fmt: skip
         np.testing.assert_allclose(results[-1].T_world_camera, slam.trajectory.Ts_world_camera[-1])
-    assert gaps[False][1] > 3
+    assert gaps[False][1] > 2, "else there is no drift to take out"
     assert gaps[True][1] < 0.3 * gaps[False][1]
     # behind a wrong focal length no position is fully consistent: the verified one itself is off by centimetres
     assert gaps[True][0] < 0.7 * gaps[False][0]

@@ -50,7 +50,8 @@ def corrected(atlas, rise):
     """Close a loop by which the path rises by so much per second; returns the new poses."""
     nodes = atlas.nodes(atlas.current)
     Ts = np.stack([at(T[0, 3], rise * n) for n, T in enumerate(atlas.history.Ts_world_camera) if n in nodes])
-    near = nearest_views(atlas.history, nodes, atlas.history.Ts_world_camera[nodes[-1]], AT_ONCE)
+    before = np.array([atlas.history.Ts_world_camera[n] for n in nodes])
+    near = [nodes[i] for i in nearest_views(before, before[-1], AT_ONCE)]
     provisional = atlas.make_volume()
     atlas.history.reintegrate(provisional, near, [Ts[nodes.index(n)] for n in near])
     atlas.correct(nodes, Ts, provisional, near)

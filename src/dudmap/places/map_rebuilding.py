@@ -92,19 +92,14 @@ class MapRebuilding:
         return len(added)
 
 
-def nearest_views(
-    history: FrameStore, numbers: Sequence[int], T_world_camera: NDArray[np.float64], count: int
-) -> list[int]:
-    """The stored frames, in order of time, whose view is nearest to that of a camera.
+def nearest_views(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64], count: int) -> NDArray[np.int64]:
+    """Numbers, in order, of the poses (n, 4, 4), at most ``count``, whose view is nearest to that of a camera."""
+    return np.sort(np.argsort(view_distances(Ts, T_world_camera), kind="stable")[:count])
 
-    Args:
-        history: The stored frames.
-        numbers: Numbers of those to choose from.
-        T_world_camera: (4, 4).
-        count: Largest number of them.
-    """
-    distances = np.linalg.norm(_points_seen(history, numbers) - _looked_at(T_world_camera), axis=1)
-    return sorted(numbers[i] for i in np.argsort(distances, kind="stable")[:count])
+
+def view_distances(Ts: NDArray[np.float64], T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Distances (n,) of what poses (n, 4, 4) look at from what a camera looks at, metres."""
+    return np.linalg.norm(_looked_at(Ts) - _looked_at(T_world_camera), axis=-1)
 
 
 def _points_seen(history: FrameStore, numbers: Sequence[int] | NDArray[np.int64]) -> NDArray[np.float64]:
