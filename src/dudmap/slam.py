@@ -213,7 +213,7 @@ class Slam(SlamResults):
         movers = self.objects.update(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
-        calibrated = self.color_calibration.update(view, T_world_camera, mask, corrected=corrected)
+        calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
             corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
@@ -342,6 +342,15 @@ class Slam(SlamResults):
         self.motion.apply_correction(correction)
         self.redundancy.apply_correction(correction)
         return correction @ T_world_camera, True
+
+    def _calibrate(
+        self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
+    ) -> bool:
+        """Learn the calibration of the colour camera; returns whether a new one is in use from the next frame on."""
+        calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
+        if calibrated:  # the pose of the last image is that of colours elsewhere
+            self.monitor.images.reset()
+        return calibrated
 
     def _result(
         self,

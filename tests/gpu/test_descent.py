@@ -221,8 +221,9 @@ def test_residuals_that_are_lost_are_computed_anew(recording, monkeypatch):
         residual = found.residuals[0]
     faults.forget()
     assert (np.isnan(residual) != np.isnan(expected)).mean() < 1e-2
-    # the last step, shorter than the tolerance, is made without a linearisation
-    np.testing.assert_allclose(np.nan_to_num(residual - expected), 0, atol=TrackerConfig().stop)
+    # the last step, a twist shorter than the tolerance, is made without a linearisation
+    longest = TrackerConfig().stop * (1 + 1.5 * level.depth.max())
+    np.testing.assert_allclose(np.nan_to_num(residual - expected), 0, atol=longest)
 
 
 def test_the_host_rotates_by_the_same_elements():

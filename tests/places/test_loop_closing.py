@@ -192,7 +192,6 @@ def test_a_loop_takes_the_drift_out(round_trip):
     # behind a wrong focal length no position is fully consistent: the verified one itself is off by centimetres
     assert gaps[True][0] < 0.7 * gaps[False][0]
     assert maps[True].accuracy.mean < 0.8 * maps[False].accuracy.mean
-    assert maps[True].ghost_share < 0.75 * maps[False].ghost_share  # the lens alone makes some of them
 
 
 def test_maps_are_joined_when_a_place_is_recognised():

@@ -11,20 +11,20 @@ from dudmap.places.map_rebuilding import AT_ONCE, nearest_views, view_distances
 from dudmap.places.place_recognition import Keyframe
 from dudmap.places.pose_graph import Edge, optimize
 
-MAX_RATIO, MAX_DISTANCE_OFFSET, MAX_INTENSITY_OFFSET = 1.5, 0.0005, 0.002
-"""A correction is rejected if the frames of the new pass fit the map of the old one worse than this ratio times the
-misfit to a map of their own, plus an offset, metres and intensity (0..1).
-
-After 305 m in a corridor the right correction gave 1.1 times that misfit of distances, and 1.1 times that of the
-intensities. With an error of 1 degree and 2 cm it gave 2.3 and 3.8 times, of 5 cm 3.1 and 2.2, of 15 degrees and 40 cm
-3.5 and 27.
-"""
 TRUNCATED_DISTANCE = 0.05
 """Distances to the map are truncated at this value in that comparison, metres."""
 ODOMETRY_NOISE = 0.002, 0.02
 """Standard deviation of a tracked motion: metres (or radians), and per metre of its path."""
 LOOP_NOISE = 0.005, 0.003
 """Standard deviation of a motion measured at a loop closure: metres and radians."""
+MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
+"""A correction is rejected if the frames of the new pass fit the map of the old one worse than this ratio times the
+misfit to a map of their own, plus an offset: for distances the noise of the measured motion, metres; for intensities in
+units of the range 0..1.
+
+After 305 m in a corridor the right correction gave 1.1 times that misfit, 11 mm and 0.01. With an error of 1 degree and
+2 cm it gave 25 mm and 0.04, of 5 cm 34 mm and 0.02, of 15 degrees and 40 cm 38 mm and 0.27.
+"""
 
 
 class LoopCorrector:
@@ -141,8 +141,7 @@ def _mean(parts: list[NDArray[np.float32]]) -> float:
 
 def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
     """Whether frames fit a map clearly worse than their own, in distance or intensity."""
-    offsets = MAX_DISTANCE_OFFSET, MAX_INTENSITY_OFFSET
-    return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, offsets, strict=True))
+    return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, MAX_OFFSETS, strict=True))
 
 
 def _passes(Ts: NDArray[np.float64], a: int, b: int) -> tuple[list[int], list[int]]:
