@@ -30,7 +30,11 @@ def test_exp_is_the_matrix_exponential(xi):
 @given(st.lists(twists, max_size=4), st.floats(0, 1e-4))
 def test_motions_of_many_twists_are_those_of_each(xis, size):
     xis = np.array([*xis, np.zeros(6), *(size * xi for xi in xis)])
-    assert np.allclose(se3.exp_all(xis), [se3.exp(xi) for xi in xis], rtol=0, atol=1e-14)
+    Ts = se3.exp_all(xis)
+    assert np.allclose(Ts, [se3.exp(xi) for xi in xis], rtol=0, atol=1e-14)
+    assert np.allclose(se3.log_all(Ts), [se3.log(T) for T in Ts], rtol=0, atol=1e-9)
+    assert np.array_equal(se3.adjoint(Ts), [se3.adjoint(T) for T in Ts])
+    assert np.array_equal(se3.small_adjoint(xis), [se3.small_adjoint(xi) for xi in xis])
 
 
 @QUICK

@@ -187,11 +187,11 @@ def test_a_loop_takes_the_drift_out(round_trip):
         print(f"loops {enabled}: end off by {gaps[enabled][0]:.3f} m, {gaps[enabled][1]:.2f} deg; map off by "
               f"{maps[enabled].accuracy.mean:.3f} m, ghosts {maps[enabled].ghost_share:.1%}")  # fmt: skip
         np.testing.assert_allclose(results[-1].T_world_camera, slam.trajectory.Ts_world_camera[-1])
-    assert gaps[False][1] > 2, "else there is no drift to take out"
+    assert gaps[False][1] > 3
     assert gaps[True][1] < 0.3 * gaps[False][1]
-    # behind a wrong focal length no position is fully consistent: the verified one itself is off by centimetres
-    assert gaps[True][0] < 0.7 * gaps[False][0]
+    assert gaps[True][0] < 0.5 * gaps[False][0]
     assert maps[True].accuracy.mean < 0.8 * maps[False].accuracy.mean
+    assert maps[True].ghost_share < 0.5 * maps[False].ghost_share
 
 
 def test_maps_are_joined_when_a_place_is_recognised():

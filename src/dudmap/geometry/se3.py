@@ -16,9 +16,11 @@ SMALL = 1e-8
 
 
 def hat(omega: Matrix) -> Matrix:
-    """Skew-symmetric matrix (3, 3) with ``hat(a) @ b == cross(a, b)``."""
-    x, y, z = omega
-    return np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    """Skew-symmetric matrices (..., 3, 3) of vectors (..., 3), with ``hat(a) @ b == cross(a, b)``."""
+    out = np.zeros((*omega.shape, 3))
+    out[..., (2, 0, 1), (1, 2, 0)] = omega
+    out[..., (1, 2, 0), (2, 0, 1)] = -omega
+    return out
 
 
 def exp(xi: Matrix) -> Matrix:
@@ -48,9 +50,7 @@ def exp_all(twists: Matrix) -> Matrix:
     """Rigid motions (n, 4, 4) of twists (n, 6), each as by ``exp``."""
     v, omega = twists[:, :3, None], twists[:, 3:]
     theta_squared = np.sum(omega * omega, axis=1)[:, None, None]
-    W = np.zeros((len(twists), 3, 3))
-    W[:, (2, 0, 1), (1, 2, 0)] = omega
-    W[:, (1, 2, 0), (2, 0, 1)] = -omega
+    W = hat(omega)
     small = theta_squared < 1e-8  # Taylor series: the closed forms are 0/0 there
     square = np.where(small, 1.0, theta_squared)
     theta = np.sqrt(square)
@@ -98,6 +98,23 @@ def log(T: Matrix) -> Matrix:
         c = (1 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / theta_squared
     V_inverse = np.eye(3) - 0.5 * W + c * (W @ W)
     return np.concatenate([V_inverse @ T[:3, 3], omega])
+
+
+def log_all(Ts: Matrix) -> Matrix:
+    """Twists (n, 6) of rigid motions (n, 4, 4), each as by ``log``."""
+    from scipy.spatial.transform import Rotation
+
+    omega = Rotation.from_matrix(Ts[:, :3, :3]).as_rotvec() if len(Ts) else np.empty((0, 3))
+    theta_squared = np.sum(omega * omega, axis=1)
+    small = theta_squared < 1e-8
+    square = np.where(small, 1.0, theta_squared)
+    theta = np.sqrt(square)
+    c = np.where(
+        small, 1 / 12 + theta_squared / 720, (1 - theta * np.cos(theta / 2) / (2 * np.sin(theta / 2))) / square
+    )
+    W = hat(omega)
+    V_inverse = np.eye(3) - 0.5 * W + c[:, None, None] * (W @ W)
+    return np.concatenate([(V_inverse @ Ts[:, :3, 3:])[..., 0], omega], axis=1)
 
 
 def log_rotation(R: Matrix) -> Matrix:
@@ -162,9 +179,10 @@ def quat_xyzw_to_rotation(quat_xyzw: Matrix) -> Matrix:
 
 
 def nearest_rotation(R: Matrix) -> Matrix:
-    """Rotation closest to ``R`` (3, 3) in the Frobenius norm: removes the drift of repeated products."""
+    """Rotations closest to ``R`` (..., 3, 3) in the Frobenius norm: removes the drift of repeated products."""
     U, _, V_t = np.linalg.svd(R)
-    return U @ np.diag([1.0, 1.0, float(np.sign(np.linalg.det(U @ V_t)))]) @ V_t
+    U[..., 2] *= np.sign(np.linalg.det(U @ V_t))[..., None]
+    return U @ V_t
 
 
 def retract(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -176,18 +194,18 @@ def retract(T_world_camera: NDArray[np.float64], step: NDArray[np.float64]) -> N
 
 
 def adjoint(T: Matrix) -> Matrix:
-    """Adjoint (6, 6) of a rigid motion: ``T exp(xi) T^-1 == exp(adjoint(T) xi)``, twists (v, omega)."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = T[:3, :3]
-    out[:3, 3:] = hat(T[:3, 3]) @ T[:3, :3]
+    """Adjoints (..., 6, 6) of rigid motions (..., 4, 4): ``T exp(xi) T^-1 == exp(adjoint(T) xi)``."""
+    out = np.zeros((*T.shape[:-2], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = T[..., :3, :3]
+    out[..., :3, 3:] = hat(T[..., :3, 3]) @ T[..., :3, :3]
     return out
 
 
 def small_adjoint(xi: Matrix) -> Matrix:
-    """Adjoint (6, 6) of a twist: the derivative of ``adjoint(exp(t xi))`` at t = 0."""
-    out = np.zeros((6, 6))
-    out[:3, :3] = out[3:, 3:] = hat(xi[3:])
-    out[:3, 3:] = hat(xi[:3])
+    """Adjoints (..., 6, 6) of twists (..., 6): the derivative of ``adjoint(exp(t xi))`` at t = 0."""
+    out = np.zeros((*xi.shape[:-1], 6, 6))
+    out[..., :3, :3] = out[..., 3:, 3:] = hat(xi[..., 3:])
+    out[..., :3, 3:] = hat(xi[..., :3])
     return out
 
 
