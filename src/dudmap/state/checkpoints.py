@@ -16,7 +16,8 @@ from dudmap.state.system import take_snapshot
 from dudmap.state.tree import NotSettledError, Snapshot
 
 SHARE = 0.02
-"""Largest share of the time so far that checkpoints take, snapshots and writing together, unless an interval is given.
+"""Largest share of the time so far that checkpoints take in processor time, snapshots and writing together, unless an
+interval is given.
 
 What the writing thread takes from the memory bandwidth and the caches of the frames is not measured; the rest of the
 3 % that checkpoints may cost is left for it.
@@ -80,7 +81,7 @@ class Checkpoints:
         if wait and self._running is not None:
             self._running.exception()  # waits
             self._finish()
-        start = time.perf_counter()
+        start, busy = time.perf_counter(), time.thread_time()  # a process that was stopped meanwhile has not been busy
         try:
             snapshot = take_snapshot(state, self.database, wait=wait)
         except NotSettledError:
@@ -92,7 +93,7 @@ class Checkpoints:
         if faults.lost_devices() != self._lost:  # the snapshot may lack what the device wrote
             return
         files, self._files = self._files, []
-        self._last_cost, self._last = time.perf_counter() - start, start
+        self._last_cost, self._last = time.thread_time() - busy, start
         self._cost += self._last_cost
         self._running = self._thread.submit(self._write, snapshot, meta, files)
         if wait:
