@@ -1,6 +1,5 @@
 """The registration against plain NumPy and against numerical derivatives; the tracker's checks."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,10 +12,11 @@ from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.se3 import retract
+from dudmap.kernels.parameters import NormalEquations
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import LinearSystem, Tracker, TrackingResult
+from dudmap.tracking.tracker import Tracker, TrackingResult
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 
@@ -123,9 +123,9 @@ def test_the_noise_of_the_cost_does_not_decide_where_the_finest_level_ends(volum
     assert quiet.iterations > 1, "else no cost is compared"
     linearize, rng = tracker.linearize, np.random.default_rng(0)
 
-    def noisy(*args: Any) -> LinearSystem:
+    def noisy(*args: Any) -> NormalEquations:
         system = linearize(*args)
-        return replace(system, cost=system.cost * rng.uniform(1, 2))
+        return system._replace(cost=system.cost * rng.uniform(1, 2))
 
     monkeypatch.setattr(tracker, "linearize", noisy)
     for _ in range(5):

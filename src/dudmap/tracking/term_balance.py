@@ -10,9 +10,10 @@ from dudmap.config import PreprocessConfig, SensorConfig
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid
+from dudmap.kernels.parameters import NormalEquations
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.tracker import LinearSystem, Tracker
+from dudmap.tracking.tracker import Tracker
 
 INTERVAL = 10
 """Every so many tracked frames are compared."""
@@ -159,8 +160,8 @@ class BalanceEstimator:
 
     def _noise(
         self,
-        distances: LinearSystem,
-        both: LinearSystem,
+        distances: NormalEquations,
+        both: NormalEquations,
         weights: NDArray[np.float32],
         tracker: Tracker,
         level: Level,

@@ -11,7 +11,7 @@ from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels.damping import SHORT_STEP, added, is_accepted, is_settled, relaxed, tightened
 from dudmap.kernels.median import median
-from dudmap.kernels.parameters import Damping, ImageStack, RegistrationParameters
+from dudmap.kernels.parameters import Damping, NormalEquations, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
@@ -25,31 +25,6 @@ MIN_READINGS = 100
 """Static readings on the map that a registration needs: well above its six unknowns."""
 MEDIAN_STRIDE = 4
 """Every so many pixels, across and down, enter the median intensity difference."""
-
-
-@dataclass(frozen=True, eq=False)
-class LinearSystem:
-    """Normal equations of one linearisation: ``H step = -b``.
-
-    Attributes:
-        H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
-        b: (6,) float64, gradient of the cost.
-        cost: Robust cost; each reading off the map costs a constant, so that costs of different poses are comparable.
-        num_inliers: Number of readings on the map.
-        readings: Sum of the static weights of all readings.
-        weight: Sum of the static weights of the readings on the map.
-        chi_square: Robustly weighted sum of squared distances, m^2; scaled to 1 m depth with ``noise_weighting``.
-        residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
-    """
-
-    H: NDArray[np.float64]
-    b: NDArray[np.float64]
-    cost: float
-    num_inliers: int
-    readings: float
-    weight: float
-    chi_square: float
-    residuals: ImageStack
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +131,7 @@ class Tracker:
         level: Level,
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
-        system: LinearSystem,
+        system: NormalEquations,
         color_weight: float | None,
     ) -> Observability:
         """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
@@ -189,12 +164,12 @@ class Tracker:
         level: Level,
         T: NDArray[np.float64],
         weights: NDArray[np.float32],
-        system: LinearSystem,
+        system: NormalEquations,
         limit: int,
         finest: bool,
         color_weight: float | None,
         seen: Observability,
-    ) -> tuple[NDArray[np.float64], LinearSystem, int, bool]:
+    ) -> tuple[NDArray[np.float64], NormalEquations, int, bool]:
         """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
         accepted if it decreases the cost. It moves only along the directions that are ``seen``.
 
@@ -230,7 +205,7 @@ class Tracker:
                 return T, system, used, True
         return T, system, used, False
 
-    def _damping(self, system: LinearSystem, limit: int, finest: bool, seen: Observability) -> Damping:
+    def _damping(self, system: NormalEquations, limit: int, finest: bool, seen: Observability) -> Damping:
         """Beginning and rules of the steps of a level."""
         config, first = self.config, (system.H, system.b, system.cost, seen.observable)
         if finest:
@@ -244,10 +219,10 @@ class Tracker:
         level: Level,
         T: NDArray[np.float64],
         weights: NDArray[np.float32],
-        system: LinearSystem,
+        system: NormalEquations,
         rules: Damping,
         color_weight: float | None,
-    ) -> tuple[NDArray[np.float64], LinearSystem, int, bool] | None:
+    ) -> tuple[NDArray[np.float64], NormalEquations, int, bool] | None:
         """What ``_optimize`` returns, found by the compute device alone; None where it does not run the loop."""
         found = volume.backend.descend(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T, rules,
@@ -255,9 +230,7 @@ class Tracker:
         )  # fmt: skip
         if found is None:
             return None
-        equations = found.equations
-        system = system if equations is None else LinearSystem(*equations)
-        return found.T_world_camera, system, found.iterations, found.settled
+        return found.T_world_camera, found.equations or system, found.iterations, found.settled
 
     def linearize(
         self,
@@ -266,7 +239,7 @@ class Tracker:
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
         color_weight: float | None = None,
-    ) -> LinearSystem:
+    ) -> NormalEquations:
         """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose.
 
         Args:
@@ -276,11 +249,10 @@ class Tracker:
             weights: (h, w) float32 static weights in [0, 1].
             color_weight: Weight of the intensity term; None takes that of the configuration.
         """
-        equations = volume.backend.linearize(
+        return volume.backend.linearize(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
             volume.window.T_grid_camera(T_world_camera), self._parameters(volume, color_weight),
         )  # fmt: skip
-        return LinearSystem(*equations)
 
     def _parameters(self, volume: TsdfVolume, color_weight: float | None) -> RegistrationParameters:
         """Parameters of the cost in a map; ``color_weight`` None takes that of the configuration."""
@@ -299,7 +271,7 @@ class Tracker:
         self,
         T: NDArray[np.float64],
         exposure: tuple[float, float],
-        system: LinearSystem,
+        system: NormalEquations,
         level: Level,
         weights: NDArray[np.float32],
         iterations: int,
@@ -342,7 +314,7 @@ class Tracker:
             unobservable=seen.unobservable,
         )  # fmt: skip
 
-    def _chi_square(self, system: LinearSystem, level: Level, weights: NDArray[np.float32]) -> float:
+    def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
         computes with ``noise_weighting``."""
         config, sensor = self.config, self.sensor
