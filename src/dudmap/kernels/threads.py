@@ -5,9 +5,11 @@ sums are added in band order, so that the result is the same, bit for bit, on on
 """
 
 import os
+import threading
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future
 from functools import cache
+from queue import SimpleQueue
 from typing import Any, TypeVar
 
 from numba import njit
@@ -40,16 +42,38 @@ def num_threads() -> int:
 
 
 @cache
-def _pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(max(1, num_threads() - 1), thread_name_prefix="dudmap")
+def _tasks() -> SimpleQueue[Callable[[], object]]:
+    """Tasks of the other threads, one for each core but one. An executor would take ten times as long to wake one."""
+    tasks: SimpleQueue[Callable[[], object]] = SimpleQueue()
+
+    def work() -> None:
+        while True:
+            tasks.get()()
+
+    for n in range(max(1, num_threads() - 1)):
+        threading.Thread(target=work, name=f"dudmap-{n}", daemon=True).start()
+    return tasks
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_tasks.cache_clear)  # a forked process has none of the threads
 
 
 def submit(function: Callable[[], Result]) -> Callable[[], Result]:
-    """Start ``function`` in the thread pool if there is a core for it; the returned function waits for its result."""
+    """Start ``function`` in another thread if there is a core for it; the returned function waits for its result."""
     if num_threads() > 1:
-        return _pool().submit(function).result
+        future: Future[Result] = Future()
+        _tasks().put(lambda: _fulfil(future, function))
+        return future.result
     result = function()
     return lambda: result
+
+
+def _fulfil(future: Future[Result], function: Callable[[], Result]) -> None:
+    try:
+        future.set_result(function())
+    except BaseException as error:
+        future.set_exception(error)
 
 
 def bands(n: int, size: int) -> list[tuple[int, int]]:
@@ -65,18 +89,23 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)
     order = iter(range(len(calls)))  # shared by all threads; next() is atomic, so no band runs twice
+    finished: SimpleQueue[BaseException | None] = SimpleQueue()  # for each band: how it ended
 
     def work() -> None:
         for n in order:
             range_, *items = calls[n]
-            results[n] = function(*range_, *items)
+            try:
+                results[n] = function(*range_, *items)
+            except BaseException as error:
+                finished.put(error)
+            else:
+                finished.put(None)
 
-    # the calling thread works too, and each worker is woken once, not once per band
-    others = [_pool().submit(work) for _ in range(threads - 1)]
-    try:
-        work()
-    finally:
-        for other in others:
-            if not other.cancel():  # do not wait for a worker that never started
-                other.result()
+    # the calling thread works too, and each other one is woken once, not once per band; one that comes late finds none
+    for _ in range(threads - 1):
+        _tasks().put(work)
+    work()
+    errors = [error for error in (finished.get() for _ in calls) if error is not None]
+    if errors:
+        raise errors[0]
     return results

@@ -1,0 +1,71 @@
+"""Bands of work on several threads."""
+
+import multiprocessing
+import sys
+import threading
+
+import pytest
+
+from dudmap.kernels import threads
+
+
+@pytest.fixture(autouse=True)
+def four_threads(monkeypatch):
+    """As on four cores, whatever this machine has."""
+    monkeypatch.setenv("DUDMAP_THREADS", "4")
+    threads._tasks.cache_clear()
+    yield
+    threads._tasks.cache_clear()
+
+
+def squares(count):
+    return threads.run_bands(lambda start, stop, add: sum(range(start, stop)) + add, threads.bands(count, 3), range(34))
+
+
+def test_results_are_in_order_and_each_band_runs_once():
+    calls = []
+    ranges = threads.bands(1000, 7)
+    results = threads.run_bands(lambda start, stop: calls.append(start) or (start, stop), ranges)
+    assert results == ranges
+    assert sorted(calls) == [start for start, _ in ranges]
+
+
+def test_other_threads_take_part():
+    barrier = threading.Barrier(4, timeout=30)  # passed only by four at once
+    names = threads.run_bands(lambda *_: barrier.wait() and threading.current_thread().name, [(n, n) for n in range(4)])
+    assert len(names) == 4
+
+
+def test_bands_within_bands_and_tasks_end():
+    inner = squares(100)
+    outer = threads.run_bands(lambda start, stop: squares(100), [(0, 1)] * 9)
+    assert outer == [inner] * 9
+    assert threads.submit(lambda: squares(100))() == inner
+
+
+def test_an_error_reaches_the_caller_after_all_bands_have_ended():
+    ended = []
+
+    def function(start, stop):
+        if start == 3:
+            raise ValueError("band 3")
+        ended.append(start)
+
+    with pytest.raises(ValueError, match="band 3"):
+        threads.run_bands(function, threads.bands(10, 1))
+    assert sorted(ended) == [0, 1, 2, 4, 5, 6, 7, 8, 9]
+    with pytest.raises(ZeroDivisionError):
+        threads.submit(lambda: 1 / 0)()
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="processes are forked on Linux only")
+@pytest.mark.filterwarnings("ignore:.*multi-threaded.*:DeprecationWarning")
+def test_a_forked_process_has_threads_of_its_own():
+    expected = squares(100)
+    context = multiprocessing.get_context("fork")
+    queue = context.SimpleQueue()
+    child = context.Process(target=lambda: queue.put((squares(100), threads.submit(lambda: 7)())), daemon=True)
+    child.start()
+    child.join(30)
+    assert child.exitcode == 0
+    assert queue.get() == (expected, 7)
