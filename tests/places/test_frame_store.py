@@ -9,7 +9,8 @@ from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.frame_store import DEPTH_UNIT, FrameStore
+from dudmap.places.frame_store import FrameStore
+from dudmap.places.glimpse import DEPTH_UNIT
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 
@@ -63,7 +64,7 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dudmap.places.frame_store.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("dudmap.places.frame_file.tempfile.TemporaryFile", full)
     history, frame = FrameStore(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
 
     def keep():

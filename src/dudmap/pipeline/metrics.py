@@ -33,7 +33,7 @@ class RunRecord:
         rejected: Number of frames that were not used for a fault of the stream, by kind; those with a readable image
             of the right size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
-        movers: Per frame with moving objects, the JSON object of movers.jsonl.
+        movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
         balances: Uncertainties of poses, of every tenth tracked frame.
         fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
@@ -47,7 +47,7 @@ class RunRecord:
     unreadable: list[str] = field(default_factory=list)
     rejected: dict[str, int] = field(default_factory=dict)
     mask_ious: list[float] = field(default_factory=list)
-    movers: list[dict[str, Any]] = field(default_factory=list)
+    movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     balances: "list[TermBalance]" = field(default_factory=list)
     fused: int = 0
@@ -112,7 +112,8 @@ class RunRecord:
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
-            self.movers.append({"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]})
+            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]}
+            self.movers.append(json.dumps(line))
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if result.balance is not None:
@@ -139,7 +140,7 @@ class RunRecord:
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
-        write_text(path, "".join(json.dumps(line) + "\n" for line in self.movers))
+        write_text(path, "".join(f"{line}\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:
         """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.

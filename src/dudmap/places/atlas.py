@@ -229,7 +229,8 @@ class Atlas:
     ) -> NDArray[np.float64]:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
-        Trajectory and keyframes receive the correction interpolated in time between the stored frames.
+        Trajectory and keyframes receive the correction interpolated in time between the stored frames; one that was
+        removed has that of the frame that shows its place now.
 
         Args:
             nodes: Numbers of all stored frames of the submap, in order of time.
@@ -241,15 +242,14 @@ class Atlas:
             (4, 4) motion of the newest stored frame.
         """
         assert self.history is not None
-        stamps = np.array([self.history.timestamps[n] for n in nodes])
+        stamps, positions = self.history.timeline(nodes)
         corrections = np.stack(
             [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
         )
+        in_time = corrections[positions]
         for place in (*self.poses, *self.keyframes.keyframes):
             if place.submap == self.current:
-                place.T_world_camera = (
-                    se3.interpolate_in_time(stamps, corrections, place.timestamp) @ place.T_world_camera
-                )
+                place.T_world_camera = se3.interpolate_in_time(stamps, in_time, place.timestamp) @ place.T_world_camera
         for n, T in zip(nodes, Ts_new, strict=True):
             self.history.Ts_world_camera[n] = T
         self.volume.take_over(volume)

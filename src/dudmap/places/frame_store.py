@@ -1,26 +1,23 @@
 """Store of fused frames on disk, from which the map is rebuilt with corrected poses or masks."""
 
-import tempfile
 import weakref
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.errors import MapError
 from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
 from dudmap.geometry.alignment import agree
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.frame_file import FilePlace, FrameFile
+from dudmap.places.glimpse import DEPTH_UNIT, Glimpse, depth_steps
 
-DEPTH_UNIT = 0.0005
-"""Step of the stored depth, metres. The quantisation error, 0.29 steps rms, is 0.14 mm: a seventh of ``sigma_base``."""
 JPEG_QUALITY = 95
 MAX_PENDING = 3
 """Frames that may wait for the encoding thread before ``add`` waits for it."""
@@ -46,13 +43,46 @@ class StoredFrame:
     count: int
 
 
+class RemovedFrames:
+    """Frames that are no longer stored, in the order of removal.
+
+    Attributes:
+        timestamps: Seconds.
+        serials, heirs: Serials of the frames, and of those that showed their places when they were removed.
+    """
+
+    def __init__(self) -> None:
+        self.timestamps: list[float] = []
+        self.serials: list[int] = []
+        self.heirs: list[int] = []
+
+    def add(self, timestamp: float, serial: int, heir: int) -> None:
+        """Note that a frame is removed."""
+        self.timestamps.append(timestamp)
+        self.serials.append(serial)
+        self.heirs.append(heir)
+
+    def standing_for(self, position: dict[int, int]) -> tuple[list[float], list[int]]:
+        """Times of the removed frames whose places stored frames show now, and the positions of the latter.
+
+        Args:
+            position: Of the stored frames, by serial.
+        """
+        last: dict[int, int] = {}
+        for serial, heir in zip(reversed(self.serials), reversed(self.heirs), strict=True):
+            last[serial] = last.get(heir, heir)  # an heir is removed later than what it stands for, if at all
+        found = [(t, position[last[n]]) for t, n in zip(self.timestamps, self.serials, strict=True)
+                 if last[n] in position]  # fmt: skip
+        return [timestamp for timestamp, _ in found], [number for _, number in found]
+
+
 class FrameStore:
     """A selection of the fused frames in a temporary file, which the operating system removes.
 
     A frame is stored if the camera has moved or turned since the last stored frame, or if a number of frames were
     fused since; other frames increase the count of the stored frame before them. Frames are encoded (16-bit PNG and
-    JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by some hundred bytes per stored frame. Not
-    for concurrent calls.
+    JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about 1.5 kB per stored frame. Frames are
+    numbered in the order of time; ``remove`` lowers the numbers of later ones. Not for concurrent calls.
 
     Args:
         camera: Camera of the frames.
@@ -67,7 +97,12 @@ class FrameStore:
         Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
         counts: Number of fused frames that each represents.
         submaps: Numbers of their submaps.
-        archived: Returns a frame that is not in the file of this store, but in the database of a continued run.
+        serials: Numbers of the stored frames that never change, and are never given again; ascending.
+        links: Standard deviations, metres and radians, of the motion to a stored frame, by its serial, from the one
+            before it in its submap, where frames between them were removed.
+        removed: The frames that were removed, and what stands for each: three numbers a frame, for ever.
+        archived: Returns a frame, by its serial, that is not in the file of this store, but in the database of a
+            continued run.
     """
 
     def __init__(
@@ -86,10 +121,14 @@ class FrameStore:
         self.Ts_world_camera: list[NDArray[np.float64]] = []
         self.counts: list[int] = []
         self.submaps: list[int] = []
+        self.serials: list[int] = []
+        self.links: dict[int, tuple[float, float]] = {}
+        self.removed = RemovedFrames()
+        self._next_serial = 0
         self.archived: Callable[[int], EncodedFrame] | None = None
-        # start in the file; bytes of depth, colour, mask; None for an archived frame
-        self._offsets: list[tuple[int, int, int, int] | None] = []
-        self._file: IO[bytes] | None = None
+        self._places: list[FilePlace | None] = []  # None for an archived frame
+        self._glimpses: dict[int, Glimpse] = {}  # by serial; follow from the frames
+        self._file = FrameFile()
         self._encoder: ThreadPoolExecutor | None = None
         self._pending: deque[Future[EncodedFrame]] = deque()
 
@@ -139,27 +178,67 @@ class FrameStore:
         self.counts.append(1)
         self.submaps.append(submap)
         self.color_timestamps.append(frame.color_timestamp)
+        self.serials.append(self._next_serial)
+        self._glimpses[self._next_serial] = Glimpse.of(frame.depth, static)
+        self._next_serial += 1
         self._pending.append(self._encoder.submit(_encoded, frame, static, exposure))
         self._write(MAX_PENDING)
         return True
 
     def drop_last(self) -> None:
-        """Remove the frame stored last."""
-        self._write(0)
-        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self._offsets
-        for column in columns:
-            column.pop()
+        """Remove the frame stored last, as if it had never been."""
+        self._drop(len(self) - 1)
+
+    def remove(self, number: int, heir: int, link: tuple[float, float]) -> None:
+        """Remove a stored frame that is neither the first nor the last of its submap.
+
+        Args:
+            number: Its number; those of later frames fall by one.
+            heir: Number of the stored frame that shows its place now, and gets its corrections.
+            link: Standard deviations of the motion from the frame before it in its submap to the one after it.
+        """
+        after = self.submaps.index(self.submaps[number], number + 1)
+        self.links[self.serials[after]] = link
+        self.removed.add(self.timestamps[number], self.serials[number], self.serials[heir])
+        self._drop(number)
+
+    def _drop(self, number: int) -> None:
+        if number >= len(self._places):  # it is being encoded
+            self._write(0)
+        place, serial = self._places[number], self.serials[number]
+        if place is not None:
+            self._file.release(place)
+        self.links.pop(serial, None)
+        self._glimpses.pop(serial, None)
+        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self.serials
+        for column in (*columns, self._places):
+            del column[number]
+
+    def timeline(self, numbers: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Times (n,) ascending of stored frames and of the removed ones whose place they show now, and for each time
+        the position of that stored frame in ``numbers``, which ascend."""
+        position = {self.serials[number]: n for n, number in enumerate(numbers)}
+        removed_stamps, removed_positions = self.removed.standing_for(position)
+        stamps = np.array([self.timestamps[number] for number in numbers] + removed_stamps)
+        positions = np.array([*range(len(numbers)), *removed_positions], np.int64)
+        order = np.argsort(stamps, kind="stable")
+        return stamps[order], positions[order]
+
+    def glimpse(self, number: int) -> Glimpse:
+        """What a stored frame shows, coarsely."""
+        serial = self.serials[number]
+        if serial not in self._glimpses:  # of a continued run
+            steps, mask = _decoded(self.encoded(number)[::2])
+            self._glimpses[serial] = Glimpse.of_stored(steps, mask > 0)
+        return self._glimpses[serial]
 
     def __getitem__(self, number: int) -> StoredFrame:
         """The stored frame of a number, 0 = oldest."""
         import cv2
 
-        kinds = cv2.IMREAD_UNCHANGED, cv2.IMREAD_COLOR, cv2.IMREAD_GRAYSCALE
-        images = [
-            cv2.imdecode(np.frombuffer(part, np.uint8), flags)
-            for part, flags in zip(self.encoded(number), kinds, strict=True)
-        ]
-        steps, bgr, mask = (np.asarray(image) for image in images)
+        depth_file, color_file, mask_file = self.encoded(number)
+        steps, mask = _decoded((depth_file, mask_file))
+        bgr = np.asarray(cv2.imdecode(np.frombuffer(color_file, np.uint8), cv2.IMREAD_COLOR))
         depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
         rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
         frame = Frame(self.timestamps[number], depth, rgb, self.color_timestamps[number])
@@ -169,25 +248,17 @@ class FrameStore:
     def encoded(self, number: int) -> EncodedFrame:
         """The files of a stored frame."""
         self._write(0)
-        place = self._offsets[number]
+        place = self._places[number]
         if place is None:
             assert self.archived is not None
-            return self.archived(number)
-        assert self._file is not None
-        start, *sizes = place
-        self._file.seek(start)
-        depth, color, mask = (self._file.read(size) for size in sizes)
+            return self.archived(self.serials[number])
+        depth, color, mask = self._file.read(place)
         return depth, color, mask
-
-    def places(self) -> list[object]:
-        """Where each stored frame is in the file, never the same for two frames; waits until all are encoded."""
-        self._write(0)
-        return list(self._offsets)
 
     def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
         """Take the frames, whose times and poses are set, from an archive."""
         self.archived = archived
-        self._offsets = [None] * len(self)
+        self._places, self._glimpses = [None] * len(self), {}
 
     def __iter__(self) -> Iterator[StoredFrame]:
         return (self[number] for number in range(len(self)))
@@ -217,19 +288,7 @@ class FrameStore:
         """Write encoded frames to the file until at most this many are pending."""
         while self._pending and (len(self._pending) > max_pending or self._pending[0].done()):
             parts = self._pending.popleft().result()
-            try:
-                if self._file is None:
-                    self._file = tempfile.TemporaryFile(prefix="dudmap-")
-                    weakref.finalize(self, self._file.close)
-                start = self._file.seek(0, 2)
-                for part in parts:
-                    self._file.write(part)
-            except OSError as error:
-                raise MapError(
-                    f"fused frames cannot be stored in {tempfile.gettempdir()}: {error}; make room there, name another "
-                    "folder in the environment variable TMPDIR, or switch off loops.enabled and submaps.enabled"
-                ) from error
-            self._offsets.append((start, len(parts[0]), len(parts[1]), len(parts[2])))
+            self._places.append(self._file.write(parts))
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:
@@ -237,9 +296,20 @@ def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, flo
     import cv2
 
     png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
-    steps = np.minimum(frame.depth * np.float32(1 / DEPTH_UNIT) + np.float32(0.5), 65535).astype(np.uint16)
+    steps = depth_steps(frame.depth)
     bgr = cv2.cvtColor(exposed_color(frame.color, exposure), cv2.COLOR_RGB2BGR)
     depth = cv2.imencode(".png", steps, png)[1]
     color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
     mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]
     return depth.tobytes(), color.tobytes(), mask.tobytes()
+
+
+def _decoded(files: Sequence[bytes]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Depth in steps and mask of their files."""
+    import cv2
+
+    kinds = cv2.IMREAD_UNCHANGED, cv2.IMREAD_GRAYSCALE
+    steps, mask = (
+        np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), kind)) for file, kind in zip(files, kinds, strict=True)
+    )
+    return steps, mask

@@ -11,6 +11,7 @@ from dudmap.config import Config
 from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree
 from dudmap.places.atlas import Atlas
+from dudmap.places.frame_thinning import FrameThinning
 from dudmap.places.loop_correction import LoopCorrector
 from dudmap.places.loop_verification import LoopQuery, LoopVerifier
 from dudmap.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
@@ -79,6 +80,7 @@ class LoopCloser:
         self.atlas = atlas
         self.verifier = LoopVerifier(config, atlas, tracker)
         self.corrector = LoopCorrector(atlas)
+        self.thinning = FrameThinning(config, atlas, self.corrector)
         self.closed = 0
         self._frame = 0
         self._next_search = 0
@@ -99,6 +101,7 @@ class LoopCloser:
             (4, 4) motion of the camera's pose by a correction of the atlas, None if nothing was corrected.
         """
         self._frame += 1
+        self.thinning.thin()
         if self._search is not None:
             if self._frame < self._search.due:
                 return None

@@ -1,6 +1,8 @@
 """Geometric verification of recognised places: plausible drift, and registration against the map of that time."""
 
+from bisect import bisect_left
 from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -64,11 +66,9 @@ class LoopVerifier:
             place: Match in the current submap.
             T_world_camera: (4, 4) tracked pose of the frame.
         """
-        since = [
-            pose.T_world_camera
-            for pose in self.atlas.poses
-            if pose.submap == self.atlas.current and pose.timestamp >= place.keyframe.last_seen
-        ]
+        poses = self.atlas.poses
+        begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
+        since = [pose.T_world_camera for pose in islice(poses, begin, None) if pose.submap == self.atlas.current]
         path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
         limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera

@@ -147,8 +147,9 @@ class StateDatabase:
 
     def _write_frames(self, frames: list[FrameSnapshot]) -> None:
         for changed in frames:
-            self._execute("DELETE FROM frames WHERE store = ? AND number >= ?", changed.number, changed.first)
-            rows = ((changed.number, changed.first + n, *parts) for n, parts in enumerate(changed.frames))
+            gone = ((changed.number, serial) for serial in changed.gone)
+            self._connection.executemany("DELETE FROM frames WHERE store = ? AND number = ?", gone)
+            rows = ((changed.number, serial, *parts) for serial, parts in changed.frames.items())
             self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
 
     def _described(self, array: NDArray, constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
@@ -261,22 +262,22 @@ class StateReader:
         except (ValueError, TypeError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
 
-    def frame(self, store: int, number: int) -> EncodedFrame:
-        """A stored frame: depth, colour and mask as files.
+    def frame(self, store: int, serial: int) -> EncodedFrame:
+        """A stored frame by its serial: depth, colour and mask as files.
 
         Raises:
             StateError: It is missing, or the database is damaged.
         """
         select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
-        rows = list(self._rows(select, store, number))
+        rows = list(self._rows(select, store, serial))
         if not rows or not all(isinstance(content, bytes) for content in rows[0]):
-            raise StateError(f"the state of the run in {self.path} is damaged: stored frame {number} is missing")
+            raise StateError(f"the state of the run in {self.path} is damaged: stored frame {serial} is missing")
         depth, color, mask = rows[0]
         return depth, color, mask
 
-    def num_frames(self, store: int) -> int:
-        """Number of stored frames of a store."""
-        return next(iter(self._rows("SELECT count(*) FROM frames WHERE store = ?", store)))[0]
+    def frames(self, store: int) -> list[int]:
+        """Serials of the stored frames of a store, ascending."""
+        return [row[0] for row in self._rows("SELECT number FROM frames WHERE store = ? ORDER BY number", store)]
 
     def release(self) -> None:
         """Let go of the state that was current when the file was opened; later reads see the newest."""

@@ -11,16 +11,16 @@ class FrameSnapshot:
 
     Attributes:
         number: Number of the store in the database.
-        first: Number of the first frame that the database lacks; those from it on are replaced.
-        frames: The frames from there on: depth, colour and mask as files.
-        places: Places of all frames in the file of the store, by which a replaced frame is noticed.
+        frames: The frames that the database lacks, by serial: depth, colour and mask as files.
+        gone: Serials of those that it holds, and the store does not any more.
+        serials: Serials of all frames of the store.
         store: The store.
     """
 
     number: int
-    first: int
-    frames: list[EncodedFrame]
-    places: list[object]
+    frames: dict[int, EncodedFrame]
+    gone: list[int]
+    serials: set[int]
     store: FrameStore
 
 
@@ -28,26 +28,24 @@ class StoredFrames:
     """Knows which frames are in the database."""
 
     def __init__(self) -> None:
-        self._stores: list[tuple[FrameStore, list[object]]] = []  # the number is the place in the list
+        self._stores: list[tuple[FrameStore, set[int]]] = []  # the number is the place in the list
 
     def snapshot(self, store: FrameStore) -> FrameSnapshot:
-        """The frames that the database lacks; waits until they are encoded."""
+        """The frames that the database lacks, and those that it no longer needs; waits until the former are encoded."""
         number = next((n for n, (one, _) in enumerate(self._stores) if one is store), len(self._stores))
         if number == len(self._stores):
-            self._stores.append((store, []))
-        places, stored = store.places(), self._stores[number][1]
-        first = min(len(stored), len(places))
-        while first > 0 and stored[first - 1] != places[first - 1]:
-            first -= 1
-        return FrameSnapshot(number, first, [store.encoded(n) for n in range(first, len(store))], places, store)
+            self._stores.append((store, set()))
+        stored, serials = self._stores[number][1], set(store.serials)
+        frames = {serial: store.encoded(n) for n, serial in enumerate(store.serials) if serial not in stored}
+        return FrameSnapshot(number, frames, sorted(stored - serials), serials, store)
 
     def commit(self, frames: list[FrameSnapshot]) -> None:
         """What these snapshots hold is in the database."""
         for changed in frames:
-            self._stores[changed.number] = changed.store, changed.places
+            self._stores[changed.number] = changed.store, changed.serials
 
     def add(self, store: FrameStore, number: int) -> None:
         """The frames of a store come from the database."""
         while len(self._stores) <= number:
-            self._stores.append((store, []))
-        self._stores[number] = store, store.places()
+            self._stores.append((store, set()))
+        self._stores[number] = store, set(store.serials)

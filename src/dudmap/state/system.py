@@ -60,9 +60,9 @@ def restore(reader: StateReader, current: object, database: StateDatabase | None
             database.maps.add(volume, number)
 
     def load_frames(store: FrameStore, number: int) -> None:
-        if reader.num_frames(number) != len(store):
+        if reader.frames(number) != store.serials:
             raise StateError(f"the state of the run in {reader.path} is damaged: stored frames are missing")
-        store.continue_from(lambda frame: reader.frame(number, frame))
+        store.continue_from(lambda serial: reader.frame(number, serial))
         if database is not None:
             database.frames.add(store, number)
 

@@ -24,6 +24,7 @@ from dudmap.errors import StateError
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.places.frame_file import FrameFile
 from dudmap.places.frame_store import FrameStore
 from dudmap.state import wiring
 
@@ -335,7 +336,7 @@ def _defaults(cls: type) -> dict[str, Any]:
     """Values of the attributes that are not stored, of an object that is made without its constructor."""
     made: dict[str, dict[str, Any]] = {
         "BlockPager": {"_store": None, "_executor": None},
-        "FrameStore": {"registered": None, "_file": None, "_encoder": None, "_pending": deque()},
+        "FrameStore": {"registered": None, "_file": FrameFile(), "_encoder": None, "_pending": deque()},
         "LoopCloser": {"_executor": None},
         "Observation": {"_halvings": [], "_recorded_halvings": []},
     }  # fmt: skip

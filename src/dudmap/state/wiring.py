@@ -20,7 +20,15 @@ REBUILT = {
         "_archived",
         "_archive",
     ),
-    "FrameStore": ("registered", "_offsets", "_file", "_encoder", "_pending", "archived"),  # the frames have a table
+    "FrameStore": (  # the frames have a table
+        "registered",
+        "_places",
+        "_glimpses",
+        "_file",
+        "_encoder",
+        "_pending",
+        "archived",
+    ),
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone

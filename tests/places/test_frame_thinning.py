@@ -1,0 +1,319 @@
+"""Stored frames that the map has forgotten are removed: their number is bounded, and what is rebuilt stays the same."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+import dudmap.synthetic
+from dudmap.config import Config
+from dudmap.frames.frame import Frame
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+from dudmap.mapping.volume import TsdfVolume
+from dudmap.places import frame_thinning
+from dudmap.places.atlas import Atlas
+from dudmap.places.frame_file import FrameFile
+from dudmap.places.frame_store import FrameStore
+from dudmap.places.frame_thinning import FrameThinning, chained
+from dudmap.places.glimpse import DEPTH_UNIT, Glimpse, Visibility, pixels
+from dudmap.places.loop_correction import LoopCorrector
+from dudmap.places.loop_verification import LOCAL_FRAMES
+from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
+from dudmap.places.pose_graph import Edge
+
+CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
+READINGS = 8
+CONFIG = Config().override([f"volume.max_readings={READINGS}", "volume.voxel_size=0.05", "volume.take_turns=false"])
+ENOUGH = int(CONFIG.similarity.threshold * (2 * READINGS + 1)) + 1  # newer frames that replace one
+EVERYTHING = np.ones(CAMERA.shape, dtype=bool)
+
+
+@pytest.fixture(autouse=True)
+def nothing_untouched(monkeypatch):
+    monkeypatch.setattr(frame_thinning, "UNTOUCHED", 0)
+
+
+def at(x, y=0.0):
+    T = np.eye(4)
+    T[:2, 3] = x, y
+    return T
+
+
+def wall(second, distance=1.5, noise=0.0):
+    """A wall with a relief that is fixed to the camera: all that matters here is how far it is."""
+    rng = np.random.default_rng(second)
+    depth = np.full(CAMERA.shape, distance) + noise * rng.normal(size=CAMERA.shape)
+    return Frame(float(second), depth.astype(np.float32), rng.integers(0, 256, (*CAMERA.shape, 3), dtype=np.uint8))
+
+
+class Walker:
+    """An atlas whose frames, one a second, are all stored, and the thinning of them.
+
+    Attributes:
+        stored: How many frames were stored after each of them.
+    """
+
+    def __init__(self, config=CONFIG, camera=CAMERA):
+        keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
+        self.atlas = Atlas(
+            lambda: TsdfVolume(camera, config.volume, config.sensor), keyframes, FrameStore(camera, gap=1)
+        )
+        self.corrector = LoopCorrector(self.atlas)
+        self.thinning = FrameThinning(config, self.atlas, self.corrector)
+        self.stored = []
+
+    @property
+    def history(self):
+        return self.atlas.history
+
+    def see(self, T, frame=None, static=EVERYTHING, *, fuse=False, thin=True):
+        second = len(self.atlas.poses)
+        frame = wall(second) if frame is None else Frame(float(second), frame.depth, frame.color)
+        self.atlas.add_pose(second, T)
+        if fuse:
+            self.atlas.integrate(frame, static, T)
+        else:
+            self.history.add(frame, static, T, self.atlas.current)
+        if thin:
+            self.thinning.thin()
+        self.stored.append(len(self.history))
+
+    def edge(self, a, b, T, sigmas=(0.005, 0.003)):
+        self.corrector.edges.append(Edge(a, b, T, *sigmas))
+
+
+def to_and_fro(count, steps=10, step=0.05):
+    """Places along a wall, to and fro."""
+    return [at(step * (steps - abs(n % (2 * steps) - steps))) for n in range(count)]
+
+
+def test_room_of_removed_frames_is_used_again():
+    """Against a dictionary, with frames of random sizes; the file ends up with little more than what is stored."""
+    rng, file, known = np.random.default_rng(0), FrameFile(), {}
+    for n in range(3000):
+        parts = tuple(rng.bytes(size) for size in rng.integers(0, 120, 3))
+        known[n] = file.write(parts), parts
+        if len(known) > 50:
+            place, _ = known.pop(int(rng.choice(list(known))))
+            file.release(place)
+        if n % 100 == 0:
+            assert all(file.read(place) == content for place, content in known.values())
+    used = sum(len(part) for _, parts in known.values() for part in parts)
+    assert file.num_bytes < 2 * used
+    spans = sorted((place.start, place.end) for place, _ in known.values() if place.end > place.start)
+    assert all(a[1] <= b[0] for a, b in pairwise(spans))
+    for place, _ in known.values():
+        file.release(place)
+    assert file.num_bytes == 0
+
+
+def test_a_camera_that_stays_keeps_what_the_map_remembers():
+    walker = Walker()
+    for second in range(5 * ENOUGH):
+        walker.see(at(0), wall(second, noise=0.01))
+    assert len(walker.history) <= 4 / 3 * ENOUGH + 4
+    stamps = walker.history.timestamps
+    assert stamps[0] == 0  # the first one fixes the world
+    assert stamps[-ENOUGH:] == list(range(4 * ENOUGH, 5 * ENOUGH))
+    assert walker.history.serials == [int(t) for t in stamps]
+    for n, stamp in enumerate(stamps):
+        expected = wall(int(stamp), noise=0.01).depth
+        np.testing.assert_allclose(walker.history[n].frame.depth, expected, atol=0.51 * DEPTH_UNIT)
+
+
+def test_a_walk_without_return_keeps_all():
+    walker = Walker()
+    for second in range(4 * ENOUGH):
+        walker.see(at(0.1 * second))
+    assert len(walker.history) == 4 * ENOUGH
+    assert not walker.history.links
+    assert walker.history.timeline(range(4 * ENOUGH))[1].tolist() == list(range(4 * ENOUGH))
+
+
+def test_the_number_depends_on_the_space_and_not_on_the_time():
+    walker = Walker()
+    for T in to_and_fro(600):
+        walker.see(T)
+    early, late = max(walker.stored[200:300]), max(walker.stored[500:])
+    assert late <= 1.05 * early < 100
+    assert sorted(walker.history.serials) == walker.history.serials
+    stored = np.array([T[0, 3] for T in walker.history.Ts_world_camera])
+    assert np.all(np.abs(stored[:, None] - np.arange(0, 0.51, 0.05)).min(axis=0) < 1e-9)  # no place is left out
+
+
+@pytest.mark.parametrize("change", ["hidden", "taken away", "before", "masked"])
+def test_only_what_was_seen_again_is_replaced(change):
+    """Later frames see the wall through where something was; behind what was put there, or moves there, they do not."""
+    left = np.zeros(CAMERA.shape, dtype=bool)
+    left[:, :20] = True
+    thing = wall(0)
+    thing.depth[left] = 0.8
+    old, new = (thing, wall(1)) if change == "taken away" else (wall(1), thing)
+    walker, others = Walker(), EVERYTHING
+    if change == "before":  # by less than the truncation band behind the new readings
+        new = wall(1, 1.5 - 0.9 * CONFIG.volume.truncation_behind_voxels * CONFIG.volume.voxel_size)
+    if change == "masked":
+        new, others = old, ~left
+    for _ in range(ENOUGH + 4):
+        walker.see(at(0), old)
+    for _ in range(3 * ENOUGH):
+        walker.see(at(0), new, others)
+    remaining = sum(1 for t in walker.history.timestamps if 0 < t < ENOUGH + 4)
+    if change in ("taken away", "before"):
+        assert remaining == 0
+    else:  # those that the map still has there, and they do not become fewer
+        assert 2 * CONFIG.volume.free_after <= remaining <= ENOUGH + 4
+
+
+def test_readings_are_seen_again_as_the_fusion_sees_them():
+    """Points of a wall at 2 m, 3 m aside of which another camera stands, which sees them against a wall of its own."""
+    visibility = Visibility(CAMERA, CONFIG)
+    glimpse = Glimpse.of(np.full(CAMERA.shape, 2.0, np.float32), EVERYTHING)
+    points = visibility.points(glimpse)
+    v, u = pixels(CAMERA.shape)
+    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], axis=1)
+    np.testing.assert_allclose(points, np.concatenate([2 * rays, rays]), atol=DEPTH_UNIT)
+    band = CONFIG.volume.truncation_behind_voxels * CONFIG.volume.voxel_size
+    for distance, seen in ((2.0, True), (2.0 - 0.9 * band, True), (2.0 - 1.1 * band, False), (3.0, True), (0.0, False)):
+        other = Glimpse.of(np.full(CAMERA.shape, distance, np.float32), EVERYTHING)
+        found = visibility.observed(points, np.eye(4)[None], [other])[0]
+        assert np.all(found[: len(u)] == seen)
+        assert np.all(found[len(u) :] == (distance > 1.0 - band))
+    T = np.eye(4)
+    T[0, 3] = 0.5  # the other camera is 0.5 m to the left
+    expected = np.abs((points[:, 0] + 0.5) / points[:, 2] * CAMERA.fx) < CAMERA.width / 2
+    assert np.array_equal(visibility.observed(points, T[None], [glimpse])[0], expected)
+    assert not visibility.observed(points, se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))[None], [glimpse]).any()
+
+
+def test_single_readings_need_not_be_seen_again():
+    depth = np.full(CAMERA.shape, 2.0, np.float32)
+    v, u = pixels(CAMERA.shape)
+    depth[v[5], u[5]] = 4.0  # a spurious reading behind the wall
+    depth[v[40], u[40] + 1] = 0
+    glimpse = Glimpse.of(depth, EVERYTHING)
+    assert np.flatnonzero(~glimpse.certain).tolist() == [5, 40]
+
+
+def test_what_a_return_may_be_compared_with_stays():
+    """A keyframe beside the wall was last seen at second 10: what was stored until then does not give way to later."""
+    walker = Walker()
+    features = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+    keyframe = Keyframe(5.0, at(0.3), features, 0, last_seen=10.0)
+    walker.atlas.keyframes.keyframes.append(keyframe)
+    for _ in range(3 * ENOUGH):
+        walker.see(at(0))
+    kept = [t for t in walker.history.timestamps if t <= 10]
+    assert kept == [0, *range(11 - LOCAL_FRAMES, 11)]
+    assert len(walker.history) <= len(kept) + 4 / 3 * ENOUGH + 4
+    keyframe.last_seen = 3.0 * ENOUGH
+    for _ in range(40):
+        walker.see(at(0))
+    assert sum(t <= 10 for t in walker.history.timestamps) == 1
+
+
+def test_a_chain_of_motions_has_the_noise_of_both(monkeypatch):
+    """Against random motions."""
+    rng = np.random.default_rng(3)
+    first, second, T = (0.02, 0.03), (0.01, 0.02), se3.exp(np.array([0.5, 0.3, -1.2, 0.2, 0.4, 0.1]))
+    ends = []
+    for _ in range(4000):
+        noise = [np.concatenate([rng.normal(0, a, 3), rng.normal(0, b, 3)]) for a, b in (first, second)]
+        ends.append(se3.log(se3.inverse(T) @ se3.exp(noise[0]) @ T @ se3.exp(noise[1])))
+    sampled = np.array(ends).std(axis=0)
+    expected = chained(first, second, float(np.linalg.norm(T[:3, 3])))
+    found = np.sqrt((sampled[:3] ** 2).mean()), np.sqrt((sampled[3:] ** 2).mean())
+    np.testing.assert_allclose(found, expected, rtol=0.03)
+
+
+def test_the_graph_without_removed_frames_has_the_same_solution(monkeypatch):
+    """A walk, and a loop that measures 20 cm at its end: the frames that stay move as with all frames."""
+    all_frames, thinned = Walker(), Walker()
+    for n in range(30):
+        for walker in (all_frames, thinned):
+            walker.see(at(0.2 * n, 0.01 * n), thin=False)
+    for serial in [n for n in range(1, 29) if n % 3]:
+        number = thinned.history.serials.index(serial)
+        thinned.thinning._remove([number - 1, number, number + 1], number + 1)
+    stayed = thinned.history.serials
+    assert stayed == [*range(0, 30, 3), 29]
+    measured = at(5.8, 0.29 + 0.2)
+    moved = []
+    for walker in (all_frames, thinned):
+        monkeypatch.setattr(walker.corrector, "_misfit", lambda *arguments: (0.0, 0.0))
+        walker.corrector.correct(Edge(0, len(walker.history) - 1, measured, 0.005, 0.003))
+        graph = dict(zip(walker.history.serials, walker.history.Ts_world_camera, strict=True))
+        moved.append(np.array([graph[serial][1, 3] for serial in stayed]))
+    assert moved[0][-1] - 0.29 > 0.15
+    np.testing.assert_allclose(moved[1], moved[0], atol=0.01)
+
+
+def test_what_is_removed_moves_with_what_shows_its_place():
+    """The place at x = 0 was seen first and later: poses and keyframes of the first visit follow the later one."""
+    walker = Walker()
+    for x in [0.0] * 5 + [5.0] * 2 + [0.0] * (ENOUGH + 6):
+        walker.see(at(x))
+    features = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+    keyframe = Keyframe(3.0, at(0.0), features)
+    walker.atlas.keyframes.keyframes.append(keyframe)
+    assert [t for t in walker.history.timestamps if t < 7] == [0, 5, 6]
+    nodes = walker.atlas.nodes(0)
+    rise = {0: 0.0, 5: 1.0, 6: 1.0}
+    places = zip(walker.history.Ts_world_camera, walker.history.serials, strict=True)
+    Ts_new = np.stack([at(T[0, 3], rise.get(serial, 0.3)) for T, serial in places])
+    walker.atlas.correct(nodes, Ts_new, walker.atlas.make_volume())
+    found = [round(pose.T_world_camera[1, 3], 9) for pose in walker.atlas.poses]
+    assert found == [0, *[0.3] * 4, 1.0, 1.0, *[0.3] * (ENOUGH + 6)]
+    assert keyframe.T_world_camera[1, 3] == pytest.approx(0.3)
+    edge = walker.corrector.measured_edge(Keyframe(3.2, at(0.0), features), at(0.0, 0.3), at(0.0, 0.3))
+    assert edge is None or walker.history.Ts_world_camera[edge.a][1, 3] == pytest.approx(0.3)
+
+
+def test_measured_motions_go_over_to_what_shows_the_place():
+    walker = Walker()
+    for T in [at(0), at(0.1), at(0.2), at(3)]:
+        walker.see(T, thin=False)
+    walker.edge(1, 3, at(2.9))
+    walker.edge(2, 3, at(2.8), (0.05, 0.05))
+    walker.edge(0, 1, at(0.1))
+    walker.edge(1, 2, at(0.1))
+    walker.thinning._remove([0, 1, 2], 2)
+    assert [(edge.a, edge.b) for edge in walker.corrector.edges] == [(1, 2), (0, 1)]
+    np.testing.assert_allclose([edge.T_a_b[0, 3] for edge in walker.corrector.edges], [2.8, 0.2])
+    np.testing.assert_allclose([edge.sigma_distance for edge in walker.corrector.edges], np.hypot(0.005, 0.005))
+    assert list(walker.history.links) == [2]  # by serial
+
+
+def test_a_loop_after_many_visits_gives_as_good_a_map():
+    """A view is seen many times, then the camera turns round once, drifting, until it sees it again. After the loop the
+    map rebuilt without the removed frames is as near to the room as that of all frames."""
+    camera, turn = Camera(65.6, 65.6, 39.5, 31.5, 80, 64), 45
+    room = dudmap.synthetic.sequence("room", movers=(), frames=turn, camera=camera, camera_path="round", seed=3)
+    images, true = [room[n] for n in range(turn)], room.ground_truth.Ts_world_camera
+    true = se3.inverse(true[0]) @ true
+    config = Config().override([f"volume.max_readings={READINGS}", "volume.voxel_size=0.04"])
+    way = [n for _ in range(12) for n in (0, 1, 2, 3, 4, 3, 2, 1)] + list(range(turn))
+    errors, complete, stored = [], [], []
+    for thin in (False, True):
+        walker = Walker(config, camera)
+        for n, index in enumerate(way):
+            drift = se3.exp(np.array([0.0, 0.1, 0, 0, 0.05, 0]) * max(n + turn - len(way), 0) / turn)
+            walker.see(drift @ true[index], images[index], np.ones(camera.shape, bool), fuse=True, thin=thin)
+        stored.append(len(walker.history))
+        nodes = walker.atlas.nodes(0)
+        T_old = walker.history.Ts_world_camera[nodes[-turn]]
+        loop = Edge(nodes[-turn], nodes[-1], se3.inverse(T_old) @ true[-1], 0.005, 0.003)
+        assert walker.corrector.correct(loop) is not None
+        walker.atlas.complete()
+        misses, shown = [], []
+        for index in (0, 2, 4, 10, 25, turn - 1):
+            seen, known = walker.atlas.volume.raycast(true[index]).depth, images[index].depth
+            both = (seen > 0) & (known > 0)
+            shown.append(both.sum() / (known > 0).sum())
+            misses.append(np.median(np.abs(seen - known)[both]))
+        errors.append(float(np.mean(misses)))
+        complete.append(float(np.mean(shown)))
+    assert stored[1] < 0.65 * stored[0]
+    assert complete[1] > complete[0] - 0.002 > 0.85
+    assert errors[1] < 1.1 * errors[0] + 0.001

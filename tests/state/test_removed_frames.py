@@ -1,0 +1,76 @@
+"""Stored frames that were removed: a system that goes on from a checkpoint, and the room in its database."""
+
+import numpy as np
+import pytest
+
+from dudmap import synthetic
+from dudmap.config import Config
+from dudmap.geometry.camera import Camera
+from dudmap.places import frame_thinning
+from dudmap.slam import Slam
+from dudmap.state.database import StateDatabase, StateReader
+from dudmap.state.system import differences, take_snapshot
+
+SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+SETTINGS = ["loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0.5", "similarity.max_translation=1e-9"]
+
+
+@pytest.fixture
+def slam(monkeypatch):
+    """A system whose camera stays: every frame is stored, and replaced by the ten that follow."""
+    monkeypatch.setattr(frame_thinning, "UNTOUCHED", 4)
+    return Slam(SMALL, Config().override(SETTINGS))
+
+
+@pytest.fixture(scope="module")
+def frames():
+    sequence = synthetic.sequence("room", movers=(), frames=40, camera=SMALL, camera_path="still", noise="kinect")
+    return [sequence[index] for index in range(len(sequence))]
+
+
+def content(store):
+    return {serial: store.encoded(number) for number, serial in enumerate(store.serials)}
+
+
+def test_a_system_with_removed_frames_goes_on_the_same(slam, frames, tmp_path):
+    for frame in frames[:25]:
+        slam.process(frame)
+    store = slam.atlas.history
+    assert 3 <= len(store.removed.serials) == store.serials[-1] + 1 - len(store)
+    slam.save(tmp_path / "state.db")
+    again = Slam.resume(tmp_path / "state.db")
+    other = again.atlas.history
+    assert content(other) == content(store)
+    for number in range(len(store)):
+        a, b = store.glimpse(number), other.glimpse(number)  # the latter is made of the stored files
+        assert a.steps.tolist() == b.steps.tolist()
+        assert a.certain.tolist() == b.certain.tolist()
+    for frame in frames[25:]:
+        slam.process(frame)
+        again.process(frame)
+    assert other.serials == store.serials != list(range(len(store)))
+    assert len(store.removed.serials) > 10
+    assert content(other) == content(store)
+    whole = [take_snapshot(one.atlas, StateDatabase(tmp_path / name)) for name, one in (("a", slam), ("b", again))]
+    assert differences(*whole) == []
+
+
+def test_the_database_uses_the_room_of_removed_frames_again(slam, frames, tmp_path):
+    database = StateDatabase(tmp_path / "state.db")
+    sizes, numbers = [], []
+    for number, frame in enumerate(frames):
+        slam.process(frame)
+        if number % 4:
+            continue
+        database.write(take_snapshot(slam, database), {})
+        reader = StateReader(tmp_path / "state.db")
+        store = slam.atlas.history
+        assert reader.frames(0) == store.serials
+        assert {serial: reader.frame(0, serial) for serial in store.serials} == content(store)
+        reader.close()
+        sizes.append(sum(len(part) for parts in content(store).values() for part in parts))
+        numbers.append(len(store))
+    assert len(store.removed.serials) > 10
+    assert store._file.num_bytes < 1.3 * max(sizes)
+    database.close()
+    np.testing.assert_array_less(numbers, 25)
