@@ -19,7 +19,6 @@ from dudmap.errors import StateError
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.kernels import threads
 from dudmap.pipeline.resume import resume
 from dudmap.pipeline.run import run
 from dudmap.pipeline.storing import Storing
@@ -101,7 +100,6 @@ def in_child(function, *arguments):
     if process == 0:
         code = 1
         try:
-            threads._pool.cache_clear()  # its threads exist in the parent only
             cv2.setNumThreads(1)
             with open(os.devnull, "w") as nowhere, contextlib.redirect_stderr(nowhere):
                 function(*arguments)
