@@ -8,7 +8,7 @@ from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.errors import ConfigError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
-from dudmap.mapping.adaptive_volume import AdaptiveVolume, make_volume
+from dudmap.mapping.adaptive_volume import AdaptiveVolume
 from dudmap.mapping.incremental_mesh import IncrementalMesh
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.volume_mirror import VolumeMirror
@@ -197,16 +197,39 @@ def test_views_are_those_of_the_smaller_voxels():
 
 
 def test_what_is_not_supported_is_said_in_one_sentence():
-    with pytest.raises(ConfigError, match="leave out --max-memory"):
-        make_volume(CAMERA, CONFIG, SENSOR, 3.0, max_blocks=100)
-    with pytest.raises(ConfigError, match="--max-memory"):
-        Slam(CAMERA, Config().override(["volume.adaptive=true"]), max_blocks=100)
     with pytest.raises(ConfigError, match="on the CPU, not on cuda; take --device cpu"):
         Slam(CAMERA, Config().override(["volume.adaptive=true", "device=cuda"]))
     assert Config().override(["volume.adaptive=true"]).compute_device == "cpu"
 
 
-def test_colours_can_be_replaced():
+def test_colours_can_be_replaced_where_the_other_map_is_not_refined():
+    """A map of the kept frames only is refined elsewhere; no voxel loses its colour by that."""
     volume, painted = fused([ridge()] * 6), fused([ridge(gray=200)] * 6)
+    colored = volume.levels[0].blocks.colors != 0
     volume.take_colors(painted)
     np.testing.assert_array_equal(volume.levels[0].blocks.colors, painted.levels[0].blocks.colors)
+    coarse = fused([ridge(gray=60)] * 2)
+    assert coarse.levels[0].blocks.num_voxel_blocks == 0
+    volume.take_colors(coarse)
+    blocks = volume.levels[0].blocks
+    near = colored & (blocks.geometry != 0)
+    red, shade = (blocks.colors[near] >> 20) & 1023, blocks.geometry[near] & 0xFF
+    assert np.count_nonzero(red == 0) < 0.02 * len(red)  # beside the end of what the two frames showed
+    np.testing.assert_allclose(red[red > 0], 4 * 60, atol=4)
+    np.testing.assert_allclose(shade[shade > 0], 60, atol=1)
+    view = volume.raycast(np.eye(4))
+    np.testing.assert_allclose(view.color[view.depth > 0], 60, atol=1)
+
+
+def test_a_map_without_its_finer_levels_is_saved_and_goes_on(tmp_path):
+    """The result of a merge, which fuses the coarsest level."""
+    volume = fused([ridge()] * 2)
+    volume.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as data:
+        np.savez(tmp_path / "coarse.npz", **{key: data[key] for key in data if not key.endswith("1")})
+    again = TsdfVolume.load(tmp_path / "coarse.npz")
+    again.save(tmp_path / "again.npz")
+    for _ in range(4):
+        again.integrate(ridge(), np.eye(4))
+    assert len(fine_centres(again)) > 10
+    assert_linked(again)
