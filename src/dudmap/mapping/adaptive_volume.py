@@ -106,8 +106,10 @@ class AdaptiveVolume(TsdfVolume):
 
     def _empty(self) -> None:
         super()._empty()
-        sizes = (self.voxel_size / 2 ** (n + 1) for n in range(self.config.adaptive_levels))
-        self.levels = [FineBlocks(size, self._new_blocks()) for size in sizes]
+        levels: list[FineBlocks] = []
+        for n in reversed(range(self.config.adaptive_levels)):
+            levels.insert(0, FineBlocks(self.voxel_size / 2 ** (n + 1), self._new_blocks(), *levels[:1]))
+        self.levels = levels
 
     @property
     def all_blocks(self) -> BlockTree:
@@ -153,15 +155,15 @@ class AdaptiveVolume(TsdfVolume):
         view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
         slots, updated = self.window.near, fused
         for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
-            level.follow(parents)
+            level.make_room(parents)
+            gone = parents.entry_of[updated] < 0
+            level.drop(level.children_of(updated[gone]))
             children = level.children_of(slots)
             updated_children = self._average(n, view, color, weights, children, count)
+            updated = updated[~gone]
             depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
-            touched = self._refinements[n].update(level, parents, updated, depths, number)
-            parents.written[touched] = number
-            in_use = level.blocks.entry_of
-            slots, updated = children[in_use[children] >= 0], updated_children[in_use[updated_children] >= 0]
-        self._note_changes(number)
+            self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
+            slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
         return fused
 
     def _average(
@@ -186,20 +188,18 @@ class AdaptiveVolume(TsdfVolume):
         slots, occupied = self.backend.fuse(
             grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
         )
-        blocks.written[slots] = number
+        self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
         if self.config.carving:
-            empty = slots[occupied == 0]
-            self._coarser[n].written[level.parents[empty]] = number
-            level.drop(empty)
+            level.drop(slots[occupied == 0])
         return slots
 
-    def _note_changes(self, number: int) -> None:
-        """Pass on to the coarsest level which blocks were written, for those that follow the changes of the map."""
-        for level, parents in zip(self.levels[::-1], self._coarser[::-1], strict=True):
-            slots = level.blocks.active_slots
-            slots = slots[level.blocks.written[slots] == number]
-            parents.written[level.parents[slots]] = number
+    def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
+        """Note that blocks of a level, 0 is the coarsest, and so those that they lie in, are not as they were."""
+        for level in self.levels[:n][::-1]:
+            level.blocks.written[slots] = self._frame_number
+            slots = level.parents[slots]
+        self.blocks.written[slots] = self._frame_number
 
     def _depths(
         self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
@@ -227,17 +227,18 @@ class AdaptiveVolume(TsdfVolume):
     def _num_levels(self) -> int:
         return 1 + len(self.levels)
 
-    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap) -> None:
+    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
         """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
         assert isinstance(other, AdaptiveVolume)
         if level == 0:
-            super()._take_level_colors(level, slots, other)
+            super()._take_level_colors(level, slots, other, number)
             return
         for finer in self.levels[:level]:
             slots = finer.children_of(slots)
         finer = self.levels[level - 1]
         interpolated = prolonged(self._coarser[level - 1], finer.parents[slots], finer.octants_of(slots))
         finer.take_colors(slots, other.levels[level - 1], interpolated)
+        finer.blocks.written[slots] = number
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -259,15 +260,17 @@ class AdaptiveVolume(TsdfVolume):
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
-            return joined(list(self.extract_pieces()))
+            return joined(list(self.extract_pieces(min_weight)))
         slots = self.active_slots
-        parameters = self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight)
+        parameters = self._mesh_parameters(min_weight)
         meshes = extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)
         return meshes[0]
 
-    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
-        parameters = self._mesh_parameters(self.config.min_weight)
+        parameters = self._mesh_parameters(min_weight)
         meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
         return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
 

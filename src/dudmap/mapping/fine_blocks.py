@@ -25,6 +25,7 @@ class FineBlocks:
     Args:
         voxel_size: Edge of a voxel of this level, metres.
         blocks: Empty blocks to use; None makes some.
+        finer: The next finer level.
 
     Attributes:
         voxel_size: See above.
@@ -34,26 +35,12 @@ class FineBlocks:
         calm: (slots,) uint8 successive evaluations in which a block was not needed.
     """
 
-    def __init__(self, voxel_size: float, blocks: VoxelBlocks | None = None) -> None:
-        self.voxel_size = voxel_size
+    def __init__(self, voxel_size: float, blocks: VoxelBlocks | None = None, finer: "FineBlocks | None" = None) -> None:
+        self.voxel_size, self._finer = voxel_size, finer
         self.blocks = blocks or VoxelBlocks()
         self.children = np.full((0, 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
-
-    def follow(self, parents: VoxelBlocks) -> NDArray[np.int32]:
-        """Make room for the slots of the parents, and drop the blocks whose parent has been released.
-
-        Returns:
-            (n,) int32 slots that were dropped.
-        """
-        self.make_room(parents)
-        slots = self.blocks.active_slots
-        parent = self.parents[slots]
-        orphan = parents.entry_of[parent] < 0
-        orphan |= np.any(parents.slot_coords[parent] != self.blocks.slot_coords[slots] >> 1, axis=1)
-        self.drop(slots[orphan])
-        return slots[orphan]
 
     def make_room(self, parents: VoxelBlocks) -> None:
         """Have room for the links of all slots of the parents and of this level."""
@@ -76,9 +63,11 @@ class FineBlocks:
         return new
 
     def drop(self, slots: NDArray[np.int32]) -> None:
-        """Remove blocks (n,)."""
+        """Remove blocks (n,), with those inside them."""
         if len(slots) == 0:
             return
+        if self._finer is not None:
+            self._finer.drop(self._finer.children_of(slots))
         octants = self.octants_of(slots)
         self.children[self.parents[slots], octants] = -1
         self.blocks.release(slots, 0)
@@ -130,7 +119,7 @@ class FineBlocks:
 
     def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of all children of the parents in slots (m,), in their order."""
-        found = self.children[slots].ravel()
+        found = self.children[slots[slots < len(self.children)]].ravel()  # there is room once a block has been opened
         return found[found >= 0]
 
     def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
@@ -148,15 +137,6 @@ class FineBlocks:
         self.parents[slots[known]] = found[known]
         self.children[found[known], self.octants_of(slots[known])] = slots[known]
         return known
-
-    def copied(self) -> "FineBlocks":
-        """Copy for another thread to read; blocks are neither opened nor dropped there."""
-        out, n = FineBlocks(self.voxel_size), self.blocks.num_slots
-        for name in ("geometry", "colors", "slot_coords", "entry_of"):
-            setattr(out.blocks, name, getattr(self.blocks, name)[:n].copy())
-        out.blocks.use_slots(n)
-        out.children, out.parents = self.children.copy(), self.parents[:n].copy()
-        return out
 
     def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
         """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""

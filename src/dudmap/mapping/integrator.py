@@ -100,7 +100,7 @@ class Integrator:
             count: Number of equal frames that it stands for.
 
         Returns:
-            (n,) int32 slots that it was averaged into and that still are in use.
+            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
         """
         view = self.view(window, camera, depth, T_world_camera)
         self._allocate(blocks, window, view, frame_number)
@@ -108,7 +108,7 @@ class Integrator:
         slots = self._average(blocks, window, view, color, weights, frame_number, count)
         if self.config.carving:
             self._observe_free(blocks, window, view, frame_number, count)
-        return slots[blocks.entry_of[slots] >= 0]
+        return slots
 
     def view(
         self, window: BlockWindow, camera: Camera, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]

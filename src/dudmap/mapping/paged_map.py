@@ -95,7 +95,7 @@ class PagedMap:
                 other._bring(first, first + REGION)
                 slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
                 slots = slots[slots >= 0]
-                self._take_level_colors(level, slots, other)
+                self._take_level_colors(level, slots, other, number)
                 self.blocks.written[slots] = number
                 if self.pager is not None:
                     self.pager.changed(first)
@@ -105,7 +105,8 @@ class PagedMap:
     def _num_levels(self) -> int:
         return 1
 
-    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap") -> None:
-        """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one."""
+    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
+        """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one, as frame
+        ``number``."""
         assert level == 0
         self.blocks.take_colors(slots, other.blocks)

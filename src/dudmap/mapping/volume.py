@@ -277,16 +277,16 @@ class TsdfVolume(PagedMap):
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
-            return joined(list(self.extract_pieces()))
+            return joined(list(self.extract_pieces(min_weight)))
         slots, blocks = self.active_slots, self.blocks
         return Mesh(
             *self.backend.extract_mesh(
                 blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-                self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
+                self._mesh_parameters(min_weight),
             )
         )  # fmt: skip
 
-    def extract_pieces(self) -> Iterator[Mesh]:
+    def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
 
         Blocks that are not in memory come and go meanwhile; frames must not be integrated until the end.
@@ -298,22 +298,26 @@ class TsdfVolume(PagedMap):
             slots = self.slots_at(first + offsets)
             exists = slots >= 0
             if np.any(exists & inner):
-                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1))
+                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1), min_weight)
 
-    def _mesh_parameters(self, min_weight: int) -> MeshParameters:
+    def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
+        min_weight = self.config.min_weight if min_weight is None else min_weight
         return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
 
-    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
         Args:
             slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
+            min_weight: As of ``extract_mesh``.
         """
         blocks = self.blocks
         meshes = self.backend.extract_chunks(
             blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(self.config.min_weight), chunks,
+            self._mesh_parameters(min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]
 
