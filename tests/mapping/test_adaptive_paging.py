@@ -4,10 +4,12 @@ import numpy as np
 import pytest
 
 from dudmap.config import SensorConfig
+from dudmap.errors import MapError
 from dudmap.geometry import se3
 from dudmap.geometry.mesh import joined
 from dudmap.mapping.adaptive_volume import AdaptiveVolume
 from dudmap.mapping.incremental_mesh import IncrementalMesh
+from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.system import restore, take_snapshot
@@ -140,6 +142,21 @@ def test_a_paged_map_is_saved_whole_and_goes_on(maps, tmp_path):
     assert limited.num_blocks > limited.blocks.num_voxel_blocks
     assert content(limited) == content(expected)
     assert_linked(limited)
+
+
+def test_blocks_stay_in_memory_while_the_disk_is_full(monkeypatch):
+    def full(self, region, records):
+        raise MapError("the disk is full")
+
+    monkeypatch.setattr(RegionStore, "write", full)
+    whole, paged = volume(), volume(MAX_BLOCKS)
+    walk([whole, paged], range(50))
+    assert paged.pager is not None
+    paged.pager._executor.submit(int).result()  # everything asked for before has been tried
+    paged.look_at(frame(0)[1])
+    assert "disk is full" in paged.pager.failure
+    assert content(paged) == content(whole)
+    assert_linked(paged)
 
 
 def test_a_paged_map_is_stored_and_goes_on(tmp_path):
