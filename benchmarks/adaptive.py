@@ -31,8 +31,9 @@ from dudmap.geometry import se3
 from dudmap.geometry.mesh import Mesh
 from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.sequences import open_sequence
-from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence, sequence
+from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.synthetic.scene import BOX
+from dudmap.synthetic.setup import sequence
 
 SYSTEMS = {
     "uniform 1 cm": ["volume.voxel_size=0.01"],

@@ -47,7 +47,7 @@ def analytic_map(distance, low, high, voxel_size=0.02, levels=1, refine=None):
     _write(volume.blocks, slots, voxel_size, distance, volume.truncation, volume.sdf_unit)
     parents = volume.blocks
     for number, level in enumerate(volume.levels):
-        level.follow(parents)
+        level.make_room(parents)
         size = 8 * level.voxel_size
         active = parents.active_slots
         for octant in range(8):

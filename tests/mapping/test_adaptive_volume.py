@@ -8,13 +8,14 @@ from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.errors import ConfigError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
-from dudmap.mapping.adaptive_volume import AdaptiveVolume, make_volume
+from dudmap.mapping.adaptive_volume import AdaptiveVolume
 from dudmap.mapping.incremental_mesh import IncrementalMesh
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.volume_mirror import VolumeMirror
 from dudmap.places.saved_map import MAP_FILE
 from dudmap.slam import Slam
 from refined_maps import analytic_map, sphere
+from triangles import triangles
 
 CAMERA = Camera(120.0, 120.0, 79.5, 59.5, 160, 120)
 SENSOR = SensorConfig(sigma_base=0.0005, sigma_scale=0.001)
@@ -134,28 +135,30 @@ def test_poses_and_masks_are_those_of_one_voxel_size():
     assert len(fine_centres(systems[1].volume)) > 10
 
 
-def test_the_incremental_mesh_follows():
-    volume, poses = AdaptiveVolume(CAMERA, CONFIG, SENSOR, 3.0), np.eye(4)
-    live = IncrementalMesh(volume)
-    for number in range(8):
-        poses[0, 3] = 0.01 * number
-        volume.integrate(ridge(), poses)
-        live.update()
-    whole, parts = volume.extract_mesh(), live.mesh()
-    centres = [np.sort(np.round(m.vertices[m.faces].mean(axis=1) @ (1.0, 0.1, 0.01), 5)) for m in (whole, parts)]
-    np.testing.assert_allclose(centres[0], centres[1], atol=2e-5)
-
-
-def test_a_mirror_for_another_thread_has_the_same_mesh():
-    volume = fused([ridge()] * 6)
+@pytest.mark.parametrize("mirrored", [False, True], ids=["direct", "by the copy for another thread"])
+def test_the_incremental_mesh_follows(mirrored):
+    """Bit for bit, also where voxel sizes change beside a part that was extracted before, and where blocks go."""
+    volume, poses = AdaptiveVolume(CAMERA, CONFIG.model_copy(update={"carve_rate": 16}), SENSOR, 3.0), np.eye(4)
     mirror = VolumeMirror(volume)
-    mirror.update()
-    assert len(mirror.volume.levels) == 1
-    parts = [IncrementalMesh(one) for one in (volume, mirror.volume)]
-    for part in parts:
-        part.update()
-    np.testing.assert_array_equal(parts[0].mesh().vertices, parts[1].mesh().vertices)
-    assert len(parts[0].mesh().faces) > 1000
+    live, counts = IncrementalMesh(mirror.volume if mirrored else volume), []
+    for number in range(25):
+        poses[0, 3] = 0.02 * number
+        volume.integrate(flat(1.2) if number > 10 else ridge(), poses)
+        if number % 4 == 0:
+            mirror.update()
+            live.update()
+            counts.append(volume.all_blocks.num_voxel_blocks - volume.num_blocks)
+            np.testing.assert_array_equal(triangles(live.mesh()), triangles(volume.extract_mesh()))
+    assert max(counts) > 20
+    assert counts[-1] < max(counts)
+
+
+def test_pieces_may_ask_for_another_weight():
+    volume = fused([ridge()] * 6)
+    paged = volume.for_camera(CAMERA, max_blocks=10**6)
+    few, many = paged.extract_mesh(1), paged.extract_mesh(19)
+    assert 1000 < len(many.faces) < len(few.faces)
+    np.testing.assert_array_equal(triangles(many), triangles(volume.extract_mesh(19)))
 
 
 def test_a_saved_map_is_the_same_again(tmp_path):
@@ -197,16 +200,39 @@ def test_views_are_those_of_the_smaller_voxels():
 
 
 def test_what_is_not_supported_is_said_in_one_sentence():
-    with pytest.raises(ConfigError, match="leave out --max-memory"):
-        make_volume(CAMERA, CONFIG, SENSOR, 3.0, max_blocks=100)
-    with pytest.raises(ConfigError, match="--max-memory"):
-        Slam(CAMERA, Config().override(["volume.adaptive=true"]), max_blocks=100)
     with pytest.raises(ConfigError, match="on the CPU, not on cuda; take --device cpu"):
         Slam(CAMERA, Config().override(["volume.adaptive=true", "device=cuda"]))
     assert Config().override(["volume.adaptive=true"]).compute_device == "cpu"
 
 
-def test_colours_can_be_replaced():
+def test_colours_can_be_replaced_where_the_other_map_is_not_refined():
+    """A map of the kept frames only is refined elsewhere; no voxel loses its colour by that."""
     volume, painted = fused([ridge()] * 6), fused([ridge(gray=200)] * 6)
+    colored = volume.levels[0].blocks.colors != 0
     volume.take_colors(painted)
     np.testing.assert_array_equal(volume.levels[0].blocks.colors, painted.levels[0].blocks.colors)
+    coarse = fused([ridge(gray=60)] * 2)
+    assert coarse.levels[0].blocks.num_voxel_blocks == 0
+    volume.take_colors(coarse)
+    blocks = volume.levels[0].blocks
+    near = colored & (blocks.geometry != 0)
+    red, shade = (blocks.colors[near] >> 20) & 1023, blocks.geometry[near] & 0xFF
+    assert np.count_nonzero(red == 0) < 0.02 * len(red)  # beside the end of what the two frames showed
+    np.testing.assert_allclose(red[red > 0], 4 * 60, atol=4)
+    np.testing.assert_allclose(shade[shade > 0], 60, atol=1)
+    view = volume.raycast(np.eye(4))
+    np.testing.assert_allclose(view.color[view.depth > 0], 60, atol=1)
+
+
+def test_a_map_without_its_finer_levels_is_saved_and_goes_on(tmp_path):
+    """The result of a merge, which fuses the coarsest level."""
+    volume = fused([ridge()] * 2)
+    volume.save(tmp_path / "map.npz")
+    with np.load(tmp_path / "map.npz") as data:
+        np.savez(tmp_path / "coarse.npz", **{key: data[key] for key in data if not key.endswith("1")})
+    again = TsdfVolume.load(tmp_path / "coarse.npz")
+    again.save(tmp_path / "again.npz")
+    for _ in range(4):
+        again.integrate(ridge(), np.eye(4))
+    assert len(fine_centres(again)) > 10
+    assert_linked(again)

@@ -8,8 +8,9 @@ from scipy.spatial import KDTree
 
 from dudmap.evaluation.surface import point_triangle_distances
 from dudmap.geometry import se3
+from dudmap.geometry.mesh import joined
 from dudmap.mapping.incremental_mesh import IncrementalMesh
-from refined_maps import analytic_map, box, sphere
+from refined_maps import CAMERA, analytic_map, box, sphere
 
 VOXEL = 0.02
 LOW, HIGH = (-2,) * 3, (2,) * 3
@@ -108,3 +109,16 @@ def test_chunks_are_parts_of_the_whole():
         return sorted(map(tuple, np.round(mesh.vertices[mesh.faces].mean(axis=1), 6).tolist()))
 
     np.testing.assert_allclose(triangles(parts.mesh()), triangles(whole), atol=2e-6)
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_pieces_of_a_map_on_disk_meet_without_a_crack(shape):
+    """The shape lies in eight regions, each a piece; vertices at the same place, bit for bit, are one."""
+    volume = analytic_map(SHAPES[shape], LOW, HIGH, VOXEL, 2, mixed).for_camera(CAMERA, max_blocks=10)
+    volume.page_out()
+    assert volume.blocks.num_entries == 0
+    pieces = list(volume.extract_pieces())
+    assert len(pieces) == 8
+    mesh = joined(pieces)
+    faces = np.unique(mesh.vertices, axis=0, return_inverse=True)[1].reshape(-1)[mesh.faces]
+    assert open_edges(faces) == []

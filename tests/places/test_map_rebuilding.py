@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dudmap.config import Config
+from dudmap.config import Config, SensorConfig
 from dudmap.frames.frame import Frame
-from dudmap.mapping.volume import TsdfVolume
+from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.places.atlas import Atlas
 from dudmap.places.frame_store import FrameStore
 from dudmap.places.map_rebuilding import AT_ONCE, PER_FRAME, nearest_views
@@ -13,6 +13,7 @@ from dudmap.places.place_recognition import KeyframeDatabase
 from wavy_wall import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1, "voxel_size": 0.02, "carving": True})
+ADAPTIVE = CONFIG.model_copy(update={"adaptive": True, "adaptive_bend": 0.05})
 COUNT = 60
 EVERYTHING = np.ones(CAMERA.shape, dtype=bool)
 
@@ -30,11 +31,11 @@ def add(atlas, second, T, submap=None):
     atlas.integrate(Frame(float(second), frame.depth, frame.color), EVERYTHING, T)
 
 
-def walked(max_blocks=None, submaps=(COUNT,)):
+def walked(max_blocks=None, submaps=(COUNT,), volume=CONFIG):
     """An atlas after a walk of 15 cm a second along the wall, so many seconds in each submap."""
     config = Config()
     atlas = Atlas(
-        lambda: TsdfVolume(CAMERA, CONFIG, depth_max=3.0, max_blocks=max_blocks),
+        lambda: make_volume(CAMERA, volume, SensorConfig(), 3.0, max_blocks=max_blocks),
         KeyframeDatabase(config.relocalization, CAMERA, config.sensor),
         FrameStore(CAMERA),
     )
@@ -59,28 +60,29 @@ def corrected(atlas, rise):
 
 
 def content(volume):
-    """Everything that is known of each block, by its coordinates."""
+    """Everything that is known of each block of each level, by its coordinates."""
     out = {}
-    for part in volume.records():
+    for level, part in ((level, part) for all in volume.records() for level, part in enumerate([all, *all.finer])):
         voxels = {int(row): n for n, row in enumerate(part.owners)}
         for n, coords in enumerate(part.coords):
             m = voxels.get(n)
             words = None if m is None else (part.geometry[m].tobytes(), part.colors[m].tobytes(), int(part.fused[m]))
-            out[tuple(coords)] = int(part.free_count[n]), words
+            out[(level, *coords)] = int(part.free_count[n]), words
     return out
 
 
 def at_once(atlas):
     """The map of the stored frames as they are now."""
-    volume = TsdfVolume(CAMERA, CONFIG, depth_max=3.0)
+    volume = make_volume(CAMERA, atlas.volume.config, SensorConfig(), 3.0)
     atlas.history.reintegrate(volume)
     return volume
 
 
+@pytest.mark.parametrize("volume", [CONFIG, ADAPTIVE], ids=["one voxel size", "adaptive"])
 @pytest.mark.parametrize("max_blocks", [None, 300])
-def test_the_complete_map_is_that_of_all_stored_frames(max_blocks):
+def test_the_complete_map_is_that_of_all_stored_frames(max_blocks, volume):
     """Frames that come meanwhile are part of it; until then the map holds what is around the camera."""
-    atlas = walked(max_blocks)
+    atlas = walked(max_blocks, volume=volume)
     before = atlas.volume
     corrected(atlas, rise=0.01)
     assert 0 < atlas.volume.num_blocks < 0.8 * at_once(atlas).num_blocks
@@ -92,7 +94,9 @@ def test_the_complete_map_is_that_of_all_stored_frames(max_blocks):
             add(atlas, COUNT + frames, at(0.15 * (COUNT - frames), 0.01 * (COUNT - frames)))
     assert COUNT / (PER_FRAME - 1) <= frames < 1.5 * COUNT  # one of two is for what is ahead at times
     assert atlas.volume is before  # views of the map stay connected
-    assert content(atlas.volume) == content(at_once(atlas))
+    expected = content(at_once(atlas))
+    assert content(atlas.volume) == expected
+    assert any(level == 1 for level, *_ in expected) == volume.adaptive
 
 
 def test_the_provisional_map_grows_ahead_of_the_camera():
@@ -152,7 +156,7 @@ def test_submaps_are_joined_over_many_frames(max_blocks, rebuilt):
         add(atlas, second, at(0.15 * second))
     assert len(atlas.rebuildings[0].missing) > 20
     atlas.complete()
-    expected = TsdfVolume(CAMERA, CONFIG, depth_max=3.0) if rebuilt else walked(submaps=(first,)).volume
+    expected = make_volume(CAMERA, CONFIG, SensorConfig(), 3.0) if rebuilt else walked(submaps=(first,)).volume
     atlas.history.reintegrate(expected, None if rebuilt else range(first, len(atlas.history)))
     assert content(atlas.volume) == content(expected)
 

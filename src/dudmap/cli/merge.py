@@ -44,6 +44,8 @@ def merge(
             f"common surface, {found['denied']:.1%} denied by free space, colour correlation "
             f"{found['color_correlation']:.2f}\nwritten to {report.out}"
         )
+        if found["finer_blocks_left_out"]:
+            text += f"; {found['finer_blocks_left_out']} blocks with smaller voxels are left out"
     else:
         from dudmap.fleet.merge import merge_fleet
 

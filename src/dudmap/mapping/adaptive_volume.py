@@ -19,11 +19,13 @@ from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
 from dudmap.mapping.adaptive_mesh import extract_groups
+from dudmap.mapping.block_tree import BlockTree
 from dudmap.mapping.fine_blocks import FineBlocks, two_levels
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.map_file import MapContent
 from dudmap.mapping.memory_limit import MemoryLimit
-from dudmap.mapping.refinement import Refinement
+from dudmap.mapping.paged_map import PagedMap
+from dudmap.mapping.refinement import Refinement, prolonged
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import VoxelBlocks
 
@@ -69,7 +71,7 @@ class AdaptiveVolume(TsdfVolume):
         levels: The finer levels, that with the larger voxels first.
 
     Raises:
-        ConfigError: The device is not the CPU, or blocks are to wait on disk.
+        ConfigError: The device is not the CPU.
         MapError: As of ``TsdfVolume``.
     """
 
@@ -85,14 +87,9 @@ class AdaptiveVolume(TsdfVolume):
         max_blocks: int | MemoryLimit | None = None,
         extent: float | None = None,
     ) -> None:
-        if max_blocks is not None:
-            raise ConfigError(
-                "a map with volume.adaptive stays in memory as a whole; leave out --max-memory, or set "
-                "volume.adaptive=false"
-            )
         if not isinstance(backend or CpuBackend(), CpuBackend):
             raise ConfigError("a map with volume.adaptive is computed on the CPU; take --device cpu")
-        super().__init__(camera, config, sensor, depth_max, backend, None, extent)
+        super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
         self._integrators, self._refinements = [], []
         for number in range(self.config.adaptive_levels):
             coarse = self.voxel_size / 2**number
@@ -107,10 +104,26 @@ class AdaptiveVolume(TsdfVolume):
     def _halved(self, voxel_size: float) -> VolumeConfig:
         return self.config.model_copy(update={"voxel_size": voxel_size})
 
-    def clear(self) -> None:
-        """Remove everything that was integrated."""
-        super().clear()
-        self.levels = [FineBlocks(self.voxel_size / 2 ** (n + 1)) for n in range(self.config.adaptive_levels)]
+    def _empty(self) -> None:
+        super()._empty()
+        levels: list[FineBlocks] = []
+        for n in reversed(range(self.config.adaptive_levels)):
+            levels.insert(0, FineBlocks(self.voxel_size / 2 ** (n + 1), self._new_blocks(), *levels[:1]))
+        self.levels = levels
+
+    @property
+    def all_blocks(self) -> BlockTree:
+        """See ``TsdfVolume.all_blocks``."""
+        return BlockTree(self.blocks, self.levels)
+
+    @property
+    def view_bytes(self) -> int:
+        """See ``TsdfVolume.view_bytes``."""
+        slots, count = self.window.near, len(self.window.near)
+        for level in self.levels:
+            slots = level.children_of(slots)
+            count += len(slots)
+        return count * self.blocks.slot_bytes
 
     @property
     def num_bytes(self) -> int:
@@ -124,7 +137,7 @@ class AdaptiveVolume(TsdfVolume):
     @property
     def _coarser(self) -> list[VoxelBlocks]:
         """The parents of each level."""
-        return [self.blocks, *(level.blocks for level in self.levels[:-1])]
+        return self.all_blocks.parents
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -135,22 +148,23 @@ class AdaptiveVolume(TsdfVolume):
         weights: NDArray[np.uint8] | None,
         T_world_camera: NDArray[np.float64],
         count: int,
-    ) -> None:
+    ) -> NDArray[np.int32]:
         weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
-        super()._fuse(depth, color, weights, T_world_camera, count)
+        fused = super()._fuse(depth, color, weights, T_world_camera, count)
         number = self._frame_number
         view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
-        slots = self.window.near
+        slots, updated = self.window.near, fused
         for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
-            level.follow(parents)
+            level.make_room(parents)
+            gone = parents.entry_of[updated] < 0
+            level.drop(level.children_of(updated[gone]))
             children = level.children_of(slots)
-            self._average(n, view, color, weights, children, count)
-            updated = slots[parents.written[slots] == number]
+            updated_children = self._average(n, view, color, weights, children, count)
+            updated = updated[~gone]
             depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
-            touched = self._refinements[n].update(level, parents, updated, depths, number)
-            parents.written[touched] = number
-            slots = children[level.blocks.entry_of[children] >= 0]
-        self._note_changes(number)
+            self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
+            slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
+        return fused
 
     def _average(
         self,
@@ -160,10 +174,11 @@ class AdaptiveVolume(TsdfVolume):
         weights: NDArray[np.uint8],
         candidates: NDArray[np.int32],
         count: int,
-    ) -> None:
-        """Average an image into blocks of a finer level, and drop those that it shows to be empty."""
+    ) -> NDArray[np.int32]:
+        """Average an image into blocks of a finer level, and drop those that it shows to be empty; slots (m,) of all
+        these."""
         if len(candidates) == 0:
-            return
+            return candidates
         level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
         blocks = level.blocks
         if self.config.antialias:
@@ -173,19 +188,18 @@ class AdaptiveVolume(TsdfVolume):
         slots, occupied = self.backend.fuse(
             grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
         )
-        blocks.written[slots] = number
+        self._note_change(n + 1, slots)
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
         if self.config.carving:
-            empty = slots[occupied == 0]
-            self._coarser[n].written[level.parents[empty]] = number
-            level.drop(empty)
+            level.drop(slots[occupied == 0])
+        return slots
 
-    def _note_changes(self, number: int) -> None:
-        """Pass on to the coarsest level which blocks were written, for those that follow the changes of the map."""
-        for level, parents in zip(self.levels[::-1], self._coarser[::-1], strict=True):
-            slots = level.blocks.active_slots
-            slots = slots[level.blocks.written[slots] == number]
-            parents.written[level.parents[slots]] = number
+    def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
+        """Note that blocks of a level, 0 is the coarsest, and so those that they lie in, are not as they were."""
+        for level in self.levels[:n][::-1]:
+            level.blocks.written[slots] = self._frame_number
+            slots = level.parents[slots]
+        self.blocks.written[slots] = self._frame_number
 
     def _depths(
         self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
@@ -206,13 +220,25 @@ class AdaptiveVolume(TsdfVolume):
         """See ``TsdfVolume.for_camera``."""
         other = AdaptiveVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.blocks, other._frame_number, other.levels = self.blocks, self._frame_number, self.levels
+        other.pager = self.pager or other.pager
         return other
 
-    def take_colors(self, other: TsdfVolume) -> None:
-        """See ``TsdfVolume.take_colors``."""
-        super().take_colors(other)
-        for level, theirs in zip(self.levels, other.levels, strict=True):
-            level.blocks.take_colors(level.blocks.active_slots, theirs.blocks)
+    @property
+    def _num_levels(self) -> int:
+        return 1 + len(self.levels)
+
+    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
+        """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
+        assert isinstance(other, AdaptiveVolume)
+        if level == 0:
+            super()._take_level_colors(level, slots, other, number)
+            return
+        for finer in self.levels[:level]:
+            slots = finer.children_of(slots)
+        finer = self.levels[level - 1]
+        interpolated = prolonged(self._coarser[level - 1], finer.parents[slots], finer.octants_of(slots))
+        finer.take_colors(slots, other.levels[level - 1], interpolated)
+        finer.blocks.written[slots] = number
 
     # -- reading -----------------------------------------------------------------------------------------------------
 
@@ -233,14 +259,18 @@ class AdaptiveVolume(TsdfVolume):
         """
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        if self.pager is not None:
+            return joined(list(self.extract_pieces(min_weight)))
         slots = self.active_slots
-        parameters = self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight)
+        parameters = self._mesh_parameters(min_weight)
         meshes = extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)
         return meshes[0]
 
-    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
         """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
-        parameters = self._mesh_parameters(self.config.min_weight)
+        parameters = self._mesh_parameters(min_weight)
         meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
         return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
 
@@ -262,3 +292,5 @@ class AdaptiveVolume(TsdfVolume):
             level.blocks = blocks
             if not np.all(level.link(parents)):
                 raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
+        for level, parents in zip(self.levels, self._coarser, strict=True):
+            level.make_room(parents)

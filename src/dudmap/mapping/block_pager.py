@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.mapping import morton
+from dudmap.mapping.block_tree import BlockTree
 from dudmap.mapping.memory_limit import MemoryLimit
 from dudmap.mapping.region_store import RegionStore
 from dudmap.mapping.voxel_blocks import BlockRecords, VoxelBlocks
@@ -33,10 +34,12 @@ Region = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class _Away:
-    """What is known of a region in the store: numbers of blocks, and of those among them that own voxels."""
+    """What is known of a region in the store: numbers of blocks, of those among them that own voxels, and of the finer
+    blocks inside these."""
 
     blocks: int
     voxel_blocks: int
+    finer: int = 0
 
 
 class BlockPager:
@@ -46,8 +49,8 @@ class BlockPager:
     Regions are written and read ahead by one background thread, in the order in which that was asked for.
 
     Args:
-        max_blocks: Largest number of blocks with voxels in memory. Blocks within the view stay, even if they are more.
-            Either a number, or a limit that is asked each time.
+        max_blocks: Largest number of blocks with voxels in memory, of all levels. Blocks within the view stay, even if
+            they are more. Either a number, or a limit that is asked each time.
 
     Attributes:
         failure: Why the store could not be written the last time it was tried; empty if it could. The regions are then
@@ -106,10 +109,11 @@ class BlockPager:
         """The regions in the store."""
         return self._away.keys()
 
-    def away(self) -> dict[Region, tuple[int, int, int]]:
-        """Of each region in the store: a number that is another for each content, and its numbers of blocks and of
-        blocks with voxels."""
-        return {region: (self._serial[region], one.blocks, one.voxel_blocks) for region, one in self._away.items()}
+    def away(self) -> dict[Region, tuple[int, int, int, int]]:
+        """Of each region in the store: a number that is another for each content, and its numbers of blocks, of blocks
+        with voxels and of finer blocks."""
+        away = self._away.items()
+        return {region: (self._serial[region], one.blocks, one.voxel_blocks, one.finer) for region, one in away}
 
     def records(self, region: Region) -> BlockRecords:
         """Content of a region in the store.
@@ -120,12 +124,12 @@ class BlockPager:
         return self._writing[region][0] if region in self._writing else self._read(region)
 
     def continue_from(
-        self, away: dict[Region, tuple[int, int, int]], archive: Callable[[Region], BlockRecords]
+        self, away: dict[Region, tuple[int, int, int, int]], archive: Callable[[Region], BlockRecords]
     ) -> None:
         """Take regions from an archive, which has them as long as they have not come back into memory."""
         self.clear()
-        self._away = {region: _Away(count, owning) for region, (_, count, owning) in away.items()}
-        self._serial = {region: serial for region, (serial, _, _) in away.items()}
+        self._away = {region: _Away(*counts) for region, (_, *counts) in away.items()}
+        self._serial = {region: serial for region, (serial, *_) in away.items()}
         self._archived, self._archive = set(away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
@@ -133,7 +137,7 @@ class BlockPager:
         self._unchanged_since.pop(_key(first >> REGION_BITS), None)
 
     def focus(
-        self, blocks: VoxelBlocks, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int
+        self, blocks: VoxelBlocks | BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int
     ) -> None:
         """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
 
@@ -164,7 +168,7 @@ class BlockPager:
         ranges = (range(a, b + 1) for a, b in zip(_key(first), _key(last), strict=True))
         return [(x, y, z) for x, y, z in product(*ranges) if (x, y, z) in self._away]
 
-    def _bring_back(self, blocks: VoxelBlocks, region: Region, frame_number: int) -> None:
+    def _bring_back(self, blocks: VoxelBlocks | BlockTree, region: Region, frame_number: int) -> None:
         if region in self._writing:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
@@ -195,7 +199,7 @@ class BlockPager:
 
     def _make_room(
         self,
-        blocks: VoxelBlocks,
+        blocks: VoxelBlocks | BlockTree,
         first: NDArray[np.integer],
         last: NDArray[np.integer],
         frame_number: int,
@@ -207,11 +211,11 @@ class BlockPager:
         """
         self._retry_in = max(self._retry_in - 1, 0)
         allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(blocks)
-        needed = blocks.num_voxel_blocks + sum(self._away[region].voxel_blocks for region in coming)
+        needed = blocks.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
         if needed <= allowed or self._retry_in:
             return
         keys, region_of = _regions_of_entries(blocks)
-        owned = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
+        owned = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys))
         outside = np.maximum(np.maximum(first - keys, keys - last), 0)
         distance = np.linalg.norm(outside, axis=1)
         leaving = np.zeros(len(keys), dtype=bool)
@@ -226,15 +230,14 @@ class BlockPager:
             self._send_all_away(blocks, keys, region_of, leaving, frame_number)
             blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
 
-    def page_out(self, blocks: VoxelBlocks, frame_number: int) -> VoxelBlocks:
-        """Move all regions to the store; returns the empty blocks that take the place of ``blocks``."""
+    def page_out(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
+        """Move all regions to the store; empty blocks must take the place of ``blocks``."""
         keys, region_of = _regions_of_entries(blocks)
         self._send_all_away(blocks, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
-        return self.new_blocks()
 
     def _send_all_away(
         self,
-        blocks: VoxelBlocks,
+        blocks: VoxelBlocks | BlockTree,
         keys: NDArray[np.integer],
         region_of: NDArray[np.integer],
         leaving: NDArray[np.bool_],
@@ -243,12 +246,17 @@ class BlockPager:
         """Send the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry."""
         order = np.argsort(region_of, kind="stable")
         ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
+        voxel_blocks = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
+        finer = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys)) - voxel_blocks
         for n in np.flatnonzero(leaving):
-            self._send_away(blocks, _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]], frame_number)
+            entries = order[ends[n - 1] if n else 0 : ends[n]]
+            self._away[_key(keys[n])] = _Away(len(entries), int(voxel_blocks[n]), int(finer[n]))
+            self._send_away(blocks, _key(keys[n]), entries, frame_number)
 
-    def _send_away(self, blocks: VoxelBlocks, region: Region, entries: NDArray[np.integer], frame_number: int) -> None:
-        """Have a region written, unless the store holds it as it is; the caller removes its entries (n,)."""
-        self._away[region] = _Away(len(entries), int(np.count_nonzero(blocks.slot_of[entries] >= 0)))
+    def _send_away(
+        self, blocks: VoxelBlocks | BlockTree, region: Region, entries: NDArray[np.integer], frame_number: int
+    ) -> None:
+        """Have a region written, unless the store holds it as it is; its entries (n,) are removed by the caller."""
         if self._unchanged_since.pop(region, -1) == frame_number:
             return
         self._serial[region] = self._next_serial = self._next_serial + 1
@@ -258,7 +266,7 @@ class BlockPager:
         records = blocks.records(entries)
         self._writing[region] = records, self._submit(self._stored.write, region, records)
 
-    def _settle(self, blocks: VoxelBlocks, frame_number: int) -> None:
+    def _settle(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
         """Forget what has been written; take back what could not be."""
         for region, (records, written) in list(self._writing.items()):
             if not written.done():
@@ -292,7 +300,7 @@ def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
     return [_key(region) for region in regions[np.argsort(morton.encode(regions))]]
 
 
-def _regions_of_entries(blocks: VoxelBlocks) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def _regions_of_entries(blocks: VoxelBlocks | BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
     x, y, z = (blocks.coords[: blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)

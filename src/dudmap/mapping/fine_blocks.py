@@ -1,13 +1,14 @@
 """Blocks of half the voxel size inside the blocks of a coarser level of the map."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.mirror import grown
 from dudmap.kernels.parameters import VoxelGrid
-from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.mapping.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
 
 NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
 NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
@@ -23,6 +24,8 @@ class FineBlocks:
 
     Args:
         voxel_size: Edge of a voxel of this level, metres.
+        blocks: Empty blocks to use; None makes some.
+        finer: The next finer level.
 
     Attributes:
         voxel_size: See above.
@@ -32,27 +35,20 @@ class FineBlocks:
         calm: (slots,) uint8 successive evaluations in which a block was not needed.
     """
 
-    def __init__(self, voxel_size: float) -> None:
-        self.voxel_size = voxel_size
-        self.blocks = VoxelBlocks()
+    def __init__(self, voxel_size: float, blocks: VoxelBlocks | None = None, finer: "FineBlocks | None" = None) -> None:
+        self.voxel_size, self._finer = voxel_size, finer
+        self.blocks = blocks or VoxelBlocks()
         self.children = np.full((0, 8), -1, dtype=np.int32)
         self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
         self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
 
-    def follow(self, parents: VoxelBlocks) -> NDArray[np.int32]:
-        """Make room for the slots of the parents, and drop the blocks whose parent has been released.
-
-        Returns:
-            (n,) int32 slots that were dropped.
-        """
+    def make_room(self, parents: VoxelBlocks) -> None:
+        """Have room for the links of all slots of the parents and of this level."""
         if len(self.children) < len(parents.entry_of):
             self.children = grown(self.children, len(parents.entry_of), -1)
-        slots = self.blocks.active_slots
-        parent = self.parents[slots]
-        orphan = parents.entry_of[parent] < 0
-        orphan |= np.any(parents.slot_coords[parent] != self.blocks.slot_coords[slots] >> 1, axis=1)
-        self.drop(slots[orphan])
-        return slots[orphan]
+        if len(self.parents) < len(self.blocks.entry_of):
+            self.parents = grown(self.parents, len(self.blocks.entry_of), -1)
+            self.calm = grown(self.calm, len(self.blocks.entry_of), 0)
 
     def open(
         self, parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64], frame_number: int
@@ -61,21 +57,60 @@ class FineBlocks:
         coords = (2 * parents.slot_coords[slots] + OCTANTS[octants]).astype(np.int32)
         entries = self.blocks.entries_at(coords, len(coords))
         new = self.blocks.allocate(entries, frame_number)
-        if len(self.parents) < len(self.blocks.entry_of):
-            self.parents = grown(self.parents, len(self.blocks.entry_of), -1)
-            self.calm = grown(self.calm, len(self.blocks.entry_of), 0)
+        self.make_room(parents)
         self.parents[new], self.calm[new] = slots, 0
         self.children[slots, octants] = new
         return new
 
     def drop(self, slots: NDArray[np.int32]) -> None:
-        """Remove blocks (n,)."""
+        """Remove blocks (n,), with those inside them."""
         if len(slots) == 0:
             return
+        if self._finer is not None:
+            self._finer.drop(self._finer.children_of(slots))
         octants = self.octants_of(slots)
         self.children[self.parents[slots], octants] = -1
         self.blocks.release(slots, 0)
         self.parents[slots] = -1
+
+    def records(self, slots: NDArray[np.int32]) -> BlockRecords:
+        """Copies of blocks (n,), all of which own voxels; ``calm`` stands in place of the observations of emptiness."""
+        owners = np.arange(len(slots), dtype=np.int32)
+        voxels = self.blocks.geometry[slots], self.blocks.colors[slots], self.blocks.fused[slots]
+        return BlockRecords(self.blocks.slot_coords[slots], self.calm[slots], owners, *voxels)
+
+    def remove(self, slots: NDArray[np.int32], frame_number: int) -> None:
+        """Forget blocks (n,), whose parents are forgotten next."""
+        blocks = self.blocks
+        self.children[self.parents[slots], self.octants_of(slots)] = -1
+        self.parents[slots] = -1
+        dropped = np.flatnonzero(blocks.slot_of[: blocks.num_entries] < 0)  # earlier; nothing is known of them
+        blocks.remove(np.concatenate([blocks.entry_of[slots], dropped]), frame_number)
+
+    def insert(self, parents: VoxelBlocks, records: BlockRecords, frame_number: int) -> None:
+        """Add blocks, none of which is known, after their parents."""
+        slots = self.blocks.insert(replace(records, free_count=np.zeros_like(records.free_count)), frame_number)
+        self.make_room(parents)
+        self.calm[slots], self.parents[slots] = records.free_count, parents.slots_at(records.coords >> 1)
+        self.children[self.parents[slots], self.octants_of(slots)] = slots
+
+    def take_colors(
+        self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
+    ) -> None:
+        """Give blocks (n,) the colours and intensities that they have in another map.
+
+        Args:
+            slots: The blocks.
+            other: This level of the other map.
+            interpolated: (n, 512) each, voxels and colours that the coarser level has there: where the other map is not
+                refined, or has no colour, these count.
+        """
+        blocks, (voxels, colors) = self.blocks, interpolated
+        there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
+        painted = (there[:, None] >= 0) & (other.blocks.colors[there] != 0)
+        colors = np.where(painted, other.blocks.colors[there], colors)
+        intensities = np.where(painted, other.blocks.geometry[there], voxels) & INTENSITY
+        blocks.write(slots, (blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
 
     def octants_of(self, slots: NDArray[np.int32]) -> NDArray[np.int64]:
         """Octant (n,) of the parent that each of these blocks (n,) covers."""
@@ -84,7 +119,7 @@ class FineBlocks:
 
     def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of all children of the parents in slots (m,), in their order."""
-        found = self.children[slots].ravel()
+        found = self.children[slots[slots < len(self.children)]].ravel()  # there is room once a block has been opened
         return found[found >= 0]
 
     def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
@@ -102,15 +137,6 @@ class FineBlocks:
         self.parents[slots[known]] = found[known]
         self.children[found[known], self.octants_of(slots[known])] = slots[known]
         return known
-
-    def copied(self) -> "FineBlocks":
-        """Copy for another thread to read; blocks are neither opened nor dropped there."""
-        out, n = FineBlocks(self.voxel_size), self.blocks.num_slots
-        for name in ("geometry", "colors", "slot_coords", "entry_of"):
-            setattr(out.blocks, name, getattr(self.blocks, name)[:n].copy())
-        out.blocks.use_slots(n)
-        out.children, out.parents = self.children.copy(), self.parents[:n].copy()
-        return out
 
     def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
         """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""

@@ -33,6 +33,8 @@ class IncrementalMesh:
         self._map_id = volume.map_id
         self._seen = -1
         self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
+        # a vertex beside a chunk, in a block around it, depends on the voxel sizes in all blocks that touch that one
+        self._reach = 2 if volume.levels else 1
 
     def update(self) -> list[Chunk]:
         """Extract what changed since the last update, and return the chunks that may have changed.
@@ -53,9 +55,9 @@ class IncrementalMesh:
             more[: len(self._coords_of)] = self._coords_of
             self._coords_of = more
         self._coords_of[slots] = coords
-        stale = _touched(changed)
+        stale = _touched(changed, self._reach)
         if self._volume.pager is not None:  # a block that waits on disk has left its slot, not the map
-            corners = np.array([[i, j, k] for i in (-1, EDGE) for j in (-1, EDGE) for k in (-1, EDGE)], dtype=np.int32)
+            corners = _corners(-self._reach, EDGE - 1 + self._reach)
             away = self._volume.pager.is_away((stale[:, None] * EDGE + corners).reshape(-1, 3))
             stale = stale[~np.any(away.reshape(-1, 8), axis=1)]
         if len(stale) == 0:
@@ -91,10 +93,14 @@ class IncrementalMesh:
         return meshes + [joined([])] * (len(stale) - len(meshes))
 
 
-def _touched(blocks: NDArray[np.int32]) -> NDArray[np.int32]:
-    """Chunks (m, 3) that hold a voxel within one block of these blocks (n, 3), each once."""
-    corners = np.array([[i, j, k] for i in (-1, 1) for j in (-1, 1) for k in (-1, 1)], dtype=np.int32)
-    chunks = ((blocks[:, None] + corners) // EDGE).reshape(-1, 3).astype(np.int64)
+def _corners(low: int, high: int) -> NDArray[np.int32]:
+    """Corners (8, 3) of a cube."""
+    return np.array([[i, j, k] for i in (low, high) for j in (low, high) for k in (low, high)], dtype=np.int32)
+
+
+def _touched(blocks: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
+    """Chunks (m, 3) that hold a voxel within so many blocks of these blocks (n, 3), each once."""
+    chunks = ((blocks[:, None] + _corners(-reach, reach)) // EDGE).reshape(-1, 3).astype(np.int64)
     packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
     unique = np.unique(packed)
     axes = [(unique >> shift) & ((1 << 21) - 1) for shift in (42, 21, 0)]

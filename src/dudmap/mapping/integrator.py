@@ -85,7 +85,7 @@ class Integrator:
         T_world_camera: NDArray[np.float64],
         frame_number: int,
         count: int,
-    ) -> None:
+    ) -> NDArray[np.int32]:
         """Fuse an image.
 
         Args:
@@ -98,13 +98,17 @@ class Integrator:
             T_world_camera: (4, 4).
             frame_number: Number of the frame among those of the map, from 1.
             count: Number of equal frames that it stands for.
+
+        Returns:
+            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
         """
         view = self.view(window, camera, depth, T_world_camera)
         self._allocate(blocks, window, view, frame_number)
         weights = self.reading_weights(depth, camera) if weights is None else weights
-        self._average(blocks, window, view, color, weights, frame_number, count)
+        slots = self._average(blocks, window, view, color, weights, frame_number, count)
         if self.config.carving:
             self._observe_free(blocks, window, view, frame_number, count)
+        return slots
 
     def view(
         self, window: BlockWindow, camera: Camera, depth: NDArray[np.float32], T_world_camera: NDArray[np.float64]
@@ -158,10 +162,10 @@ class Integrator:
         weights: NDArray[np.uint8],
         frame_number: int,
         count: int,
-    ) -> None:
+    ) -> NDArray[np.int32]:
         """Average distances and colours into the voxels in view; release the blocks that are seen to be empty."""
         if len(window.near) == 0:
-            return
+            return window.near
         turn = frame_number if self.config.take_turns else -1
         if self.config.antialias:
             color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
@@ -173,6 +177,7 @@ class Integrator:
         blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
         if self.config.carving:
             window.release(slots[occupied == 0], blocks, self.config.free_after)
+        return slots
 
     def _observe_free(
         self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int, count: int

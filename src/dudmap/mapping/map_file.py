@@ -42,7 +42,10 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
     """
     camera = volume.camera
     coords, free_count, entries, first = [], [], [], 0
+    finer: list[list[NDArray[np.int32]]] = [[] for _ in volume.levels]
     for part in volume.records():
+        for level, blocks in zip(finer, part.finer, strict=False):
+            level.append(blocks.coords)
         coords.append(part.coords.astype(np.int32))
         free_count.append(part.free_count)
         entries.append(part.owners + np.int32(first))
@@ -66,11 +69,12 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
                 _write_array(archive, name, array.dtype, array.shape, iter([array]))
             for name in ("geometry", "colors"):
                 _write_array(archive, name, np.int32, shape, (getattr(part, name) for part in volume.records()))
-            for number, level in enumerate(volume.levels, start=1):
-                slots = level.blocks.active_slots
-                for name in ("slot_coords", "geometry", "colors"):
-                    array = getattr(level.blocks, name)[slots]
-                    _write_array(archive, f"{name}{number}", array.dtype, array.shape, iter([array]))
+            for n, level in enumerate(finer):
+                places = np.concatenate(level)
+                _write_array(archive, f"slot_coords{n + 1}", np.int32, places.shape, iter([places]))
+                for name in ("geometry", "colors"):
+                    parts = (getattr(part.finer[n], name) for part in volume.records() if n < len(part.finer))
+                    _write_array(archive, f"{name}{n + 1}", np.int32, (len(places), BLOCK**3), parts)
     except OSError as error:
         raise MapError(f"cannot write the map to {path}: {error}") from error
 

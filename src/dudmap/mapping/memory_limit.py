@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 
 from dudmap.errors import ConfigError
+from dudmap.mapping.block_tree import BlockTree
 from dudmap.mapping.voxel_blocks import VoxelBlocks
 
 SAFE_SHARE = 0.75
@@ -36,8 +37,8 @@ class MemoryLimit:
                 f"first frame, so that at least {(taken + LEAST) / 1e6:.0f} MB are needed"
             )
 
-    def __call__(self, blocks: VoxelBlocks) -> int:
-        """Largest number of blocks with voxels that a map may have in memory now."""
+    def __call__(self, blocks: VoxelBlocks | BlockTree) -> int:
+        """Largest number of blocks with voxels, of all levels, that a map may have in memory now."""
         spare = SAFE_SHARE * self.limit - resident_bytes()
         if spare < 0 and _return_freed():
             spare = SAFE_SHARE * self.limit - resident_bytes()

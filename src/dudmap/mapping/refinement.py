@@ -8,7 +8,7 @@ from dudmap.kernels.parameters import TruncationBand
 from dudmap.kernels.refinement import SATURATED, examine, prolong
 from dudmap.kernels.threads import bands, run_bands
 from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood
-from dudmap.mapping.voxel_blocks import VoxelBlocks
+from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
 FIRST = 3
 """Frames after which a block is examined for the first time."""
@@ -68,7 +68,7 @@ class Refinement:
         """
         sigma = self.sensor.sigma(depths)
         fused = parents.fused[slots].astype(np.int64)
-        due = (fused == FIRST) | ((fused > FIRST) & ((slots + number) % PERIOD == 0))
+        due = (fused == FIRST) | ((fused > FIRST) & ((_phases(parents, slots) + number) % PERIOD == 0))
         due &= (depths > 0) & (sigma < level.voxel_size)
         slots, sigma, fused = slots[due], sigma[due], fused[due]
         if len(slots) == 0:
@@ -83,7 +83,7 @@ class Refinement:
         rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
         if len(rows):
             opened = level.open(parents, slots[rows], octants, number)
-            self._prolong(level, parents, near[rows], octants, opened)
+            level.blocks.write(opened, *prolonged(parents, slots[rows], octants))
         dropped = self._drop_calm(level, children, surface, needed)
         changed = np.zeros(len(slots), dtype=bool)
         changed[rows] = True
@@ -117,16 +117,20 @@ class Refinement:
         )
         return bend, texture, surface.astype(bool)
 
-    def _prolong(
-        self,
-        level: FineBlocks,
-        parents: VoxelBlocks,
-        near: NDArray[np.int32],
-        octants: NDArray[np.int64],
-        slots: NDArray[np.int32],
-    ) -> None:
-        """Fill new blocks with the interpolation of the coarser level."""
-        geometry, colors = level.blocks.geometry, level.blocks.colors
-        prolong(0, len(slots), parents.geometry, parents.colors, near, octants, slots, geometry, colors)
-        level.blocks.geometry_mirror.wrote(slots)
-        level.blocks.colors_mirror.wrote(slots)
+
+def prolonged(
+    parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Interpolation of the coarser level in octants (n,) of blocks in slots (n,): voxels and colours (n, 512)."""
+    voxels, colors = np.empty((2, len(slots), BLOCK**3), dtype=np.int32)
+    rows = np.arange(len(slots), dtype=np.int32)
+    prolong(
+        0, len(slots), parents.geometry, parents.colors, neighbourhood(parents, slots), octants, rows, voxels, colors
+    )
+    return voxels, colors
+
+
+def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Numbers (n,) that spread the examinations of blocks over the frames; of their place alone, so that it does not
+    matter when blocks came into memory. Along each axis all remainders by ``PERIOD`` follow each other."""
+    return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])

@@ -5,7 +5,7 @@ import tempfile
 import threading
 import weakref
 from collections.abc import Sequence
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +13,8 @@ import numpy as np
 from dudmap.errors import MapError
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords
 
-COLUMNS = tuple(field.name for field in fields(BlockRecords))
+COLUMNS = tuple(field.name for field in fields(BlockRecords) if field.name != "finer")
+"""Arrays of a row: of the blocks of one level of a region, 0 is the coarsest."""
 _TYPES = {
     "coords": (np.int32, 3), "free_count": (np.uint8, 1), "owners": (np.int32, 1), "geometry": (np.int32, BLOCK**3),
     "colors": (np.int32, BLOCK**3), "fused": (np.uint8, 1),
@@ -33,7 +34,8 @@ class RegionStore:
         connection.execute("PRAGMA journal_mode = MEMORY")  # a scratch file: nothing is read from it after a crash
         connection.execute("PRAGMA synchronous = OFF")
         columns = ", ".join(f"{name} BLOB" for name in COLUMNS)
-        connection.execute(f"CREATE TABLE regions (x INTEGER, y INTEGER, z INTEGER, {columns}, PRIMARY KEY (x, y, z))")
+        key = "x INTEGER, y INTEGER, z INTEGER, level INTEGER"
+        connection.execute(f"CREATE TABLE regions ({key}, {columns}, PRIMARY KEY (x, y, z, level))")
         self.close = weakref.finalize(self, _remove, connection, self._lock, folder)
 
     def write(self, region: tuple[int, int, int], records: BlockRecords) -> None:
@@ -42,11 +44,12 @@ class RegionStore:
         Raises:
             MapError: The file cannot be written.
         """
-        blobs = blobs_of(records)
-        marks = ", ".join("?" * (3 + len(blobs)))
+        rows = [(*region, level, *blobs) for level, blobs in enumerate(blobs_of(records))]
+        marks = ", ".join("?" * (4 + len(COLUMNS)))
         try:
             with self._lock, self._connection:
-                self._connection.execute(f"INSERT OR REPLACE INTO regions VALUES ({marks})", (*region, *blobs))
+                self._connection.execute("DELETE FROM regions WHERE x = ? AND y = ? AND z = ?", region)
+                self._connection.executemany(f"INSERT INTO regions VALUES ({marks})", rows)
         except sqlite3.Error as error:
             raise MapError(
                 f"blocks of the map cannot be stored in {tempfile.gettempdir()}: {error}; make room there, or name "
@@ -59,28 +62,35 @@ class RegionStore:
         Raises:
             MapError: The file cannot be read, or does not hold the region.
         """
-        query = f"SELECT {', '.join(COLUMNS)} FROM regions WHERE x = ? AND y = ? AND z = ?"
+        query = f"SELECT {', '.join(COLUMNS)} FROM regions WHERE x = ? AND y = ? AND z = ? ORDER BY level"
         try:
             with self._lock:
-                row = self._connection.execute(query, region).fetchone()
+                rows = self._connection.execute(query, region).fetchall()
         except sqlite3.Error as error:
             raise MapError(f"blocks of the map cannot be read from {tempfile.gettempdir()}: {error}") from error
-        if row is None:
+        if not rows:
             raise MapError(f"region {region} of the map is missing in {tempfile.gettempdir()}")
-        return records_of(row)
+        return records_of(rows)
 
 
-def blobs_of(records: BlockRecords) -> list[memoryview]:
-    """The arrays of records as they are stored, in the order of ``COLUMNS``."""
-    return [np.ascontiguousarray(getattr(records, name)).data for name in COLUMNS]
+def blobs_of(records: BlockRecords) -> list[list[memoryview]]:
+    """The arrays of records as they are stored, in the order of ``COLUMNS``, level by level."""
+    levels = [records, *records.finer]
+    return [[np.ascontiguousarray(getattr(level, name)).data for name in COLUMNS] for level in levels]
 
 
-def records_of(blobs: Sequence[bytes]) -> BlockRecords:
-    """The records of stored arrays.
+def records_of(rows: Sequence[Sequence[bytes]]) -> BlockRecords:
+    """The records of stored arrays, level by level.
 
     Raises:
         ValueError: They do not fit each other.
     """
+    levels = [_level_of(blobs) for blobs in rows]
+    return replace(levels[0], finer=tuple(levels[1:]))
+
+
+def _level_of(blobs: Sequence[bytes]) -> BlockRecords:
+    """The blocks of one level; see ``records_of``."""
     arrays = {}
     for name, blob in zip(COLUMNS, blobs, strict=True):
         kind, width = _TYPES[name]

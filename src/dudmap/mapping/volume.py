@@ -25,13 +25,13 @@ from dudmap.kernels.parameters import (
     RaycastResult,
     VoxelGrid,
 )
-from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
-from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.block_pager import REGION, BlockPager
 from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.integrator import DEPTH_MIN, Integrator, StorageScale
 from dudmap.mapping.map_file import read_map, write_map
 from dudmap.mapping.memory_limit import MemoryLimit
-from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks
+from dudmap.mapping.paged_map import PagedMap
+from dudmap.mapping.voxel_blocks import BLOCK
 
 __all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
 
@@ -43,7 +43,7 @@ MAX_WINDOW = 288
 """Largest number of blocks along the edge of the window; its cells then take 96 MB."""
 
 
-class TsdfVolume:
+class TsdfVolume(PagedMap):
     """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
 
     Args:
@@ -109,11 +109,10 @@ class TsdfVolume:
 
     def clear(self) -> None:
         """Remove everything that was integrated."""
-        self.window = BlockWindow(self.block_size, self._window_cells)
-        self.blocks = VoxelBlocks() if self.pager is None else self.pager.new_blocks()
+        self._empty()
         if self.pager is not None:
             self.pager.clear()
-        self._left: NDArray[np.int64] | None = None  # where the window was when all blocks left the memory
+        self._left = None
         self._frame_number = 0
         self.map_id = next(_MAP_IDS)
 
@@ -121,11 +120,6 @@ class TsdfVolume:
     def is_empty(self) -> bool:
         """Whether nothing has been integrated yet."""
         return self.num_blocks == 0
-
-    @property
-    def num_blocks(self) -> int:
-        """Blocks that own voxels, also those that are not in memory."""
-        return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
 
     @property
     def num_free_blocks(self) -> int:
@@ -194,9 +188,9 @@ class TsdfVolume:
         weights: NDArray[np.uint8] | None,
         T_world_camera: NDArray[np.float64],
         count: int,
-    ) -> None:
+    ) -> NDArray[np.int32]:
         """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
-        self._integrator.integrate(
+        return self._integrator.integrate(
             self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
         )
 
@@ -214,30 +208,6 @@ class TsdfVolume:
         other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
         return other
-
-    def take_colors(self, other: "TsdfVolume") -> None:
-        """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
-
-        A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
-        """
-        assert other.config == self.config
-        number = self._frame_number + 1
-        for first in self._visited_regions():
-            other._bring(first, first + REGION)
-            slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
-            slots = slots[slots >= 0]
-            self.blocks.take_colors(slots, other.blocks)
-            self.blocks.written[slots] = number
-            if self.pager is not None:
-                self.pager.changed(first)
-        self._frame_number = number
-
-    def page_out(self) -> None:
-        """Have all blocks wait on disk, where the map may do so, until they are needed again."""
-        if self.pager is not None and self.blocks.num_entries:
-            self.blocks = self.pager.page_out(self.blocks, self._frame_number)
-            self._left = self._left if self.window.origin is None else self.window.origin
-            self.window = BlockWindow(self.block_size, self._window_cells)
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
@@ -307,16 +277,16 @@ class TsdfVolume:
         if self.is_empty:
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
-            return joined(list(self.extract_pieces()))
+            return joined(list(self.extract_pieces(min_weight)))
         slots, blocks = self.active_slots, self.blocks
         return Mesh(
             *self.backend.extract_mesh(
                 blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-                self._mesh_parameters(self.config.min_weight if min_weight is None else min_weight),
+                self._mesh_parameters(min_weight),
             )
         )  # fmt: skip
 
-    def extract_pieces(self) -> Iterator[Mesh]:
+    def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
 
         Blocks that are not in memory come and go meanwhile; frames must not be integrated until the end.
@@ -328,50 +298,26 @@ class TsdfVolume:
             slots = self.slots_at(first + offsets)
             exists = slots >= 0
             if np.any(exists & inner):
-                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1))
+                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1), min_weight)
 
-    def records(self) -> Iterator[BlockRecords]:
-        """Copies of all blocks, in parts: everything at once if it is in memory, else region by region."""
-        if self.pager is None:
-            yield self.blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # as in the mesh
-            return
-        for first in self._visited_regions():
-            yield self.blocks.records(self.blocks.entries_in(first, first + REGION))
-
-    def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
-        """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
-        for region in regions_of(self.blocks, self.pager):
-            first = np.array(region, dtype=np.int32) * REGION
-            self._bring(first, first + REGION)
-            yield first
-        if self.pager is not None and self.window.origin is not None:
-            self._place_window(self.window.origin)
-
-    def _place_window(self, origin: NDArray[np.int64]) -> None:
-        self._bring(origin, origin + self.window.shape)
-        self.window.fill(origin, self.blocks)
-
-    def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
-        """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
-        if self.pager is None and (room := self.blocks.colors_mirror.max_rows):
-            self.pager = BlockPager(room)
-        if self.pager is not None:
-            self.pager.focus(self.blocks, low, high, self._frame_number)
-
-    def _mesh_parameters(self, min_weight: int) -> MeshParameters:
+    def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
+        min_weight = self.config.min_weight if min_weight is None else min_weight
         return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
 
-    def extract_chunks(self, slots: NDArray[np.int32], chunks: NDArray[np.int64]) -> list[Mesh]:
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
         """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
 
         Args:
             slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
+            min_weight: As of ``extract_mesh``.
         """
         blocks = self.blocks
         meshes = self.backend.extract_chunks(
             blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(self.config.min_weight), chunks,
+            self._mesh_parameters(min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]
 

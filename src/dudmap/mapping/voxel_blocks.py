@@ -31,6 +31,7 @@ class BlockRecords:
         owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
         geometry, colors: (m, 512) int32 packed voxels.
         fused: (m,) uint8 frames that were fused into a block, 255 or more.
+        finer: Of each finer level, the blocks inside these (``FineBlocks.records``).
     """
 
     coords: NDArray[np.int32]
@@ -39,6 +40,7 @@ class BlockRecords:
     geometry: NDArray[np.int32]
     colors: NDArray[np.int32]
     fused: NDArray[np.uint8]
+    finer: "tuple[BlockRecords, ...]" = ()
 
 
 class VoxelBlocks:
@@ -246,13 +248,18 @@ class VoxelBlocks:
         self.table.fill(hashing.EMPTY)
         hashing.rebuild(self.table, self.coords, m)
 
-    def insert(self, records: BlockRecords, frame_number: int) -> None:
-        """Add blocks, none of which is known."""
+    def insert(self, records: BlockRecords, frame_number: int) -> NDArray[np.int32]:
+        """Add blocks, none of which is known; slots (m,) int32 of those that own voxels."""
         entries = self.entries_at(records.coords, len(records.coords))
         self.free_count[entries] = records.free_count
         slots = self.allocate(entries[records.owners], frame_number)
         self.write(slots, records.geometry, records.colors)
         self.fused[slots] = records.fused
+        return slots
+
+    def owned_slots(self) -> NDArray[np.int64]:
+        """Number (entries,) of slots that each entry owns."""
+        return (self.slot_of[: self.num_entries] >= 0).astype(np.int64)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""

@@ -66,6 +66,8 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
     tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
     tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
+    finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
+    tree |= {"finer_blocks_left_out": sum(finer)}
     write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
     return MergeReport(out, pair, tree)
 

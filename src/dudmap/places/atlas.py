@@ -167,8 +167,7 @@ class Atlas:
         """Have the current map leave the memory, unless another one of the same view fits beside it."""
         limit = None if self.volume.pager is None else self.volume.pager.max_blocks
         if isinstance(limit, MemoryLimit):
-            view = len(self.volume.window.near) * self.volume.blocks.slot_bytes
-            if limit.limit - resident_bytes() < view:
+            if limit.limit - resident_bytes() < self.volume.view_bytes:
                 self.volume.page_out()
 
     def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:

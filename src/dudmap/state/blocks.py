@@ -11,6 +11,7 @@ from dudmap.errors import StateError
 from dudmap.kernels import hashing
 from dudmap.mapping.block_pager import Region
 from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
 from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
@@ -142,19 +143,30 @@ class StoredMaps:
 
 def _index(volume: TsdfVolume) -> dict[str, Any]:
     """Everything of the blocks and the window of a map except the voxels."""
-    blocks, window = volume.blocks, volume.window
+    window = {"near": volume.window.near, "origin": volume.window.origin}
+    return _index_of(volume.blocks) | window | {"levels": [_fine_index(level) for level in volume.levels]}
+
+
+def _index_of(blocks: VoxelBlocks) -> dict[str, Any]:
+    """Everything of blocks except the voxels."""
     n, m = blocks.num_entries, blocks.num_slots
     return {
         "coords": blocks.coords[:n], "free_count": blocks.free_count[:n], "slot_of": blocks.slot_of[:n],
         "entry_of": blocks.entry_of[:m], "slot_coords": blocks.slot_coords[:m], "written": blocks.written[:m],
         "fused": blocks.fused[:m], "released": blocks._released, "table": len(blocks.table),
-        "near": window.near, "origin": window.origin,
     }  # fmt: skip
 
 
-def _away_rows(away: dict[Region, tuple[int, int, int]]) -> NDArray[np.int64]:
-    """Coordinates, number of the content, and numbers of blocks (n, 6) of regions that have left the memory."""
-    return np.array([(*region, *numbers) for region, numbers in away.items()], np.int64).reshape(-1, 6)
+def _fine_index(level: FineBlocks) -> dict[str, Any]:
+    """The same of a finer level, with the voxels: they are few, and are stored as arrays."""
+    m = level.blocks.num_slots
+    voxels = {"geometry": level.blocks.geometry[:m], "colors": level.blocks.colors[:m], "calm": level.calm[:m]}
+    return _index_of(level.blocks) | voxels
+
+
+def _away_rows(away: dict[Region, tuple[int, int, int, int]]) -> NDArray[np.int64]:
+    """Coordinates, number of the content, and numbers of blocks (n, 7) of regions that have left the memory."""
+    return np.array([(*region, *numbers) for region, numbers in away.items()], np.int64).reshape(-1, 7)
 
 
 def restore_map(
@@ -177,40 +189,76 @@ def restore_map(
         StateError: The rows do not fit the index.
     """
     frame_number, left = volume._frame_number, volume._left
-    TsdfVolume.clear(volume)  # not what a subclass has besides, which is in the tree
+    volume.clear()
     volume._frame_number, volume._left = frame_number, left
+    owned = _check_index(index)
+    order = np.argsort(slots)
+    number = int(keys[0] >> MAP_SHIFT) if len(keys) else 0
+    if not np.array_equal(slots[order], owned) or not np.array_equal(
+        keys[order], block_keys(number, index["slot_coords"][owned])
+    ):
+        raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
+    blocks = volume.blocks
+    _restore_blocks(blocks, index, paged=volume.pager is not None)
+    blocks.geometry[slots], blocks.colors[slots] = voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :]
+    _restore_levels(volume, index["levels"])
+    if volume.pager is not None:
+        away = {(x, y, z): tuple(numbers) for x, y, z, *numbers in index["away"].tolist()}
+        volume.pager.continue_from(away, read_region)
+    _restore_window(volume.window, blocks, index)
+
+
+def _check_index(index: dict[str, Any]) -> NDArray[np.int64]:
+    """Check that the parts of an index fit each other; slots (n,) that own voxels.
+
+    Raises:
+        StateError: They do not.
+    """
     n, m = len(index["coords"]), len(index["entry_of"])
     sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
     owned = np.flatnonzero(index["entry_of"] >= 0)
-    order = np.argsort(slots)
-    number = int(keys[0] >> MAP_SHIFT) if len(keys) else 0
     if (
         any(a != b for a, b in (*sizes, (len(index["written"]), m), (len(index["fused"]), m)))
-        or not np.array_equal(slots[order], owned)
-        or not np.array_equal(keys[order], block_keys(number, index["slot_coords"][owned]))
         or not np.array_equal(index["slot_of"][index["entry_of"][owned]], owned)
         or not 0.8 * index["table"] >= n
     ):
-        raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
-    blocks = VoxelBlocks()
+        raise StateError("the stored map is damaged: the parts of its index do not fit each other")
+    return owned
+
+
+def _restore_blocks(blocks: VoxelBlocks, index: dict[str, Any], *, paged: bool) -> None:
+    """Fill empty blocks, but for their voxels, with an index; with room for more slots where a map is paged."""
+    n, m = len(index["coords"]), len(index["entry_of"])
+    capacity = max(m, len(blocks.geometry)) if paged else m
     blocks.num_entries = n
     blocks.coords, blocks.free_count, blocks.slot_of = index["coords"], index["free_count"], index["slot_of"]
-    blocks.entry_of, blocks.slot_coords = index["entry_of"], index["slot_coords"]
-    blocks.written, blocks.fused, blocks._released = index["written"], index["fused"], index["released"]
-    capacity = max(m, len(volume.blocks.geometry)) if volume.pager is not None else m
     for name in ("slot_coords", "written", "fused"):
-        setattr(blocks, name, grown(getattr(blocks, name), capacity, 0))
-    blocks.entry_of = grown(blocks.entry_of, capacity, -1)
+        setattr(blocks, name, grown(index[name], capacity, 0))
+    blocks.entry_of, blocks._released = grown(index["entry_of"], capacity, -1), index["released"]
     blocks.geometry, blocks.colors = (np.zeros((capacity, BLOCK**3), np.int32) for _ in range(2))
     blocks.use_slots(m)
-    blocks.geometry[slots], blocks.colors[slots] = voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :]
     blocks.table = np.full(index["table"], hashing.EMPTY, dtype=np.int32)
     hashing.rebuild(blocks.table, blocks.coords, n)
-    volume.blocks = blocks
-    if volume.pager is not None:
-        away = {(x, y, z): (serial, count, owning) for x, y, z, serial, count, owning in index["away"].tolist()}
-        volume.pager.continue_from(away, read_region)
-    _restore_window(volume.window, blocks, index)
+
+
+def _restore_levels(volume: TsdfVolume, indices: list[dict[str, Any]]) -> None:
+    """Fill the finer levels of a map whose coarsest one is complete.
+
+    Raises:
+        StateError: A level does not fit its index or the next coarser one.
+    """
+    parents = volume.blocks
+    for level, index in zip(volume.levels, indices, strict=True):
+        _check_index(index)
+        blocks, m = level.blocks, len(index["entry_of"])
+        _restore_blocks(blocks, index, paged=volume.pager is not None)
+        if {len(index[name]) for name in ("geometry", "colors", "calm")} != {m}:
+            raise StateError("the stored map is damaged: blocks with smaller voxels lack some of them")
+        blocks.geometry[:m], blocks.colors[:m] = index["geometry"], index["colors"]
+        if not np.all(level.link(parents)):
+            raise StateError("the stored map is damaged: blocks with smaller voxels lie in no larger block")
+        level.calm[:m] = index["calm"]
+        parents = blocks
 
 
 def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, Any]) -> None:

@@ -30,7 +30,7 @@ from dudmap.state.tree import Snapshot, lines
 
 APPLICATION = 0x44554453
 """Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
-SCHEMA = 1
+SCHEMA = 2
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 ROWS = 4096
@@ -40,8 +40,9 @@ CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
 CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
 CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
-CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, crc INTEGER NOT NULL, coords BLOB, free_count BLOB,
-                      owners BLOB, geometry BLOB, colors BLOB, fused BLOB, PRIMARY KEY (map, x, y, z));
+CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, level INTEGER, crc INTEGER NOT NULL, coords BLOB,
+                      free_count BLOB, owners BLOB, geometry BLOB, colors BLOB, fused BLOB,
+                      PRIMARY KEY (map, x, y, z, level));
 CREATE TABLE frames (store INTEGER, number INTEGER, depth BLOB NOT NULL, color BLOB NOT NULL, mask BLOB NOT NULL,
                      PRIMARY KEY (store, number));
 """
@@ -136,13 +137,15 @@ class StateDatabase:
             self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
             self._execute("DELETE FROM regions WHERE map = ?", number)
         for changed in maps:
-            stored = known.get(changed.number)
+            number, stored = changed.number, known.get(changed.number)
             if stored is not None:
                 run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
-                back = ((changed.number, *region) for region in stored.regions.keys() - changed.away.keys())
+                back = ((number, *region) for region in stored.regions.keys() - changed.away.keys())
                 run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
-            rows = ((changed.number, *region, *_region_row(records)) for region, records in changed.regions)
-            run(f"INSERT OR REPLACE INTO regions VALUES ({', '.join('?' * 11)})", rows)
+            for region, records in changed.regions:
+                self._execute("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", number, *region)
+                rows = ((number, *region, *row) for row in _region_rows(records))
+                run(f"INSERT INTO regions VALUES ({', '.join('?' * 12)})", rows)
             run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
 
     def _write_frames(self, frames: list[FrameSnapshot]) -> None:
@@ -253,12 +256,14 @@ class StateReader:
         Raises:
             StateError: They are missing, or the database is damaged.
         """
-        select = f"SELECT crc, {', '.join(COLUMNS)} FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?"
+        columns, where = ", ".join(COLUMNS), "map = ? AND x = ? AND y = ? AND z = ?"
+        select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
         rows = list(self._rows(select, map_number, *region))
         try:
-            if not rows or _checksum(rows[0][1:]) != rows[0][0]:
+            whole = all(row[0] == n and _checksum(row[2:]) == row[1] for n, row in enumerate(rows))
+            if not rows or not whole:
                 raise ValueError("it is missing or not as it was written")
-            return records_of(rows[0][1:])
+            return records_of([row[2:] for row in rows])
         except (ValueError, TypeError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
 
@@ -297,10 +302,10 @@ class StateReader:
 _HEADER = "application_id", "user_version"
 
 
-def _region_row(records: BlockRecords) -> list[Any]:
-    """Checksum and arrays of a region."""
-    blobs = blobs_of(records)
-    return [_checksum(blobs), *blobs]
+def _region_rows(records: BlockRecords) -> Iterable[list[Any]]:
+    """Level, checksum and arrays of the blocks of a region, level by level."""
+    for level, blobs in enumerate(blobs_of(records)):
+        yield [level, _checksum(blobs), *blobs]
 
 
 def _checksum(blobs: Sequence[bytes | memoryview]) -> int:

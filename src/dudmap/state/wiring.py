@@ -34,7 +34,12 @@ REBUILT = {
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
     "StageTimer": ("_clock", "_marks", "_inner"),  # of a device, and only until the frame is done
     "Slam": ("device",),  # a run may be continued on another one
-    "TsdfVolume": ("blocks", "window", "map_id"),  # the blocks have a table; the number is one of this process
+    "TsdfVolume": (
+        "blocks",
+        "levels",
+        "window",
+        "map_id",
+    ),  # the blocks have a table; the number is one of this process
 }
 """Attributes by class that a new object makes itself, so that they are not part of the state."""
 BACKENDS = frozenset({"CpuBackend", "FallbackBackend"})
