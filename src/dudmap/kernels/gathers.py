@@ -119,7 +119,10 @@ def load_pairs(typing_context, pairs, places, out):
     """
 
     def generate(context, builder, signature, arguments):
-        arrays = [context.make_array(kind)(context, builder, value) for kind, value in zip(signature.args, arguments)]
+        arrays = [
+            context.make_array(kind)(context, builder, value)
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
         largest = cgutils.alloca_once_value(builder, _every(0))
         with cgutils.for_range(builder, builder.udiv(arrays[1].nitems, I64(LANES))) as loop:
             start = builder.mul(loop.index, I64(LANES))

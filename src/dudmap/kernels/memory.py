@@ -4,7 +4,6 @@ from llvmlite import ir
 from numba.core import types
 from numba.extending import intrinsic
 
-
 LINES = 16
 """Cache lines of one call of ``prefetch``: as many as a core of most processors can wait for; more of them at once hold
 up the loads that follow."""
