@@ -12,7 +12,7 @@ from dudmap.mapping.volume import TsdfVolume
 
 @njit
 def loaded(pairs, places, out):
-    return load_pairs(pairs, places, out)
+    return load_pairs(pairs, places, out)  # pyright: ignore[reportCallIssue]
 
 
 def test_pairs_are_those_that_indexing_finds():
