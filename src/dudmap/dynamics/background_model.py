@@ -55,13 +55,14 @@ class BackgroundModel:
         """
         import cv2
 
-        depth, intensity = _subsampled(level)
         none = np.zeros(level.depth.shape, dtype=bool)
-        if self._background is None:
+        stride = _stride(level)
+        farthest = cv2.dilate(level.depth, np.ones((stride, stride), np.uint8), anchor=(0, 0))[::stride, ::stride]
+        hole = np.asarray(farthest) <= 0
+        if self._background is None or not hole.any():
             return none
+        depth, intensity = _subsampled(level)
         _, background, times = self._seen_from(timestamp, level, depth.shape, T_world_camera)
-        rows, columns = (np.arange(0, size, _stride(level)) for size in level.depth.shape)
-        hole = np.maximum.reduceat(np.maximum.reduceat(level.depth, rows, axis=0), columns, axis=1) <= 0
         missing = np.isnan(background)
         square = np.ones((3, 3), np.uint8)
         darkest = cv2.erode(np.where(missing, np.float32(9), background), square)

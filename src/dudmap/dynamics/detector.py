@@ -11,7 +11,7 @@ from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.dynamics.background_model import BackgroundModel
 from dudmap.dynamics.label_scale import pixel_scale
 from dudmap.dynamics.masks import Labels, elliptical_kernel, opened_mask
-from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture, residual_histogram
+from dudmap.dynamics.mixture import EDGES, Mixture, fit_mixture, residual_histogram
 from dudmap.dynamics.segments import (
     Segmentation,
     classify_segments,
@@ -174,7 +174,7 @@ class DynamicDetector:
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
-        mixture = fit_mixture(histogram, np.linspace(0, MAX_RESIDUAL, BINS + 1))
+        mixture = fit_mixture(histogram, EDGES)
         evidence = self._evidence(frame, residual, mixture)
         probability = volume.backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
@@ -227,12 +227,12 @@ class DynamicDetector:
         """
         depth = frame.level.depth
         evidence = np.clip(mixture.log_odds(residual), -MAX_LOG_ODDS, MAX_LOG_ODDS)
-        within_noise = np.abs(frame.sample.distance) < frame.noise
-        evidence = np.where(within_noise, np.maximum(evidence, np.float32(1)), evidence)
-        evidence = np.where(frame.surface, evidence, np.float32(0))  # NaN elsewhere
+        np.maximum(evidence, np.float32(1), out=evidence, where=np.abs(frame.sample.distance) < frame.noise)
+        evidence[~frame.surface] = 0  # NaN before
         if not self.config.free_space:
             return evidence
-        unknown = float(np.mean(frame.unknown[depth > 0])) if depth.any() else 0.0
+        read = depth > 0
+        unknown = np.count_nonzero(frame.unknown & read) / max(np.count_nonzero(read), 1)
         max_gap = np.float32(1.5) * frame.noise.astype(np.float32)
         seen_free = self.memory.free(frame.timestamp, frame.level, frame.T_world_camera, max_gap, unknown)
         evidence[frame.free | seen_free] = -MAX_LOG_ODDS
@@ -274,7 +274,8 @@ class DynamicDetector:
         dynamic = dynamic & (known | started[labels])
         gain, offset = frame.exposure
         correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = np.asarray(np.nan_to_num(sample.difference + correction), np.float32)  # NaN in the air
+        difference = np.asarray(sample.difference + correction, np.float32)
+        difference[np.isnan(difference)] = 0  # in the air
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
         evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
         dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]

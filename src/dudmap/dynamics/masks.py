@@ -60,10 +60,13 @@ def full_mask(labels: Labels, level: Level, depth: NDArray[np.float32]) -> NDArr
     """
     import cv2
 
+    hidden = labels.hidden is not None and labels.hidden.any()
+    if not (hidden or labels.dynamic.any()):
+        return np.zeros(depth.shape, dtype=bool)
     element = elliptical_kernel(CLOSING_RADIUS * pixel_scale(level))
     low = cv2.morphologyEx(labels.dynamic.astype(np.uint8), cv2.MORPH_CLOSE, element)
     low[(level.depth > 0) & ~labels.dynamic] = 0
-    if labels.hidden is not None:
+    if hidden:
         low[labels.hidden] = 1
     return full_size(low > 0, level.depth, depth)
 
@@ -86,7 +89,11 @@ def grown_mask(mask: NDArray[np.bool_], pixels: int) -> NDArray[np.bool_]:
 
     if pixels == 0 or not mask.any():
         return mask
-    return cv2.dilate(mask.astype(np.uint8), elliptical_kernel(pixels)) > 0
+    marks, grown = mask.astype(np.uint8), np.zeros_like(mask)
+    x, y, width, height = cv2.boundingRect(marks)
+    around = np.s_[max(y - pixels, 0) : y + height + pixels, max(x - pixels, 0) : x + width + pixels]
+    grown[around] = cv2.dilate(marks[around], elliptical_kernel(pixels)) > 0
+    return grown
 
 
 def elliptical_kernel(radius: float) -> NDArray[np.uint8]:

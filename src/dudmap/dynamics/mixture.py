@@ -11,6 +11,8 @@ BINS = 128
 """Bins of the histogram of normalised residuals."""
 MAX_RESIDUAL = 16.0
 """Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
+EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
+"""Edges of its bins."""
 START = 0.1, 1.0, 6.0
 """Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
 PRIOR_BOUNDS = 0.02, 0.98

@@ -1,6 +1,7 @@
 """Surface segments of an image, and the decision whether a whole segment moves."""
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,10 +53,14 @@ class Segmentation:
     min_pixels: float = MIN_PIXELS
     window: int = 3
 
+    @cached_property
+    def sizes(self) -> NDArray[np.int64]:
+        """Number (count + 1,) of each segment's pixels; entry 0 counts those without a reading."""
+        return np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
+
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""
-        total = np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
-        return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(total, 1)
+        return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(self.sizes, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,7 +123,9 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
         segmentation: The segments.
         dynamic_before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
     """
-    total = np.bincount(segmentation.labels.reshape(-1), minlength=segmentation.count + 1)
+    if not dynamic_before.any():
+        return segmentation
+    total = segmentation.sizes
     part = np.bincount(segmentation.labels[dynamic_before], minlength=segmentation.count + 1)
     mixed = np.minimum(part, total - part) >= np.maximum(segmentation.min_pixels, 0.2 * total)
     mixed[0] = False

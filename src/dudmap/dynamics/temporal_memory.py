@@ -162,12 +162,14 @@ class TemporalMemory:
         """
         import cv2
 
-        num_free, num_surface = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(2))
         if timestamp < self._young_until:
             candidates = self._start_frames if self._imported else self._recent_frames
         else:
             candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
         frames = [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
+        if not frames:
+            return np.zeros(level.depth.shape, dtype=bool)
+        num_free, num_surface = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(2))
         for gap, _, _ in reproject(level, T_world_camera, frames):
             num_free += gap > noise
             num_surface += np.abs(gap) <= noise
@@ -210,7 +212,7 @@ class TemporalMemory:
         for frame in frames:
             ((gap, difference, _),) = reproject(level, T_world_camera, [frame])
             compared = ~np.isnan(gap)
-            displaced = compared & (np.abs(np.nan_to_num(gap)) > 4 * sigma)
+            displaced = np.abs(gap) > 4 * sigma  # not where it is NaN
             evidence = segment_evidence(parts, compared, displaced, gap, sigma, difference)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])

@@ -231,7 +231,7 @@ class CpuBackend:
             lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, p, pixels),
             bands(depth.shape[0], PIXEL_ROWS),
         )
-        words, size = pixels.view(np.int64).reshape(-1), np.array(depth.shape, dtype=np.int64)
+        words, size = pixels.reshape(-1), np.array(depth.shape, dtype=np.int64)
         occupied = np.empty(len(slots), dtype=np.int32)
         run_bands(
             lambda start, stop: integration.integrate_blocks(

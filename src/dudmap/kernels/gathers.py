@@ -6,7 +6,7 @@ none, LLVM makes single loads of it.
 """
 
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
 from numba.extending import intrinsic
 
 LANES = 8
@@ -106,6 +106,38 @@ def load_voxels_of_blocks(typing_context, window, size_y, size_z, geometry, cell
 
     index = types.intp
     return types.void(window, index, index, geometry, cells, voxels, points, index, words, index), generate
+
+
+@intrinsic
+def load_pairs(typing_context, pairs, places, out):
+    """Pairs of words at places that an array names, and the largest of the upper halves of the first words, int64.
+
+    Args:
+        pairs: (2 * n,) int32.
+        places: (m,) int32, numbers of pairs; m is a multiple of ``LANES``.
+        out: (m,) int64 out, the pair of each number.
+    """
+
+    def generate(context, builder, signature, arguments):
+        arrays = [
+            context.make_array(kind)(context, builder, value)
+            for kind, value in zip(signature.args, arguments, strict=True)
+        ]
+        largest = cgutils.alloca_once_value(builder, _every(0))
+        with cgutils.for_range(builder, builder.udiv(arrays[1].nitems, I64(LANES))) as loop:
+            start = builder.mul(loop.index, I64(LANES))
+            place, target = (builder.gep(array.data, [start]) for array in arrays[1:])
+            number = builder.sext(builder.load(builder.bitcast(place, INTS.as_pointer()), align=4), LONGS)
+            pair = _gathered(builder, arrays[0].data, builder.shl(number, _every(1)), LONGS)
+            builder.store(pair, builder.bitcast(target, LONGS.as_pointer()), align=8)
+            half, before = builder.and_(builder.lshr(pair, _every(16)), _every(0xFFFF)), builder.load(largest)
+            builder.store(builder.select(builder.icmp_unsigned(">", half, before), half, before), largest)
+        reduced = builder.module.declare_intrinsic(
+            f"llvm.vector.reduce.umax.v{LANES}i64", (), ir.FunctionType(I64, [LONGS])
+        )
+        return builder.call(reduced, [builder.load(largest)])
+
+    return types.int64(pairs, places, out), generate
 
 
 def _every(value):

@@ -2,14 +2,12 @@
 
 import numpy as np
 
+from dudmap.kernels.gathers import load_pairs
 from dudmap.kernels.memory import prefetch
-from dudmap.kernels.pixel import free_depth, project, ray, reading_weight
+from dudmap.kernels.pixel import band_behind, free_depth, project, ray, reading_weight
 from dudmap.kernels.threads import kernel
 from dudmap.kernels.vectors import wide_vectors
 from dudmap.kernels.voxel import fuse_color, fuse_voxel, is_occupied, pack_pixel_color, pack_reading
-
-CACHE_LINE = 16
-"""32-bit words of a cache line of most processors."""
 
 
 @kernel
@@ -75,10 +73,11 @@ def integrate_blocks(
         T: (3, 4) float32, world to camera.
         intrinsics: (4,) float32.
         size: (2,) int64 image height and width.
-        pixels: (H * W + 1,) int64, the two words of ``pack_pixels`` as one.
+        pixels: (2 * (H * W + 1),) int32, the words of ``pack_pixels``.
         map_geometry, map_colors: (num_slots * 512,) int32.
         parameters: FusionParameters.
-        occupied: (n,) int32 out: voxels that hold a surface or were never observed.
+        occupied: (n,) int32 out: voxels that hold a surface or were never observed; 1 for any number of them where
+            the image changes none.
     """
     wide_vectors()
     voxel_size = parameters.voxel_size
@@ -92,6 +91,7 @@ def integrate_blocks(
     local_x = np.empty(512, np.float32)
     local_y = np.empty(512, np.float32)
     local_z = np.empty(512, np.float32)
+    lowest = zero
     for i in range(8):
         for j in range(8):
             for k in range(8):
@@ -100,6 +100,7 @@ def integrate_blocks(
                 local_x[n] = T[0, 0] * x + T[0, 1] * y + T[0, 2] * z
                 local_y[n] = T[1, 0] * x + T[1, 1] * y + T[1, 2] * z
                 local_z[n] = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z
+                lowest = min(lowest, local_z[n])
     # few arrays, since the compiler vectorises no loop that needs many checks whether two of them overlap
     pixel = np.empty(512, np.int32)
     seen = np.empty(512, np.int64)
@@ -107,12 +108,11 @@ def integrate_blocks(
     known = np.empty((2, 512), np.float32)  # depth of the voxel; share in which it takes on the pixel's colour
     max_u, max_v = np.float32(width), np.float32(height)
 
+    # the voxels of the next block are prefetched a quarter at a time, between the loops
     for block in range(start, stop):
         slot = slots[block]
         following = np.uintp(slots[min(block + 1, stop - 1)]) * np.uintp(512)
-        for n in range(0, 512, CACHE_LINE):
-            prefetch(map_geometry, following + np.uintp(n))
-            prefetch(map_colors, following + np.uintp(n))
+        prefetch(map_geometry, following)
         ox = np.float32(coords[slot, 0] * 8) * voxel_size
         oy = np.float32(coords[slot, 1] * 8) * voxel_size
         oz = np.float32(coords[slot, 2] * 8) * voxel_size
@@ -127,12 +127,23 @@ def integrate_blocks(
             ok = (z > np.float32(0.05)) & (u >= zero) & (v >= zero) & (u < max_u) & (v < max_v)
             pixel[n] = np.int32(v * max_u + u if ok else blank)
             known[0, n] = z
-        for n in range(512):
-            seen[n] = pixels[np.uintp(pixel[n])]
+        prefetch(map_geometry, following + np.uintp(256))
+        farthest = np.float32(load_pairs(pixels, pixel, seen)) * parameters.depth_unit
+        prefetch(map_colors, following)
         first = np.int64(slot) * 512
         geometry = map_geometry[first : first + 512]
         count = repeats[block]
         num_occupied = painted = zero  # counted in float32: an integer sum has 64 bits, half as many in a register
+        behind = min(band_behind(farthest, parameters.band), parameters.band.limit)
+        if (farthest == zero) | (farthest - (bz + lowest) <= -behind):
+            # no voxel has a reading, or all lie behind the band of the farthest: the image changes none of them
+            occupied[block] = 0
+            for n in range(512):
+                if is_occupied(geometry[n], parameters):
+                    occupied[block] = 1
+                    break
+            continue
+        prefetch(map_colors, following + np.uintp(256))
         for n in range(512):
             word, share = fuse_voxel(
                 geometry[n], words[2 * n], words[2 * n + 1], known[0, n], count, by_unit, parameters

@@ -245,7 +245,7 @@ def upsample_labels(
         lambda start, stop: upsample_rows(start, stop, marks, low_depth, depth, stride, out),
         bands(depth.shape[0], UPSAMPLING_BAND),
     )
-    return out > 0
+    return out.view(np.bool_)
 
 
 @kernel
@@ -262,14 +262,18 @@ def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
     # depth and label of the four low-resolution pixels whose centres surround each pixel, from the upper left on
     adjacent, marks = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
     last = np.int64(-(2**31))
-    marked = False
+    first, stop = 0, 0
     for v in range(row_start, row_stop):
         y = (2 * v + 1 - stride) // (2 * stride)
         if y != last:
             last = y
             upper, lower = min(max(y, 0), h - 1), min(max(y + 1, 0), h - 1)
-            marked = low[upper].any() or low[lower].any()
-            for u in range(width if marked else 0):
+            first, stop = w, 0  # the marked columns
+            for x in range(w):
+                if low[upper, x] | low[lower, x]:
+                    first, stop = min(first, x), x + 1
+            first, stop = max(first - 1, 0) * stride, min((stop + 1) * stride, width)
+            for u in range(first, stop):
                 x = (2 * u + 1 - stride) // (2 * stride)
                 left, right = min(max(x, 0), w - 1), min(max(x + 1, 0), w - 1)
                 adjacent[0, u], marks[0, u] = low_depth[upper, left], np.float32(low[upper, left])
@@ -277,18 +281,17 @@ def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
                 adjacent[2, u], marks[2, u] = low_depth[lower, left], np.float32(low[lower, left])
                 adjacent[3, u], marks[3, u] = low_depth[lower, right], np.float32(low[lower, right])
         target = out[v]
-        if not marked:
-            target[:] = 0
-            continue
+        target[:] = 0  # what has no marked pixel beside it
         row = depth[v]
         below = DISTANCE_COST * np.float32((2 * v + 1 - stride) % (2 * stride)) / np.float32(2 * stride)
-        for u in range(width):
-            z = row[u]
+        for u in range(first, stop):
+            n = np.uintp(u)
+            z = row[n]
             best, label = np.float32(1e9), zero
             for k in range(4):
-                candidate = marks[k, u]
-                cost = depth_cost(z, adjacent[k, u]) + (across[k & 1, u] + (below if k < 2 else DISTANCE_COST - below))
+                candidate = marks[k, n]
+                cost = depth_cost(z, adjacent[k, n]) + (across[k & 1, n] + (below if k < 2 else DISTANCE_COST - below))
                 better = cost < best
                 best = cost if better else best
                 label = candidate if better else label
-            target[u] = np.uint8(label)
+            target[n] = np.uint8(label)

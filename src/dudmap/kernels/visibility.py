@@ -158,6 +158,9 @@ def visible_slots(
         cx, cy, cz = transform(t, x, y, z)
         if cz < depth_min - radius or cz > depth_max + radius + block_size:
             continue
+        alternates = (turn >= 0) & (fused[slot] >= SETTLED) & (band.sigmas * sigma(cz, band.noise) > band.front)
+        if alternates and (coords[slot, 0] + coords[slot, 1] + coords[slot, 2] + turn) & 1:
+            continue
         near_z = max(cz - radius, np.float32(0.05))
         if cz > radius + np.float32(0.05):
             reach, by_z = radius / near_z, np.float32(1) / cz
@@ -169,15 +172,14 @@ def visible_slots(
                 continue
             tx0, tx1 = max(np.int64(u - ru) // TILE, 0), min(np.int64(u + ru) // TILE, farthest.shape[1] - 1)
             ty0, ty1 = max(np.int64(v - rv) // TILE, 0), min(np.int64(v + rv) // TILE, farthest.shape[0] - 1)
-            far = np.float32(0)
-            for ty in range(ty0, ty1 + 1):
-                for tx in range(tx0, tx1 + 1):
-                    far = max(far, farthest[ty, tx])
+            # the tile at the centre decides for most blocks
+            far = farthest[min(max(np.int64(v) // TILE, ty0), ty1), min(max(np.int64(u) // TILE, tx0), tx1)]
             if cz - radius > far + band_behind(far, band):
-                continue
-        alternates = (turn >= 0) & (fused[slot] >= SETTLED) & (band.sigmas * sigma(cz, band.noise) > band.front)
-        if alternates and (coords[slot, 0] + coords[slot, 1] + coords[slot, 2] + turn) & 1:
-            continue
+                for ty in range(ty0, ty1 + 1):
+                    for tx in range(tx0, tx1 + 1):
+                        far = max(far, farthest[ty, tx])
+                if cz - radius > far + band_behind(far, band):
+                    continue
         out[count] = slot
         repeats[count] = np.float32(2) if alternates else np.float32(1)
         count += 1

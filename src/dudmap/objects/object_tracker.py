@@ -198,8 +198,8 @@ class ObjectTracker:
         groups: list[list[Region]] = []
         for region in regions:
             same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
-            fitting = [group for group in same + groups if self._is_fragment(region, group)]
-            fitting[0].append(region) if fitting else groups.append([region])
+            fitting = next((group for group in same + groups if self._is_fragment(region, group)), None)
+            groups.append([region]) if fitting is None else fitting.append(region)
         return [
             np.concatenate([region.indices for region in group])
             for group in groups

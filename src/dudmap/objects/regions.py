@@ -87,6 +87,8 @@ def connected_regions(
         predicted_ids: ((h + 1) // 2, (w + 1) // 2) int32, number of the object expected in each 2x2 block, 0 = none.
     """
     moving = dynamic & (level.depth > 0)
+    if not moving.any():
+        return None
     tolerance = np.float32(0.02) + np.float32(0.02) * level.depth
     regions, count = labeling.grow_regions(moving, moving, level.depth, tolerance)
     number = regions.reshape(-1)
