@@ -9,6 +9,7 @@ from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment
 from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.cpu import CpuBackend
 from dudmap.slam import Slam
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
@@ -101,10 +102,15 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
+def free_space(memory, timestamp, image, T, unknown=0.0):
+    """Pixels that single frames have seen to be free, with readings that differ by up to 0.1 m."""
+    noise, frames = np.full(CAMERA.shape, 0.1, np.float32), memory.free_space_frames(timestamp, unknown)
+    return memory.seen_free(CpuBackend(), image, T, noise, frames)
+
+
 def test_single_frames_give_free_space():
     """A moving board in front of a wall, seen by a moving camera, against where both are."""
     memory = TemporalMemory(DynamicsConfig())
-    noise = np.full(CAMERA.shape, 0.1, np.float32)
     v, u = np.indices(CAMERA.shape)
 
     def image(camera_x, board_x):
@@ -120,7 +126,7 @@ def test_single_frames_give_free_space():
         T[0, 3] = camera_x
         if i == 0:
             memory.start(0.0)
-        free = memory.free(i / 30, seen, T, noise)
+        free = free_space(memory, i / 30, seen, T)
         assert not free[~board].any()
         memory.update(i / 30, seen, T, np.zeros_like(board), None)
     new = board & (X > -0.3 + 0.2 + 0.03)  # where it was not in the first frame
@@ -131,16 +137,16 @@ def test_single_frames_give_free_space():
         memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
     )
     seen, board, X = image(0.0, -0.3)
-    free = again.free(0.0, seen, np.eye(4), noise)
+    free = free_space(again, 0.0, seen, np.eye(4))
     assert free[board].mean() > 0.8
     assert not free[~board].any()
     # an older map knows free space itself, unless the camera has turned towards unknown space
-    assert not np.any(again.free(10.0, seen, np.eye(4), noise, unknown=0.05))
-    assert not np.any(again.free(10.0, seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
+    assert not again.free_space_frames(10.0, unknown=0.05)
+    assert not again.free_space_frames(10.0, unknown=0.5)  # not from the first seconds
     for i in range(16):
         seen, board, X = image(0.0, -0.3 + 0.05 * i)
-        free = again.free(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.5)
-        assert not again.free(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.05).any()
+        free = free_space(again, 10.0 + i / 30, seen, np.eye(4), unknown=0.5)
+        assert not again.free_space_frames(10.0 + i / 30, unknown=0.05)
         again.update(10.0 + i / 30, seen, np.eye(4), np.zeros_like(board), None)
     assert free[board & (X > -0.3 + 0.2 + 0.03)].mean() > 0.9
     assert not free[~board].any()

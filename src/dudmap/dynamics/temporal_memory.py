@@ -13,6 +13,7 @@ from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, segment_evid
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation as kernels
+from dudmap.kernels.backend import Backend
 
 SETTLE_FRAMES = 4
 """Frames kept of ``settle_time``, in which a segment must stand still to be released."""
@@ -137,43 +138,44 @@ class TemporalMemory:
         ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
         return (marks > 0) & (np.abs(gap) < max_gap)
 
-    def free(
-        self,
-        timestamp: float,
+    def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
+        """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
+
+        Single frames are compared while the map is young, and where it does not know much of what is in view;
+        otherwise there are none. In the first seconds of a second pass later frames are compared, too.
+
+        Args:
+            timestamp: Seconds.
+            unknown: Share of the readings that lie in space unknown to the map.
+        """
+        if timestamp < self._young_until:
+            candidates = self._start_frames if self._imported else self._recent_frames
+        else:
+            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
+        return [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
+
+    @staticmethod
+    def seen_free(
+        backend: Backend,
         level: Level,
         T_world_camera: NDArray[np.float64],
         noise: NDArray[np.float32],
-        unknown: float = 0.0,
+        frames: Sequence[RememberedFrame],
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) in space that single frames have seen to be free.
-
-        Single frames are compared while the map is young, and where it does not know much of what is in view;
-        otherwise the mask is empty. In the first seconds of a second pass later frames are compared, too.
 
         A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
         at least half as many frames have as have seen a surface at it.
 
         Args:
-            timestamp: Seconds.
+            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest depth difference between two readings of one point, metres.
-            unknown: Share of the readings that lie in space unknown to the map.
+            frames: As of ``free_space_frames``.
         """
-        import cv2
-
-        num_free, num_surface = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(2))
-        if timestamp < self._young_until:
-            candidates = self._start_frames if self._imported else self._recent_frames
-        else:
-            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
-        frames = [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
-        for gap, _, _ in reproject(level, T_world_camera, frames):
-            num_free += gap > noise
-            num_surface += np.abs(gap) <= noise
-        free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
-        side = scaled_side(SEAM, level)
-        return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+        targets, side = _targets(T_world_camera, frames), scaled_side(SEAM, level)
+        return backend.free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
 
     def settled(
         self,
@@ -225,10 +227,17 @@ def reproject(
     level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
 ) -> list[kernels.Reprojection]:
     """Differences of an image at a pose (4, 4) to remembered frames, one for each."""
-    targets = [
+    targets = _targets(T_world_camera, frames)
+    return kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)
+
+
+def _targets(
+    T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
+) -> list[kernels.ReprojectionTarget]:
+    """Remembered frames that an image at a pose (4, 4) is compared with."""
+    return [
         kernels.ReprojectionTarget(
             se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
         )
         for frame in frames
     ]
-    return kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)

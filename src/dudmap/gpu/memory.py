@@ -254,8 +254,11 @@ class Images:
         self.device = device
         self._twins: dict[int, tuple[weakref.ref, Any, bool]] = {}
 
-    def up(self, array: NDArray, staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
-        """The array on the device, for the main queue, to which the staging belongs."""
+    def up(self, array: "NDArray | DeviceImage", staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
+        """The array on the device, for the main queue, to which the staging belongs; bools as bytes."""
+        if isinstance(array, DeviceImage):
+            return array.twin
+        array = array.view(np.uint8) if array.dtype == np.bool_ else array
         known = self._twins.get(id(array))
         if known is not None and known[0]() is array:
             return known[1]
@@ -300,6 +303,23 @@ class Images:
                 give_back(twin)
 
         self._twins[key] = weakref.ref(array, forget), twin, uploading
+
+
+class DeviceImage:
+    """Image (h, w) on a device, downloaded when the host reads it with ``np.asarray``, and not uploaded again.
+
+    Args:
+        twin: The image, an array of Warp that nothing changes any more.
+        queue: What has written it.
+        dtype: Type on the host where it is not the device's: that of a mask is a byte there.
+    """
+
+    def __init__(self, twin: Any, queue: Queue, dtype: Any = None) -> None:  # noqa: ANN401
+        self.twin, self.queue, self.dtype = twin, queue, dtype
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:  # noqa: ANN401
+        found = self.queue.download(self.twin)
+        return np.asarray(found if self.dtype is None else found.view(self.dtype), dtype)
 
 
 class OnDevice:

@@ -1,4 +1,4 @@
-"""Preparation of a frame on a device: filter, intensities and pyramid, in a queue of its own.
+"""Preparation of a frame on a device: filter, intensities, pyramid and segments, in a queue of its own.
 
 While the main queue processes a frame, the next one is uploaded and prepared beside it by the thread that reads it.
 """
@@ -10,7 +10,9 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.gpu.components import Components
 from dudmap.gpu.kernels import images as kernels
+from dudmap.gpu.kernels.structs import camera_of
 from dudmap.gpu.memory import Images
 from dudmap.gpu.staging import WARP_TYPES, ImagePool, Staging
 from dudmap.gpu.streams import gate, main_queue, own_queue
@@ -35,6 +37,7 @@ class Preparation:
         self._scratch: dict[tuple[Any, ...], Any] = {}
         self._weights: tuple[NDArray, Any] = np.empty(0), None
         self._lock, self._gate = threading.RLock(), gate(device)
+        self._components = Components(self._queue, self._buffer, self._staging.download)
 
     def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
         """See ``Backend.filter``."""
@@ -83,6 +86,20 @@ class Preparation:
             out = self._pool.take(shape), self._pool.take(shape)
             self._queue.launch(kernels.halve, shape, z, shade, tolerance, *out)
             return self._down(out[0]), self._down(out[1])
+
+    def segment_surface(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        reach: int,
+        normal_reach: int,
+        sine: float,
+    ) -> tuple[NDArray[np.int32], int]:
+        """See ``Backend.segment_surface``."""
+        with self._lock, self._gate.use():
+            images = self._up(depth, "depth"), camera_of(intrinsics), self._up(tolerance, "tolerance")
+            return self._components.segment_surface(*images, reach, normal_reach, sine)
 
     def _up(self, array: NDArray, use: str) -> Any:  # noqa: ANN401 - an array of Warp
         """The array on the device; one that is not there already is copied to a buffer of this queue alone."""

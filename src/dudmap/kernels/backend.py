@@ -1,10 +1,12 @@
 """The operations that the system asks of a compute device: arrays and one tuple of parameters in, arrays out."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.evidence import EvidenceParameters, ResidualCounts
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -24,6 +26,7 @@ from dudmap.kernels.parameters import (
     SensorNoise,
     VoxelGrid,
 )
+from dudmap.kernels.segmentation import ReprojectionTarget
 
 
 class Backend(Protocol):
@@ -75,6 +78,18 @@ class Backend(Protocol):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
         ``max(tolerance, tolerance z)`` behind the nearest one z."""
+        ...
+
+    def segment_surface(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        reach: int,
+        normal_reach: int,
+        sine: float,
+    ) -> tuple[NDArray[np.int32], int]:
+        """Connected segments of surface; see ``segmentation.segment_surface``. May run beside other operations."""
         ...
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -233,6 +248,55 @@ class Backend(Protocol):
         ``linearize``; ``free_after`` observations make free space."""
         ...
 
+    # -- label -------------------------------------------------------------------------------------------------------
+    # Images that these give may be anything that ``np.asarray`` takes, so that a device keeps what nobody reads.
+
+    def residual_counts(
+        self, sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]
+    ) -> ResidualCounts:
+        """Histogram of the normalised residuals of an image at the surfaces of the map; arguments as of ``log_odds``,
+        and the depth (h, w) in metres, 0 = none."""
+        ...
+
+    def free_space(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        noise: NDArray[np.float32],
+        targets: Sequence[ReprojectionTarget],
+        side: int,
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) bool that at least half as many older frames have seen through as have a reading there, opened.
+
+        Args:
+            depth, intensity: (h, w) float32; depth in metres, 0 = none.
+            intrinsics: (4,) float32 fx, fy, cx, cy.
+            noise: (h, w) float32, largest depth difference of two readings of one point, metres.
+            targets: The older frames.
+            side: Of the square that the mask is opened with, pixels, odd.
+        """
+        ...
+
+    def log_odds(
+        self,
+        sample: MapSample,
+        sigma: NDArray[np.float32],
+        parameters: EvidenceParameters,
+        free_space: bool,
+        seen_free: NDArray[np.bool_] | None,
+    ) -> NDArray[np.float32]:
+        """Log odds static : dynamic (h, w) float32 of each pixel alone, 0 = unknown (eq. 4.56, 4.57).
+
+        Args:
+            sample: The map at the points of the image.
+            sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+            parameters: Of the log odds at surfaces of the map.
+            free_space: Whether a pixel in space that the map knows to be free is certain to move.
+            seen_free: (h, w) bool, other pixels that then are, as of ``free_space``; None = none.
+        """
+        ...
+
     def label(
         self,
         log_odds: NDArray[np.float32],
@@ -251,6 +315,28 @@ class Backend(Protocol):
             sweeps: Iterations of the mean field.
         """
         ...
+
+    def moving_regions(
+        self,
+        seeds: NDArray[np.bool_],
+        log_odds: NDArray[np.float32],
+        depth: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        min_area: float,
+        seeded_share: float,
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) bool of regions that grow from seeds over the surface, up to depth edges and static pixels.
+
+        Args:
+            seeds: (h, w) bool, pixels with a reading.
+            log_odds: As of ``label``; a pixel is static from 1 on.
+            depth, tolerance: As of ``label``.
+            min_area: Fewest pixels of a region.
+            seeded_share: Least share of seeds in a region.
+        """
+        ...
+
+    # -- views and meshes --------------------------------------------------------------------------------------------
 
     def raycast(
         self,

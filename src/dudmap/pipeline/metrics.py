@@ -147,7 +147,8 @@ class RunRecord:
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
         """
-        from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, fit_mixture
+        from dudmap.dynamics.mixture import fit_mixture
+        from dudmap.kernels.evidence import BINS, MAX_RESIDUAL
 
         if not self.residuals.any():
             return
