@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from dudmap.gpu.components import Components
 from dudmap.gpu.kernels import images as kernels
-from dudmap.gpu.kernels.structs import camera_of
 from dudmap.gpu.memory import Images
 from dudmap.gpu.staging import WARP_TYPES, ImagePool, Staging
 from dudmap.gpu.streams import gate, main_queue, own_queue
@@ -37,7 +36,8 @@ class Preparation:
         self._scratch: dict[tuple[Any, ...], Any] = {}
         self._weights: tuple[NDArray, Any] = np.empty(0), None
         self._lock, self._gate = threading.RLock(), gate(device)
-        self._components = Components(self._queue, self._buffer, self._staging.download)
+        # another thread may wait for events, which no thread may do while this one captures a graph
+        self._components = Components(self._queue, self._buffer, self._staging.download, as_graph=False)
 
     def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
         """See ``Backend.filter``."""
@@ -98,8 +98,8 @@ class Preparation:
     ) -> tuple[NDArray[np.int32], int]:
         """See ``Backend.segment_surface``."""
         with self._lock, self._gate.use():
-            images = self._up(depth, "depth"), camera_of(intrinsics), self._up(tolerance, "tolerance")
-            return self._components.segment_surface(*images, reach, normal_reach, sine)
+            images = self._up(depth, "depth"), self._up(tolerance, "tolerance")
+            return self._components.segment_surface(*images, intrinsics, reach, normal_reach, sine)
 
     def _up(self, array: NDArray, use: str) -> Any:  # noqa: ANN401 - an array of Warp
         """The array on the device; one that is not there already is copied to a buffer of this queue alone."""
