@@ -52,7 +52,7 @@ def older(recording, cpu):
     T, shade = recording.ground_truth.Ts_world_camera, np.zeros(SHAPE, np.float32)
     images = [cpu.filter(recording[n].depth.astype(np.float32), FILTER) for n in (1, 3, 5)]
     return [
-        ReprojectionTarget(np.linalg.inv(T[n]) @ T[0], image, shade, np.zeros(SHAPE, np.uint8))
+        ReprojectionTarget(np.linalg.inv(T[n]) @ T[0], image, shade, (image > 2.5).astype(np.uint8))
         for n, image in zip((1, 3, 5), images, strict=True)
     ]
 
@@ -72,7 +72,14 @@ def labelled(backend, frame, depth, older):
     seeds = (probability < 0.5) & (depth > 0)
     moving = backend.moving_regions(seeds, odds, depth, tolerance, 15.36, 0.25)
     labels, count = backend.segment_surface(depth, CAMERA.intrinsics, tolerance, *SEGMENTS)
-    return *counts, np.asarray(free), np.asarray(odds), probability, moving, labels, count
+    before = backend.seen_marked(depth, depth, CAMERA.intrinsics, older[0], 0.1)
+    in_segments = backend.segment_counts(labels, count, (before, moving))
+    started = in_segments[2] > 0.3 * in_segments[0]
+    known, sums = backend.compare_segments(
+        sample, labels, started, moving, sigma, depth, (0.98, 0.01), np.ascontiguousarray(depth / 10), 3
+    )
+    images = [np.asarray(image) for image in (free, odds, before, known)]
+    return *counts, *images, probability, moving, labels, count, *in_segments, *sums
 
 
 def test_counts_of_residuals_are_those_of_the_cpu(cpu, gpu, frame, smooth):
@@ -166,9 +173,51 @@ def test_rounds_go_on_until_nothing_changes(cpu, gpu, monkeypatch):
 def test_the_order_of_the_streams_changes_no_label(monkeypatch, frame, smooth, older, seed):
     expected = labelled(WarpBackend("cpu"), frame, smooth, older)
     monkeypatch.setattr(backends, "_IMAGES", {})
-    Gpu(monkeypatch, seed)
-    for a, b in zip(labelled(WarpBackend(NAME), frame, smooth, older), expected, strict=True):
-        np.testing.assert_array_equal(a, b)
+    gpu = Gpu(monkeypatch, seed)
+    backend = WarpBackend(NAME)
+    for _ in range(3):  # the launches are a graph from the second time on
+        for a, b in zip(labelled(backend, frame, smooth, older), expected, strict=True):
+            np.testing.assert_array_equal(a, b)
+    assert gpu.launched > 1
+
+
+def test_what_was_marked_is_that_of_the_cpu(cpu, gpu, smooth, older):
+    for target, gap in zip(older, (0.02, 0.1, 1.0), strict=True):
+        arguments = smooth, smooth, CAMERA.intrinsics, target, gap
+        expected, found = (np.asarray(backend.seen_marked(*arguments)) for backend in (cpu, gpu))
+        assert 0.05 < expected.mean() < 0.95
+        assert (found != expected).mean() < 1e-3
+
+
+def test_counts_of_segments_are_those_of_the_cpu(cpu, gpu, smooth):
+    labels, count = cpu.segment_surface(smooth, CAMERA.intrinsics, tolerances(smooth), *SEGMENTS)
+    masks = [np.random.default_rng(6).random(SHAPE) < share for share in (0.1, 0.7)]
+    for chosen in ((), masks):
+        expected, found = (backend.segment_counts(labels, count, chosen) for backend in (cpu, gpu))
+        np.testing.assert_array_equal(found, expected)
+        assert len(found) == 1 + len(chosen)
+
+
+@pytest.mark.parametrize("window", [3, 5])
+def test_sums_over_segments_are_those_of_the_cpu(cpu, gpu, frame, smooth, window):
+    labels, count = cpu.segment_surface(smooth, CAMERA.intrinsics, tolerances(smooth), *SEGMENTS)
+    random = np.random.default_rng(8)
+    difference = random.normal(0, 0.1, SHAPE).astype(np.float32)
+    difference[random.random(SHAPE) < 0.1] = np.nan
+    sample, started = frame[0]._replace(difference=difference), random.random(count + 1) < 0.5
+    shade, gradient = (random.random(SHAPE).astype(np.float32) for _ in range(2))
+    dynamic = random.random(SHAPE) < 0.4
+    arguments = sample, labels, started, dynamic, frame[1], shade, (1.1, -0.02), gradient, window
+    (mask, expected), (other, found) = (backend.compare_segments(*arguments) for backend in (cpu, gpu))
+    np.testing.assert_array_equal(np.asarray(other), mask)
+    assert 0.1 < mask.mean() < dynamic.mean()
+    for name, numbers, values in zip(found._fields, found, expected, strict=True):
+        values, numbers = values[1:], numbers[1:]  # the first entry is meaningless
+        if name in ("pixels", "compared", "moving", "static"):
+            np.testing.assert_array_equal(numbers, values)
+        else:
+            assert values.any()
+            np.testing.assert_allclose(numbers / found.pixels[1:], values / found.pixels[1:], atol=3e-6)
 
 
 def test_no_image_comes_down_before_the_probabilities(gpu, frame, smooth, older, monkeypatch):

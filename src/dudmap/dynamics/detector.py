@@ -15,8 +15,8 @@ from dudmap.dynamics.mixture import Mixture, fit_mixture
 from dudmap.dynamics.segments import (
     Segmentation,
     classify_segments,
+    evidence_of,
     segment,
-    segment_evidence,
     split_mixed_segments,
 )
 from dudmap.dynamics.temporal_memory import TemporalMemory
@@ -26,7 +26,7 @@ from dudmap.kernels import labeling
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.evidence import BINS, MAX_RESIDUAL, EvidenceParameters, noise_limit
 from dudmap.kernels.threads import submit
-from dudmap.mapping.volume import FREE, SURFACE, UNKNOWN, MapSample, TsdfVolume
+from dudmap.mapping.volume import FREE, MapSample, TsdfVolume
 
 MAX_DISPLACEMENT = 0.1
 """Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
@@ -76,19 +76,9 @@ class _Comparison:
     tolerance: NDArray[np.float32]
 
     @property
-    def surface(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels near a surface of the map."""
-        return self.sample.occupancy == SURFACE
-
-    @property
     def free(self) -> NDArray[np.bool_]:
         """(h, w) bool, pixels in space the map knows to be free."""
         return self.sample.occupancy == FREE
-
-    @property
-    def unknown(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels in space the map does not know."""
-        return self.sample.occupancy == UNKNOWN
 
 
 class DynamicDetector:
@@ -183,7 +173,7 @@ class DynamicDetector:
             least = MIN_REGION * seeds.size
             dynamic = backend.moving_regions(seeds, evidence, level.depth, tolerance, least, SEEDED_SHARE)
             if self.config.pieces:
-                dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
+                dynamic, segments = self._segments(backend, frame, dynamic, seeds, segmentation())
             if moving is not None:
                 dynamic = dynamic | moving
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
@@ -236,6 +226,7 @@ class DynamicDetector:
 
     def _segments(
         self,
+        backend: Backend,
         frame: _Comparison,
         dynamic: NDArray[np.bool_],
         seeds: NDArray[np.bool_],
@@ -247,19 +238,20 @@ class DynamicDetector:
         2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
         3. Segments that have settled are static.
         """
-        level, T_world_camera, sample = frame.level, frame.T_world_camera, frame.sample
-        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
-        segmentation = split_mixed_segments(segmentation, before)
-        known = ~frame.unknown
-        started = segmentation.share(seeds) >= STARTED_SHARE
-        labels = segmentation.labels
-        dynamic = dynamic & (known | started[labels])
-        gain, offset = frame.exposure
-        correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = np.asarray(np.nan_to_num(sample.difference + correction), np.float32)  # NaN in the air
+        level, T_world_camera = frame.level, frame.T_world_camera
+        before = self.memory.last_dynamic(backend, level, T_world_camera, MAX_DISPLACEMENT)
+        counts = backend.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
+        split = split_mixed_segments(segmentation, before, *counts[:2])
+        if split is not segmentation:
+            segmentation, counts = split, backend.segment_counts(split.labels, split.count, (before, seeds))
+        size, labels = np.maximum(counts[0], 1), segmentation.labels
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
-        evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
-        dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]
+        known, sums = backend.compare_segments(
+            frame.sample, labels, counts[2] / size >= STARTED_SHARE, dynamic, sigma, level.intensity, frame.exposure,
+            segmentation.gradient, segmentation.window,
+        )  # fmt: skip
+        moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
+        dynamic = np.asarray(known) | moving[labels]
         settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 

@@ -7,9 +7,10 @@ from numpy.typing import NDArray
 
 from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.frames.observation import Level
-from dudmap.kernels import segmentation as kernels
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.evidence import smoothed_segment_sums
+from dudmap.kernels.segmentation import SegmentSums
 
 EDGE_REACH = 3
 """Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
@@ -112,7 +113,9 @@ def intensity_gradient(level: Level) -> NDArray[np.float32]:
     return np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
 
 
-def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.bool_]) -> Segmentation:
+def split_mixed_segments(
+    segmentation: Segmentation, dynamic_before: NDArray[np.bool_], total: NDArray[np.int64], part: NDArray[np.int64]
+) -> Segmentation:
     """Segmentation in which segments that were separate in the last frame, a dynamic and a static one, stay separate.
 
     A segment is split where each part holds at least a fifth of its pixels; a smaller part has merely come into view.
@@ -120,9 +123,8 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     Args:
         segmentation: The segments.
         dynamic_before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        total, part: (count + 1,) pixels of each segment, and those that did.
     """
-    total = np.bincount(segmentation.labels.reshape(-1), minlength=segmentation.count + 1)
-    part = np.bincount(segmentation.labels[dynamic_before], minlength=segmentation.count + 1)
     mixed = np.minimum(part, total - part) >= np.maximum(segmentation.min_pixels, 0.2 * total)
     mixed[0] = False
     if not mixed.any():
@@ -130,7 +132,7 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     count = segmentation.count + int(np.count_nonzero(mixed))
     number = np.zeros(segmentation.count + 1, dtype=np.int32)
     number[mixed] = np.arange(segmentation.count + 1, count + 1)
-    split = dynamic_before & mixed[segmentation.labels]
+    split = np.asarray(dynamic_before) & mixed[segmentation.labels]
     labels = np.where(split, number[segmentation.labels], segmentation.labels)
     return replace(segmentation, labels=labels, count=count)
 
@@ -153,17 +155,15 @@ def segment_evidence(
         sigma: (h, w) float32, standard deviation of the distance, metres.
         difference: (h, w) float32, of intensities; arbitrary where not compared.
     """
-    import cv2
-
-    ones = compared.astype(np.float32)
-    window = segmentation.window, segmentation.window
-    mean_difference = cv2.blur(np.where(compared, difference, np.float32(0)), window) / np.maximum(
-        cv2.blur(ones, window), np.float32(1e-3)
+    s = segmentation
+    sums = smoothed_segment_sums(
+        s.labels, s.count, compared, dynamic, distance, sigma, difference, s.gradient, s.window
     )
-    sums = kernels.segment_sums(
-        segmentation.labels, segmentation.count, compared, dynamic, distance, sigma,
-        np.asarray(mean_difference, np.float32), segmentation.gradient,
-    )  # fmt: skip
+    return evidence_of(sums, s.min_pixels)
+
+
+def evidence_of(sums: SegmentSums, min_pixels: float) -> SegmentEvidence:
+    """Evidence of motion of each segment, from the sums over its pixels and the fewest pixels of a large one."""
     size, static = np.maximum(sums.pixels, 1), np.maximum(sums.static, 1)
     texture = sums.gradient / static
     return SegmentEvidence(
@@ -172,7 +172,7 @@ def segment_evidence(
         dynamic=sums.moving / size,
         distance=sums.distance / static,
         mismatch=sums.deviation / static * texture / (texture + GRADIENT_NOISE) ** 2,
-        min_pixels=segmentation.min_pixels,
+        min_pixels=min_pixels,
     )
 
 

@@ -125,18 +125,21 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+    def last_dynamic(
+        self, backend: Backend, level: Level, T_world_camera: NDArray[np.float64], max_gap: float
+    ) -> NDArray[np.bool_]:
         """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
+            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
         """
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, dtype=bool)
-        ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
-        return (marks > 0) & (np.abs(gap) < max_gap)
+        (target,) = _targets(T_world_camera, [self._last])
+        return backend.seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.

@@ -73,6 +73,8 @@ class WarpBackend:
             labels.log_odds,
         )
         self.label, self.moving_regions = labels.label, labels.moving_regions
+        self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
+        self.compare_segments = labels.compare_segments
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
 
     # -- filter ------------------------------------------------------------------------------------------------------

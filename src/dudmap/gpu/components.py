@@ -70,8 +70,9 @@ class Components:
         reach: int,
         normal_reach: int,
         sine: float,
+        kept: Any,  # noqa: ANN401
     ) -> tuple[NDArray[np.int32], int]:
-        """See ``Backend.segment_surface``."""
+        """See ``Backend.segment_surface``; the device's equal of the image is written to ``kept``."""
         shape, camera = depth.shape, camera_of(intrinsics)
 
         def commands(z: Any, step: Any, rounds: int) -> tuple[list[Any], Any]:  # noqa: ANN401
@@ -94,7 +95,7 @@ class Components:
             return [*found, self._recorded(kernels.append, 2, graph.status, labels[0])], labels[0]
 
         key = "segments", *shape, *intrinsics.tolist(), reach, normal_reach, sine
-        return self._run(key, (depth, tolerance), commands)
+        return self._run(key, (depth, tolerance), commands, kept)
 
     def moving_regions(
         self,
@@ -146,7 +147,11 @@ class Components:
         )
 
     def _run(
-        self, key: tuple[Any, ...], images: tuple[Any, ...], commands: Callable[..., tuple[list[Any], Any]]
+        self,
+        key: tuple[Any, ...],
+        images: tuple[Any, ...],
+        commands: Callable[..., tuple[list[Any], Any]],
+        kept: Any = None,  # noqa: ANN401
     ) -> tuple[NDArray[np.int32], int]:
         """Image (h, w) that launches make, with as many rounds as it needs, and the number of components.
 
@@ -154,6 +159,7 @@ class Components:
             key: What the launches depend on.
             images: That they read.
             commands: Takes images of the same sizes, and the rounds; gives the launches and their result.
+            kept: Receives a copy of the image on the device.
         """
         rounds = ROUNDS
         while True:
@@ -167,6 +173,8 @@ class Components:
                 self._queue.copy(own, image)
             program.steps.prepare()
             program.steps.run()
+            if kept is not None:
+                self._queue.copy(kept, program.result[: kept.shape[0]])
             found = self._download(program.result)
             if not found[-1, 0]:
                 return found[:-1], int(found[-1, 1])

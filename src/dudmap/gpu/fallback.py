@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from dudmap.gpu import faults
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.memory import DeviceImage, OnDevice
-from dudmap.kernels.backend import Backend
+from dudmap.kernels.backend import OPERATIONS
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
@@ -144,6 +144,5 @@ def _operation(name: str) -> Callable[..., Any]:
     return operation
 
 
-for _name in vars(Backend):
-    if not _name.startswith("_"):
-        setattr(FallbackBackend, _name, _operation(_name))
+for _name in OPERATIONS:
+    setattr(FallbackBackend, _name, _operation(_name))

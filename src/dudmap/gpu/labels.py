@@ -20,7 +20,11 @@ from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import Queue
 from dudmap.kernels.evidence import BINS, EvidenceParameters, ResidualCounts
 from dudmap.kernels.parameters import MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget
+from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums
+
+RUN = kernels.RUN
+STEPS = np.array([1, 1, 1, 1, 2.0**20, 2.0**30, 2.0**30, 2.0**30])
+"""Steps of each column of the sums over segments."""
 
 
 class LabelOperations:
@@ -62,11 +66,8 @@ class LabelOperations:
         shape, z, step, camera = depth.shape, self._up(depth), self._up(noise), camera_of(intrinsics)
         free, surface = (self._buffer(shape, wp.int32, use) for use in ("free", "surface"))
         for number, target in enumerate(targets):
-            old = self._up(target.depth), self._up(target.intensity), self._up(target.marks)
-            motion = motion_of(target.T_target_camera[:3].astype(np.float32))
-            self._queue.launch(
-                kernels.count_views, shape, z, step, camera, motion, *old, int(number == 0), free, surface
-            )
+            older = self._older(target)
+            self._queue.launch(kernels.count_views, shape, z, step, camera, *older, int(number == 0), free, surface)
         eroded, out = self._buffer(shape, wp.uint8, "eroded"), self._empty(shape, wp.uint8)
         self._queue.launch(kernels.eroded_views, shape, free, surface, side // 2, eroded)
         self._queue.launch(kernels.dilated, shape, eroded, side // 2, out)
@@ -120,6 +121,73 @@ class LabelOperations:
         images = self._up(seeds), self._up(log_odds), self._up(depth), self._up(tolerance)
         return self._components.moving_regions(*images, min_area, seeded_share)
 
+    def seen_marked(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],  # that of the older frame is not compared
+        intrinsics: NDArray[np.float32],
+        target: ReprojectionTarget,
+        max_gap: float,
+    ) -> Any:  # noqa: ANN401 - a DeviceImage stands for an array
+        """See ``Backend.seen_marked``; the image stays on the device."""
+        out = self._empty(depth.shape, wp.uint8)
+        self._queue.launch(
+            kernels.marked_within, depth.shape, self._up(depth), camera_of(intrinsics), *self._older(target), max_gap,
+            out,
+        )  # fmt: skip
+        return DeviceImage(out, self._queue, np.bool_)
+
+    def segment_counts(
+        self, labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
+    ) -> list[NDArray[np.int64]]:
+        """See ``Backend.segment_counts``."""
+        places, image = _places(count), self._up(labels)
+        counts = wp.zeros((len(masks) + 1) * places, dtype=wp.int32, device=self._queue.device)
+        runs = _runs(labels.shape)
+        nothing = self._buffer((1, 1), wp.uint8, "nothing")
+        self._queue.launch(kernels.count_segments, runs, image, nothing, counts, 1, 0)
+        for number, mask in enumerate(masks, 1):
+            self._queue.launch(kernels.count_segments, runs, image, self._up(mask), counts, 0, number * places)
+        return list(self._staging.download(counts).reshape(-1, places)[:, : count + 1].astype(np.int64))
+
+    def compare_segments(
+        self,
+        sample: MapSample,
+        labels: NDArray[np.int32],
+        started: NDArray[np.bool_],
+        dynamic: NDArray[np.bool_],
+        sigma: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        exposure: tuple[float, float],
+        gradient: NDArray[np.float32],
+        window: int,
+    ) -> tuple[Any, SegmentSums]:
+        """See ``Backend.compare_segments``; the image stays on the device."""
+        shape, count, places = labels.shape, len(started) - 1, _places(len(started) - 1)
+        numbers, occupancy = self._up(labels), self._up(sample.occupancy)
+        mean, moving = self._buffer(shape, wp.float32, "mean"), self._empty(shape, wp.uint8)
+        marks, begun = np.zeros(places, np.uint8), self._buffer((places,), wp.uint8, "started")
+        marks[: count + 1] = started
+        self._staging.upload(marks, begun)
+        self._queue.launch(
+            kernels.compare_with_map, shape, self._up(sample.difference), occupancy, self._up(intensity), *exposure,
+            numbers, begun, self._up(dynamic), window // 2, mean, moving,
+        )  # fmt: skip
+        sums = wp.zeros((places, len(SegmentSums._fields)), dtype=wp.int64, device=self._queue.device)
+        images = numbers, occupancy, moving
+        self._queue.launch(
+            kernels.add_segments, _runs(shape), *images, self._up(sample.distance), self._up(sigma), mean,
+            self._up(gradient), sums,
+        )  # fmt: skip
+        self._queue.launch(kernels.add_deviations, _runs(shape), *images, mean, sums)
+        found = self._staging.download(sums)[: count + 1] / STEPS
+        return DeviceImage(moving, self._queue, np.bool_), SegmentSums(*found.T)
+
+    def _older(self, target: ReprojectionTarget) -> tuple[Any, ...]:
+        """Motion and images of an older frame, as the kernels take them."""
+        motion = motion_of(target.T_target_camera[:3].astype(np.float32))
+        return motion, self._up(target.depth), self._up(target.intensity), self._up(target.marks)
+
     def _up(self, image: Any) -> Any:  # noqa: ANN401
         if isinstance(image, np.ndarray):
             image.flags.writeable = False  # uploaded once
@@ -134,3 +202,13 @@ class LabelOperations:
         if key not in self._scratch:
             self._scratch[key] = self._empty(shape, dtype)
         return self._scratch[key]
+
+
+def _places(count: int) -> int:
+    """Rows of an array for the numbers of segments from 0 on: few different ones, since each has buffers."""
+    return max(256, 1 << count.bit_length())
+
+
+def _runs(shape: tuple[int, ...]) -> tuple[int, int]:
+    """Rows, and runs of pixels in a row."""
+    return shape[0], -(-shape[1] // RUN)

@@ -258,12 +258,12 @@ class Images:
         """The array on the device, for the main queue, to which the staging belongs; bools as bytes."""
         if isinstance(array, DeviceImage):
             return array.twin
-        array = array.view(np.uint8) if array.dtype == np.bool_ else array
         known = self._twins.get(id(array))
         if known is not None and known[0]() is array:
             return known[1]
-        twin = wp.empty(array.shape, dtype=WARP_TYPES[array.dtype], device=self.device)
-        staging.upload(array, twin)
+        words = array.view(np.uint8) if array.dtype == np.bool_ else array
+        twin = wp.empty(words.shape, dtype=WARP_TYPES[words.dtype], device=self.device)
+        staging.upload(words, twin)
         if not array.flags.writeable and array.base is None:
             self.remember(array, twin, uploading=self.device != "cpu")
         return twin

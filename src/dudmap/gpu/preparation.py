@@ -99,7 +99,10 @@ class Preparation:
         """See ``Backend.segment_surface``."""
         with self._lock, self._gate.use():
             images = self._up(depth, "depth"), self._up(tolerance, "tolerance")
-            return self._components.segment_surface(*images, intrinsics, reach, normal_reach, sine)
+            twin = self._pool.take(depth.shape, wp.int32)
+            labels, count = self._components.segment_surface(*images, intrinsics, reach, normal_reach, sine, twin)
+            self._remember(labels, twin)
+            return labels, count
 
     def _up(self, array: NDArray, use: str) -> Any:  # noqa: ANN401 - an array of Warp
         """The array on the device; one that is not there already is copied to a buffer of this queue alone."""
@@ -112,9 +115,13 @@ class Preparation:
     def _down(self, image: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
         """A copy in the host's memory, read-only, whose equal on the device is used again when it has gone."""
         array = self._staging.download(image)
+        self._remember(array, image)
+        return array
+
+    def _remember(self, array: NDArray, image: Any) -> None:  # noqa: ANN401
+        """The image on the device is the array's equal until that has gone."""
         array.flags.writeable = False
         self._images.remember(array, image, self._pool.give_back)
-        return array
 
     def _buffer(self, shape: tuple[int, ...], dtype: Any, use: Any) -> Any:  # noqa: ANN401
         """The array of this queue alone for a use, which is overwritten in the order of the queue."""

@@ -19,7 +19,7 @@ KINDS = 16
 """Kinds of images, by direction, shape and type, that have buffers."""
 WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64, np.dtype(np.int32): wp.int32,
-    np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
+    np.dtype(np.int64): wp.int64, np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
 }  # fmt: skip
 NUMPY_TYPES = {one: other for other, one in WARP_TYPES.items()}
 

@@ -1,12 +1,11 @@
 """The operations that the system asks of a compute device: arrays and one tuple of parameters in, arrays out."""
 
-from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.evidence import EvidenceParameters, ResidualCounts
+from dudmap.kernels.label_backend import LabelBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -26,11 +25,10 @@ from dudmap.kernels.parameters import (
     SensorNoise,
     VoxelGrid,
 )
-from dudmap.kernels.segmentation import ReprojectionTarget
 
 
-class Backend(Protocol):
-    """Operations of a compute device.
+class Backend(LabelBackend, Protocol):
+    """Operations of a compute device, with those on the label image.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -248,96 +246,6 @@ class Backend(Protocol):
         ``linearize``; ``free_after`` observations make free space."""
         ...
 
-    # -- label -------------------------------------------------------------------------------------------------------
-    # Images that these give may be anything that ``np.asarray`` takes, so that a device keeps what nobody reads.
-
-    def residual_counts(
-        self, sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]
-    ) -> ResidualCounts:
-        """Histogram of the normalised residuals of an image at the surfaces of the map; arguments as of ``log_odds``,
-        and the depth (h, w) in metres, 0 = none."""
-        ...
-
-    def free_space(
-        self,
-        depth: NDArray[np.float32],
-        intensity: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        noise: NDArray[np.float32],
-        targets: Sequence[ReprojectionTarget],
-        side: int,
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) bool that at least half as many older frames have seen through as have a reading there, opened.
-
-        Args:
-            depth, intensity: (h, w) float32; depth in metres, 0 = none.
-            intrinsics: (4,) float32 fx, fy, cx, cy.
-            noise: (h, w) float32, largest depth difference of two readings of one point, metres.
-            targets: The older frames.
-            side: Of the square that the mask is opened with, pixels, odd.
-        """
-        ...
-
-    def log_odds(
-        self,
-        sample: MapSample,
-        sigma: NDArray[np.float32],
-        parameters: EvidenceParameters,
-        free_space: bool,
-        seen_free: NDArray[np.bool_] | None,
-    ) -> NDArray[np.float32]:
-        """Log odds static : dynamic (h, w) float32 of each pixel alone, 0 = unknown (eq. 4.56, 4.57).
-
-        Args:
-            sample: The map at the points of the image.
-            sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-            parameters: Of the log odds at surfaces of the map.
-            free_space: Whether a pixel in space that the map knows to be free is certain to move.
-            seen_free: (h, w) bool, other pixels that then are, as of ``free_space``; None = none.
-        """
-        ...
-
-    def label(
-        self,
-        log_odds: NDArray[np.float32],
-        depth: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        coupling: float,
-        sweeps: int,
-    ) -> NDArray[np.float32]:
-        """Static probability (h, w) of each pixel, consistent with its neighbours on the same surface (algorithm 3).
-
-        Args:
-            log_odds: (h, w) float32 log odds static : dynamic of each pixel alone; 0 = unknown.
-            depth: (h, w) float32, metres, 0 = none.
-            tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-            coupling: Log odds that all neighbours together can add.
-            sweeps: Iterations of the mean field.
-        """
-        ...
-
-    def moving_regions(
-        self,
-        seeds: NDArray[np.bool_],
-        log_odds: NDArray[np.float32],
-        depth: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        min_area: float,
-        seeded_share: float,
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) bool of regions that grow from seeds over the surface, up to depth edges and static pixels.
-
-        Args:
-            seeds: (h, w) bool, pixels with a reading.
-            log_odds: As of ``label``; a pixel is static from 1 on.
-            depth, tolerance: As of ``label``.
-            min_area: Fewest pixels of a region.
-            seeded_share: Least share of seeds in a region.
-        """
-        ...
-
-    # -- views and meshes --------------------------------------------------------------------------------------------
-
     def raycast(
         self,
         grid: VoxelGrid,
@@ -394,3 +302,7 @@ class Backend(Protocol):
                 complete if the up to seven blocks at +(dx, dy, dz) from each of its blocks are among ``slots``.
         """
         ...
+
+
+OPERATIONS = tuple(name for protocol in (Backend, LabelBackend) for name in vars(protocol) if not name.startswith("_"))
+"""Names of all operations."""

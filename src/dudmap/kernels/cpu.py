@@ -68,6 +68,9 @@ class CpuBackend:
     free_space = staticmethod(evidence.free_space)
     log_odds = staticmethod(evidence.log_odds)
     moving_regions = staticmethod(evidence.moving_regions)
+    seen_marked = staticmethod(evidence.seen_marked)
+    segment_counts = staticmethod(evidence.segment_counts)
+    compare_segments = staticmethod(evidence.compare_segments)
 
     def __init__(self) -> None:
         self._padded = np.empty((0, 0), dtype=np.float32)

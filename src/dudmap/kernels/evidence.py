@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.kernels import labeling
 from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, reproject
+from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums, reproject, segment_sums
 
 BINS = 128
 """Bins of the histogram of normalised residuals."""
@@ -21,6 +21,10 @@ LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
 """Residual that larger ones are counted as."""
 BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
 """Bins per standard deviation of a reading."""
+
+
+LEAST_SHARE = np.float32(1e-3)
+"""Least share of the pixels of a window that are compared: keeps a quotient finite."""
 
 
 class ResidualCounts(NamedTuple):
@@ -89,7 +93,7 @@ def surface_log_odds(
 
 
 def residual_counts(sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> ResidualCounts:
-    """See ``Backend.residual_counts``."""
+    """See ``LabelBackend.residual_counts``."""
     surface, valid = sample.occupancy == SURFACE, depth > 0
     histogram = np.bincount(residual_bin(sample.distance[surface], sigma[surface]), minlength=BINS)
     unknown = np.count_nonzero((sample.occupancy == UNKNOWN) & valid) / max(np.count_nonzero(valid), 1)
@@ -103,7 +107,7 @@ def log_odds(
     free_space: bool,
     seen_free: NDArray[np.bool_] | None,
 ) -> NDArray[np.float32]:
-    """See ``Backend.log_odds``."""
+    """See ``LabelBackend.log_odds``."""
     p = parameters
     noise = noise_limit(sigma, np.float32(p.noise_floor), np.float32(p.noise_sigmas))
     limit = np.float32(p.limit)
@@ -123,7 +127,7 @@ def free_space(
     targets: Sequence[ReprojectionTarget],
     side: int,
 ) -> NDArray[np.bool_]:
-    """See ``Backend.free_space``."""
+    """See ``LabelBackend.free_space``."""
     import cv2
 
     num_free, num_surface = (np.zeros(depth.shape, dtype=np.float32) for _ in range(2))
@@ -142,10 +146,73 @@ def moving_regions(
     min_area: float,
     seeded_share: float,
 ) -> NDArray[np.bool_]:
-    """See ``Backend.moving_regions``."""
+    """See ``LabelBackend.moving_regions``."""
     labels, count = labeling.grow_regions(seeds, log_odds < 1, depth, tolerance)
     areas = np.bincount(labels.reshape(-1), minlength=count + 1)
     seeded = np.bincount(labels[seeds], minlength=count + 1)
     dynamic = (areas >= min_area) & (seeded >= seeded_share * areas)
     dynamic[0] = False
     return dynamic[labels]
+
+
+def seen_marked(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    target: ReprojectionTarget,
+    max_gap: float,
+) -> NDArray[np.bool_]:
+    """See ``LabelBackend.seen_marked``."""
+    ((gap, _, marks),) = reproject(depth, intensity, intrinsics, [target])
+    return (marks > 0) & (np.abs(gap) < max_gap)
+
+
+def segment_counts(
+    labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
+) -> list[NDArray[np.int64]]:
+    """See ``LabelBackend.segment_counts``."""
+    return [
+        np.bincount(found, minlength=count + 1) for found in (labels.reshape(-1), *(labels[mask] for mask in masks))
+    ]
+
+
+def compare_segments(
+    sample: MapSample,
+    labels: NDArray[np.int32],
+    started: NDArray[np.bool_],
+    dynamic: NDArray[np.bool_],
+    sigma: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    exposure: tuple[float, float],
+    gradient: NDArray[np.float32],
+    window: int,
+) -> tuple[NDArray[np.bool_], SegmentSums]:
+    """See ``LabelBackend.compare_segments``."""
+    surface, known = sample.occupancy == SURFACE, sample.occupancy != UNKNOWN
+    dynamic = dynamic & (known | started[labels])
+    gain, offset = exposure
+    correction = np.float32(1 - gain) * intensity - np.float32(offset)
+    difference = np.asarray(np.nan_to_num(sample.difference + correction), np.float32)  # NaN in the air
+    arguments = labels, len(started) - 1, surface, dynamic, sample.distance, sigma, difference, gradient, window
+    return dynamic, smoothed_segment_sums(*arguments)
+
+
+def smoothed_segment_sums(
+    labels: NDArray[np.int32],
+    count: int,
+    compared: NDArray[np.bool_],
+    moving: NDArray[np.bool_],
+    distance: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    difference: NDArray[np.float32],
+    gradient: NDArray[np.float32],
+    window: int,
+) -> SegmentSums:
+    """Sums over segments, as of ``segment_sums``, with the mean difference over the pixels of a window that are
+    compared."""
+    import cv2
+
+    size = window, window
+    ones = cv2.blur(compared.astype(np.float32), size)
+    mean = cv2.blur(np.where(compared, difference, np.float32(0)), size) / np.maximum(ones, LEAST_SHARE)
+    return segment_sums(labels, count, compared, moving, distance, sigma, np.asarray(mean, np.float32), gradient)
