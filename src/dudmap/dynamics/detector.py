@@ -246,12 +246,12 @@ class DynamicDetector:
             segmentation, counts = split, backend.segment_counts(split.labels, split.count, (before, seeds))
         size, labels = np.maximum(counts[0], 1), segmentation.labels
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
-        known, sums = backend.compare_segments(
+        dynamic, sums = backend.compare_segments(
             frame.sample, labels, counts[2] / size >= STARTED_SHARE, dynamic, sigma, level.intensity, frame.exposure,
             segmentation.gradient, segmentation.window,
         )  # fmt: skip
         moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
-        dynamic = np.asarray(known) | moving[labels]
+        dynamic = dynamic | moving[labels]
         settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 

@@ -284,7 +284,7 @@ class WarpBackend:
             motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count),
             free_after, *out,
         )  # fmt: skip
-        return MapSample(*(self._images.down(image) for image in out))
+        return MapSample(*self._images.down_all(out, self._staging))
 
     def raycast(
         self,

@@ -161,11 +161,11 @@ class LabelOperations:
         exposure: tuple[float, float],
         gradient: NDArray[np.float32],
         window: int,
-    ) -> tuple[Any, SegmentSums]:
-        """See ``Backend.compare_segments``; the image stays on the device."""
+    ) -> tuple[NDArray[np.bool_], SegmentSums]:
+        """See ``Backend.compare_segments``."""
         shape, count, places = labels.shape, len(started) - 1, _places(len(started) - 1)
         numbers, occupancy = self._up(labels), self._up(sample.occupancy)
-        mean, moving = self._buffer(shape, wp.float32, "mean"), self._empty(shape, wp.uint8)
+        mean, moving = self._buffer(shape, wp.float32, "mean"), self._buffer(shape, wp.uint8, "moving")
         marks, begun = np.zeros(places, np.uint8), self._buffer((places,), wp.uint8, "started")
         marks[: count + 1] = started
         self._staging.upload(marks, begun)
@@ -180,8 +180,8 @@ class LabelOperations:
             self._up(gradient), sums,
         )  # fmt: skip
         self._queue.launch(kernels.add_deviations, _runs(shape), *images, mean, sums)
-        found = self._staging.download(sums)[: count + 1] / STEPS
-        return DeviceImage(moving, self._queue, np.bool_), SegmentSums(*found.T)
+        found, mask = self._staging.download_all([sums, moving])
+        return mask.view(np.bool_), SegmentSums(*(found[: count + 1] / STEPS).T)
 
     def _older(self, target: ReprojectionTarget) -> tuple[Any, ...]:
         """Motion and images of an older frame, as the kernels take them."""

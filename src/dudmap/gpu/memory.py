@@ -4,7 +4,7 @@
 # pyright: reportArgumentType=false, reportReturnType=false
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -271,9 +271,19 @@ class Images:
     def down(self, twin: Any) -> NDArray:  # noqa: ANN401
         """A copy in the host's memory, read-only, so that the device's array stays its equal."""
         array = main_queue(self.device).download(twin)
+        self._keep(array, twin)
+        return array
+
+    def down_all(self, twins: Sequence[Any], staging: Staging) -> list[NDArray]:
+        """The same of several images at once, by the staging of the main queue: see ``Staging.download_all``."""
+        arrays = staging.download_all(twins)
+        for array, twin in zip(arrays, twins, strict=True):
+            self._keep(array, twin)
+        return arrays
+
+    def _keep(self, array: NDArray, twin: Any) -> None:  # noqa: ANN401
         array.flags.writeable = False
         self.remember(array, twin)
-        return array
 
     def twin(self, array: NDArray) -> Any:  # noqa: ANN401
         """The device's equal of an array of the host that is ready for every queue; None where there is none."""

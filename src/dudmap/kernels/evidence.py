@@ -171,9 +171,8 @@ def segment_counts(
     labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
 ) -> list[NDArray[np.int64]]:
     """See ``LabelBackend.segment_counts``."""
-    return [
-        np.bincount(found, minlength=count + 1) for found in (labels.reshape(-1), *(labels[mask] for mask in masks))
-    ]
+    members = labels.reshape(-1), *(labels[mask] for mask in masks)
+    return [np.bincount(found, minlength=count + 1) for found in members]
 
 
 def compare_segments(
