@@ -12,7 +12,7 @@ from dudmap.gpu.device import make_backend
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
-from failing import LOST, Device
+from failing import FULL, LOST, Device
 from streamed import NAME, Gpu
 from test_images import FILTER
 
@@ -253,3 +253,19 @@ def test_the_cpu_computes_what_a_lost_device_had(cpu, frame, smooth, older, monk
     expected = cpu.label(cpu.log_odds(frame[0], frame[1], PARAMETERS, True, seen_free), smooth, tolerance, 4.0, 4)
     np.testing.assert_array_equal(found, expected)
     assert len(told) == 1
+
+
+@pytest.mark.parametrize(
+    "kernel",
+    ["count_residuals", "count_views", "log_odds", "mean_field_sweep", "join", "marked_within", "add_segments"],
+)
+def test_the_cpu_does_what_has_too_little_memory(gpu, frame, smooth, older, monkeypatch, kernel):
+    """Whatever step fails, what follows takes the CPU's result, and what came before is read."""
+    expected, device, told = labelled(gpu, frame, smooth, older), Device(monkeypatch), []
+    with faults.told_to(told.append):
+        device.breaks(FULL, kernel)
+        found = labelled(gpu, frame, smooth, older)
+    assert 1 <= len(told) <= 2  # segments and regions are joined by the same kernel
+    assert all("too little free memory for the operation" in sentence for sentence in told)
+    for a, b in zip(found, expected, strict=True):
+        np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), atol=0.02)
