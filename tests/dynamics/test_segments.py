@@ -92,7 +92,7 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     for i in range(35):
         image, board = scene(speed * i / 30)
         surface = segment(image, TOLERANCE)
-        still = memory.settled(i / 30, image, np.eye(4), surface, sigma, board)
+        still = memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
         if i < 30:
             assert not still.any()
@@ -104,7 +104,7 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
         assert not before[~board].any()
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
-    assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
+    assert not memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
 def free_space(memory, timestamp, image, T, unknown=0.0):

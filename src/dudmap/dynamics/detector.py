@@ -252,7 +252,7 @@ class DynamicDetector:
         )  # fmt: skip
         moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
         dynamic = dynamic | moving[labels]
-        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
+        settled = self.memory.settled(backend, frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:

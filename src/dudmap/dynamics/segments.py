@@ -9,7 +9,6 @@ from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length,
 from dudmap.frames.observation import Level
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.evidence import smoothed_segment_sums
 from dudmap.kernels.segmentation import SegmentSums
 
 EDGE_REACH = 3
@@ -135,31 +134,6 @@ def split_mixed_segments(
     split = np.asarray(dynamic_before) & mixed[segmentation.labels]
     labels = np.where(split, number[segmentation.labels], segmentation.labels)
     return replace(segmentation, labels=labels, count=count)
-
-
-def segment_evidence(
-    segmentation: Segmentation,
-    compared: NDArray[np.bool_],
-    dynamic: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    difference: NDArray[np.float32],
-) -> SegmentEvidence:
-    """Evidence of motion of each segment.
-
-    Args:
-        segmentation: The segments.
-        compared: (h, w) bool, pixels whose distance and difference are known.
-        dynamic: (h, w) bool, pixels that are dynamic by themselves.
-        distance: (h, w) float32, metres; arbitrary where not compared.
-        sigma: (h, w) float32, standard deviation of the distance, metres.
-        difference: (h, w) float32, of intensities; arbitrary where not compared.
-    """
-    s = segmentation
-    sums = smoothed_segment_sums(
-        s.labels, s.count, compared, dynamic, distance, sigma, difference, s.gradient, s.window
-    )
-    return evidence_of(sums, s.min_pixels)
 
 
 def evidence_of(sums: SegmentSums, min_pixels: float) -> SegmentEvidence:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
 from dudmap.dynamics.label_scale import scaled_side
-from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, segment_evidence, upper_quartile
+from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation as kernels
@@ -182,6 +182,7 @@ class TemporalMemory:
 
     def settled(
         self,
+        backend: Backend,
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
@@ -196,6 +197,7 @@ class TemporalMemory:
         sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
 
         Args:
+            backend: Compute device.
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
@@ -212,11 +214,12 @@ class TemporalMemory:
         parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
         settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
         settled[: count + 1] = False
-        for frame in frames:
-            ((gap, difference, _),) = reproject(level, T_world_camera, [frame])
-            compared = ~np.isnan(gap)
-            displaced = compared & (np.abs(np.nan_to_num(gap)) > 4 * sigma)
-            evidence = segment_evidence(parts, compared, displaced, gap, sigma, difference)
+        for target in _targets(T_world_camera, frames):
+            sums = backend.compare_with_frame(
+                level.depth, level.intensity, level.camera.intrinsics, target, labels, 2 * count, sigma, 4,
+                parts.gradient, parts.window,
+            )  # fmt: skip
+            evidence = evidence_of(sums, parts.min_pixels)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
             settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
@@ -224,14 +227,6 @@ class TemporalMemory:
             if not settled.any():
                 return none
         return settled[parts.labels]
-
-
-def reproject(
-    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
-) -> list[kernels.Reprojection]:
-    """Differences of an image at a pose (4, 4) to remembered frames, one for each."""
-    targets = _targets(T_world_camera, frames)
-    return kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)
 
 
 def _targets(

@@ -74,7 +74,7 @@ class WarpBackend:
         )
         self.label, self.moving_regions = labels.label, labels.moving_regions
         self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
-        self.compare_segments = labels.compare_segments
+        self.compare_segments, self.compare_with_frame = labels.compare_segments, labels.compare_with_frame
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
 
     # -- filter ------------------------------------------------------------------------------------------------------

@@ -163,25 +163,78 @@ class LabelOperations:
         window: int,
     ) -> tuple[NDArray[np.bool_], SegmentSums]:
         """See ``Backend.compare_segments``."""
-        shape, count, places = labels.shape, len(started) - 1, _places(len(started) - 1)
-        numbers, occupancy = self._up(labels), self._up(sample.occupancy)
-        mean, moving = self._buffer(shape, wp.float32, "mean"), self._buffer(shape, wp.uint8, "moving")
+        shape, places = labels.shape, _places(len(started) - 1)
         marks, begun = np.zeros(places, np.uint8), self._buffer((places,), wp.uint8, "started")
-        marks[: count + 1] = started
+        marks[: len(started)] = started
         self._staging.upload(marks, begun)
-        self._queue.launch(
-            kernels.compare_with_map, shape, self._up(sample.difference), occupancy, self._up(intensity), *exposure,
-            numbers, begun, self._up(dynamic), window // 2, mean, moving,
+        difference, occupancy, distance = (
+            self._up(sample.difference), self._up(sample.occupancy), self._up(sample.distance),
         )  # fmt: skip
-        sums = wp.zeros((places, len(SegmentSums._fields)), dtype=wp.int64, device=self._queue.device)
+        moving = self._buffer(shape, wp.uint8, "moving")
+        sums = self._sums(
+            (difference, occupancy, self._up(intensity), *exposure), (begun, self._up(dynamic)), distance, sigma,
+            labels, gradient, window, moving,
+        )  # fmt: skip
+        found, mask = self._staging.download_all([sums, moving])
+        return mask.view(np.bool_), SegmentSums(*(found[: len(started)] / STEPS).T)
+
+    def compare_with_frame(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        target: ReprojectionTarget,
+        labels: NDArray[np.int32],
+        count: int,
+        sigma: NDArray[np.float32],
+        max_sigmas: float,
+        gradient: NDArray[np.float32],
+        window: int,
+    ) -> SegmentSums:
+        """See ``Backend.compare_with_frame``."""
+        shape, shade = depth.shape, self._up(intensity)
+        distance, difference = (self._buffer(shape, wp.float32, use) for use in ("gap", "difference"))
+        occupancy, displaced = (self._buffer(shape, wp.uint8, use) for use in ("seen", "displaced"))
+        self._queue.launch(
+            kernels.compare_with_frame, shape, self._up(depth), shade, camera_of(intrinsics), *self._older(target),
+            self._up(sigma), max_sigmas, distance, difference, occupancy, displaced,
+        )  # fmt: skip
+        all_started = wp.full(_places(count), 1, dtype=wp.uint8, device=self._queue.device)
+        sums = self._sums(
+            (difference, occupancy, shade, 1.0, 0.0), (all_started, displaced), distance, sigma, labels, gradient,
+            window, self._buffer(shape, wp.uint8, "moving"),
+        )  # fmt: skip
+        return SegmentSums(*(self._staging.download(sums)[: count + 1] / STEPS).T)
+
+    def _sums(
+        self,
+        compared: tuple[Any, ...],
+        marks: tuple[Any, Any],
+        distance: Any,  # noqa: ANN401 - an array of Warp
+        sigma: NDArray[np.float32],
+        labels: NDArray[np.int32],
+        gradient: NDArray[np.float32],
+        window: int,
+        moving: Any,  # noqa: ANN401
+    ) -> Any:  # noqa: ANN401
+        """Sums over segments (places, 8) in steps.
+
+        Args:
+            compared: Difference, occupancy, intensity, gain and offset.
+            marks: Segments that have started, whose number gives that of the places, and moving pixels.
+            distance, sigma, labels, gradient, window: As of ``compare_segments``.
+            moving: Receives the moving pixels of segments that have started, and those in known space.
+        """
+        shape, numbers, occupancy = labels.shape, self._up(labels), compared[1]
+        mean = self._buffer(shape, wp.float32, "mean")
+        self._queue.launch(kernels.compare_with_map, shape, *compared, numbers, *marks, window // 2, mean, moving)
+        sums = wp.zeros((marks[0].size, len(SegmentSums._fields)), dtype=wp.int64, device=self._queue.device)
         images = numbers, occupancy, moving
         self._queue.launch(
-            kernels.add_segments, _runs(shape), *images, self._up(sample.distance), self._up(sigma), mean,
-            self._up(gradient), sums,
-        )  # fmt: skip
+            kernels.add_segments, _runs(shape), *images, distance, self._up(sigma), mean, self._up(gradient), sums
+        )
         self._queue.launch(kernels.add_deviations, _runs(shape), *images, mean, sums)
-        found, mask = self._staging.download_all([sums, moving])
-        return mask.view(np.bool_), SegmentSums(*(found[: count + 1] / STEPS).T)
+        return sums
 
     def _older(self, target: ReprojectionTarget) -> tuple[Any, ...]:
         """Motion and images of an older frame, as the kernels take them."""

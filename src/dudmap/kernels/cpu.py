@@ -71,6 +71,7 @@ class CpuBackend:
     seen_marked = staticmethod(evidence.seen_marked)
     segment_counts = staticmethod(evidence.segment_counts)
     compare_segments = staticmethod(evidence.compare_segments)
+    compare_with_frame = staticmethod(evidence.compare_with_frame)
 
     def __init__(self) -> None:
         self._padded = np.empty((0, 0), dtype=np.float32)

@@ -196,6 +196,25 @@ def compare_segments(
     return dynamic, smoothed_segment_sums(*arguments)
 
 
+def compare_with_frame(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    target: ReprojectionTarget,
+    labels: NDArray[np.int32],
+    count: int,
+    sigma: NDArray[np.float32],
+    max_sigmas: float,
+    gradient: NDArray[np.float32],
+    window: int,
+) -> SegmentSums:
+    """See ``LabelBackend.compare_with_frame``."""
+    ((gap, difference, _),) = reproject(depth, intensity, intrinsics, [target])
+    compared = ~np.isnan(gap)
+    displaced = compared & (np.abs(np.nan_to_num(gap)) > max_sigmas * sigma)
+    return smoothed_segment_sums(labels, count, compared, displaced, gap, sigma, difference, gradient, window)
+
+
 def smoothed_segment_sums(
     labels: NDArray[np.int32],
     count: int,

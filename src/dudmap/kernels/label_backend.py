@@ -159,3 +159,20 @@ class LabelBackend(Protocol):
             window: Side of the window over which the intensity difference is averaged, pixels, odd.
         """
         ...
+
+    def compare_with_frame(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        target: ReprojectionTarget,
+        labels: NDArray[np.int32],
+        count: int,
+        sigma: NDArray[np.float32],
+        max_sigmas: float,
+        gradient: NDArray[np.float32],
+        window: int,
+    ) -> SegmentSums:
+        """Sums over the segments of a frame compared with an older one, in which points move that are off by more than
+        ``max_sigmas``; other arguments as of ``seen_marked``, ``segment_counts`` and ``compare_segments``."""
+        ...

@@ -161,6 +161,26 @@ def marked_within(
 
 
 @wp.kernel
+def compare_with_frame(
+    depth: Image, intensity: Image, camera: Camera, t: Motion, old_depth: Image, old_intensity: Image,
+    old_marks: Bytes, sigma: Image, max_sigmas: wp.float32, distance: Image, difference: Image, occupancy: Bytes,
+    moving: Bytes,
+):  # fmt: skip
+    """An older frame in place of a sample of the map, and the points that are not where it has seen them."""
+    v, u = wp.tid()
+    gap, grey, _mark = older(depth[v, u], v, u, camera, t, old_depth, old_intensity, old_marks)
+    space, moves = UNKNOWN, int(0)
+    if not wp.isnan(gap):
+        space = SURFACE
+        if abs(gap) > max_sigmas * sigma[v, u]:
+            moves = 1
+    distance[v, u] = gap
+    difference[v, u] = grey - intensity[v, u]
+    occupancy[v, u] = wp.uint8(space)
+    moving[v, u] = wp.uint8(moves)
+
+
+@wp.kernel
 def count_segments(labels: Labels, mask: Bytes, counts: Counts, all_: int, first: int):
     """Pixels of each segment in a mask, from ``counts[first]`` on; without one where ``all_`` is not 0.
 
