@@ -155,7 +155,7 @@ class Slam(SlamResults):
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
-            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
+            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size, observation.backend)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)}, make_clock(self.device))
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:

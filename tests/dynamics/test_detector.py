@@ -8,9 +8,10 @@ import pytest
 from dudmap import synthetic
 from dudmap.benchmark.systems import systems
 from dudmap.config import Config
-from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, Mixture, fit_mixture
+from dudmap.dynamics.mixture import Mixture, fit_mixture
 from dudmap.geometry.camera import Camera
 from dudmap.kernels import labeling
+from dudmap.kernels.evidence import BINS, MAX_RESIDUAL
 from dudmap.slam import Slam
 from oracle import half_normal_mixture_em
 

@@ -9,6 +9,7 @@ from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment
 from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.cpu import CpuBackend
 from dudmap.slam import Slam
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
@@ -57,16 +58,21 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
     assert len(large(segment(level(floor), TOLERANCE))) == 1
 
 
+def split(segmentation, before):
+    counts = CpuBackend().segment_counts(segmentation.labels, segmentation.count, [before])
+    return split_mixed_segments(segmentation, before, *counts)
+
+
 def test_segments_that_have_merged_are_split_by_their_last_labels():
     whole = segment(level(np.full(CAMERA.shape, 2.0)), TOLERANCE)
     body = np.zeros(CAMERA.shape, bool)
-    assert split_mixed_segments(whole, body) is whole
+    assert split(whole, body) is whole
     body[:, :60] = True
-    two = split_mixed_segments(whole, body)
+    two = split(whole, body)
     assert two.count == whole.count + 1
     assert len(np.unique(two.labels[body])) == len(np.unique(two.labels[~body])) == 1
     body[:, 6:60] = False  # a strip that came into view
-    assert split_mixed_segments(whole, body) is whole
+    assert split(whole, body) is whole
 
 
 def scene(x):
@@ -86,25 +92,30 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     for i in range(35):
         image, board = scene(speed * i / 30)
         surface = segment(image, TOLERANCE)
-        still = memory.settled(i / 30, image, np.eye(4), surface, sigma, board)
+        still = memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        before = memory.last_dynamic(image, np.eye(4), 0.1)
+        before = memory.last_dynamic(CpuBackend(), image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
         assert before[inner].mean() > 0.9
         assert not before[~board].any()
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
-    assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
+    assert not memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board).any()
+
+
+def free_space(memory, timestamp, image, T, unknown=0.0):
+    """Pixels that single frames have seen to be free, with readings that differ by up to 0.1 m."""
+    noise, frames = np.full(CAMERA.shape, 0.1, np.float32), memory.free_space_frames(timestamp, unknown)
+    return memory.seen_free(CpuBackend(), image, T, noise, frames)
 
 
 def test_single_frames_give_free_space():
     """A moving board in front of a wall, seen by a moving camera, against where both are."""
     memory = TemporalMemory(DynamicsConfig())
-    noise = np.full(CAMERA.shape, 0.1, np.float32)
     v, u = np.indices(CAMERA.shape)
 
     def image(camera_x, board_x):
@@ -120,7 +131,7 @@ def test_single_frames_give_free_space():
         T[0, 3] = camera_x
         if i == 0:
             memory.start(0.0)
-        free = memory.free(i / 30, seen, T, noise)
+        free = free_space(memory, i / 30, seen, T)
         assert not free[~board].any()
         memory.update(i / 30, seen, T, np.zeros_like(board), None)
     new = board & (X > -0.3 + 0.2 + 0.03)  # where it was not in the first frame
@@ -131,16 +142,16 @@ def test_single_frames_give_free_space():
         memory, {k / 30: np.array([[1, 0, 0, 0.01 * k], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) for k in range(16)}
     )
     seen, board, X = image(0.0, -0.3)
-    free = again.free(0.0, seen, np.eye(4), noise)
+    free = free_space(again, 0.0, seen, np.eye(4))
     assert free[board].mean() > 0.8
     assert not free[~board].any()
     # an older map knows free space itself, unless the camera has turned towards unknown space
-    assert not np.any(again.free(10.0, seen, np.eye(4), noise, unknown=0.05))
-    assert not np.any(again.free(10.0, seen, np.eye(4), noise, unknown=0.5))  # not from the first seconds
+    assert not again.free_space_frames(10.0, unknown=0.05)
+    assert not again.free_space_frames(10.0, unknown=0.5)  # not from the first seconds
     for i in range(16):
         seen, board, X = image(0.0, -0.3 + 0.05 * i)
-        free = again.free(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.5)
-        assert not again.free(10.0 + i / 30, seen, np.eye(4), noise, unknown=0.05).any()
+        free = free_space(again, 10.0 + i / 30, seen, np.eye(4), unknown=0.5)
+        assert not again.free_space_frames(10.0 + i / 30, unknown=0.05)
         again.update(10.0 + i / 30, seen, np.eye(4), np.zeros_like(board), None)
     assert free[board & (X > -0.3 + 0.2 + 0.03)].mean() > 0.9
     assert not free[~board].any()

@@ -17,7 +17,8 @@ from warp._src.context import invoke
 
 NAME = "cuda:0"
 MODULES = (
-    "backend", "clock", "descent", "linearization", "memory", "meshing", "preparation", "staging", "streams",
+    "backend", "clock", "components", "descent", "labels", "linearization", "memory", "meshing", "preparation",
+    "staging", "streams",
 )  # fmt: skip
 """Modules that call Warp."""
 

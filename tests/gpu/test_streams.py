@@ -148,6 +148,22 @@ def test_a_buffer_is_filled_again_when_it_was_read(streamed, seed):
     assert [staging.download(target)[0, 0] for target in targets] == [*range(7)]
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+def test_several_arrays_are_downloaded_at_once(streamed, seed):
+    warp = streamed(seed).warp
+    staging = Staging(own_queue(NAME))
+    kinds = ((3, 4), wp.float32), ((3, 4), wp.uint8), ((3, 4), wp.float32)
+    targets = [warp.empty(shape, dtype=kind, device=NAME) for shape, kind in kinds]
+    for turn in range(3):
+        for number, target in enumerate(targets):
+            kind = np.uint8 if number == 1 else np.float32
+            staging.upload(np.full((3, 4), 10 * turn + number, kind), target)
+        found = staging.download_all(targets)
+        assert [array[1, 1] for array in found] == [10 * turn, 10 * turn + 1, 10 * turn + 2]
+    with pytest.raises(ValueError, match="more than 2 arrays of one kind"):
+        staging.download_all([targets[0]] * 3)
+
+
 @pytest.mark.parametrize("device", ["cpu", NAME])
 def test_few_kinds_of_images_have_buffers(streamed, device):
     """The memory of buffers that are given up may be used again when their copies are done."""

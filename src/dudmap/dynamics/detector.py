@@ -11,20 +11,22 @@ from dudmap.config import DynamicsConfig, SensorConfig
 from dudmap.dynamics.background_model import BackgroundModel
 from dudmap.dynamics.label_scale import pixel_scale
 from dudmap.dynamics.masks import Labels, elliptical_kernel, opened_mask
-from dudmap.dynamics.mixture import EDGES, Mixture, fit_mixture, residual_histogram
+from dudmap.dynamics.mixture import Mixture, fit_mixture
 from dudmap.dynamics.segments import (
     Segmentation,
     classify_segments,
+    evidence_of,
     segment,
-    segment_evidence,
     split_mixed_segments,
 )
 from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.kernels import labeling
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.evidence import EDGES, EvidenceParameters, noise_limit
 from dudmap.kernels.threads import submit
-from dudmap.mapping.volume import FREE, SURFACE, UNKNOWN, MapSample, TsdfVolume
+from dudmap.mapping.volume import FREE, MapSample, TsdfVolume
 
 MAX_DISPLACEMENT = 0.1
 """Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
@@ -62,7 +64,6 @@ class _Comparison:
         exposure: Gain and offset that make the image's intensities those of the map.
         sample: The map at the points of the image.
         sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        noise: (h, w) float32, distance below which nothing is called motion (theta in eq. 4.57), metres.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
     """
 
@@ -72,23 +73,12 @@ class _Comparison:
     exposure: tuple[float, float]
     sample: MapSample
     sigma: NDArray[np.float32]
-    noise: NDArray[np.float32]
     tolerance: NDArray[np.float32]
-
-    @property
-    def surface(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels near a surface of the map."""
-        return self.sample.occupancy == SURFACE
 
     @property
     def free(self) -> NDArray[np.bool_]:
         """(h, w) bool, pixels in space the map knows to be free."""
         return self.sample.occupancy == FREE
-
-    @property
-    def unknown(self) -> NDArray[np.bool_]:
-        """(h, w) bool, pixels in space the map does not know."""
-        return self.sample.occupancy == UNKNOWN
 
 
 class DynamicDetector:
@@ -109,12 +99,13 @@ class DynamicDetector:
         self.memory = TemporalMemory(config)
         self.background = BackgroundModel(config)
 
-    def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
+    def segment(self, level: Level, voxel_size: float, backend: Backend) -> Callable[[], Segmentation]:
         """Begin to segment the surface an image shows; needs no map.
 
         Args:
             level: The image, at the resolution of the labels.
             voxel_size: Edge of the map's voxels, metres.
+            backend: Compute device.
 
         Returns:
             A function that waits for the segmentation. It is computed in another thread, or, where the configuration
@@ -122,7 +113,7 @@ class DynamicDetector:
         """
 
         def compute() -> Segmentation:
-            return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
+            return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level), backend)
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
@@ -165,25 +156,24 @@ class DynamicDetector:
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        sigma = distance_sigma(self.sensor, level.depth, volume.voxel_size)
-        noise = noise_threshold(self.config, sigma)
+        sigma, backend = distance_sigma(self.sensor, level.depth, volume.voxel_size), volume.backend
         tolerance = depth_tolerance(sigma, level)
-        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, noise, tolerance)
-        residual = np.asarray(np.abs(sample.distance) / sigma, np.float32)
-        histogram = residual_histogram(residual[frame.surface])
+        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, tolerance)
+        histogram, unknown = backend.residual_counts(sample, level.depth, sigma)
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, EDGES)
-        evidence = self._evidence(frame, residual, mixture)
-        probability = volume.backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
+        evidence = self._evidence(backend, frame, mixture, unknown)
+        probability = backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
         if self.config.regions:
             seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
-            dynamic = self._regions(frame, seeds, evidence)
+            least = MIN_REGION * seeds.size
+            dynamic = backend.moving_regions(seeds, evidence, level.depth, tolerance, least, SEEDED_SHARE)
             if self.config.pieces:
-                dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
+                dynamic, segments = self._segments(backend, frame, dynamic, seeds, segmentation())
             if moving is not None:
                 dynamic = dynamic | moving
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
@@ -219,41 +209,24 @@ class DynamicDetector:
         self.memory.reset()
         self.background.reset()
 
-    def _evidence(self, frame: _Comparison, residual: NDArray[np.float32], mixture: Mixture) -> NDArray[np.float32]:
+    def _evidence(self, backend: Backend, frame: _Comparison, mixture: Mixture, unknown: float) -> NDArray[np.float32]:
         """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown.
 
         Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
-        free space they are -MAX_LOG_ODDS.
+        free space they are -MAX_LOG_ODDS; ``unknown`` is the share of the readings in space unknown to the map.
         """
-        depth = frame.level.depth
-        evidence = np.clip(mixture.log_odds(residual), -MAX_LOG_ODDS, MAX_LOG_ODDS)
-        np.maximum(evidence, np.float32(1), out=evidence, where=np.abs(frame.sample.distance) < frame.noise)
-        evidence[~frame.surface] = 0  # NaN before
-        if not self.config.free_space:
-            return evidence
-        read = depth > 0
-        unknown = np.count_nonzero(frame.unknown & read) / max(np.count_nonzero(read), 1)
-        max_gap = np.float32(1.5) * frame.noise.astype(np.float32)
-        seen_free = self.memory.free(frame.timestamp, frame.level, frame.T_world_camera, max_gap, unknown)
-        evidence[frame.free | seen_free] = -MAX_LOG_ODDS
-        return evidence
-
-    def _regions(
-        self, frame: _Comparison, seeds: NDArray[np.bool_], evidence: NDArray[np.float32]
-    ) -> NDArray[np.bool_]:
-        """Pixels (h, w) of regions that grow from moving seeds over the surface, up to depth edges and static pixels.
-
-        A region of at least MIN_REGION is dynamic if at least SEEDED_SHARE of it are seeds.
-        """
-        labels, count = labeling.grow_regions(seeds, evidence < 1, frame.level.depth, frame.tolerance)
-        areas = np.bincount(labels.reshape(-1), minlength=count + 1)
-        seeded = np.bincount(labels[seeds], minlength=count + 1)
-        dynamic = (areas >= MIN_REGION * seeds.size) & (seeded >= SEEDED_SHARE * areas)
-        dynamic[0] = False
-        return dynamic[labels]
+        config, level, seen_free = self.config, frame.level, None
+        if config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown)):
+            max_gap = np.float32(1.5) * noise_threshold(config, frame.sigma)
+            seen_free = self.memory.seen_free(backend, level, frame.T_world_camera, max_gap, older)
+        parameters = EvidenceParameters(
+            *mixture.coefficients, MAX_LOG_ODDS, config.noise_threshold, config.noise_sigmas
+        )
+        return backend.log_odds(frame.sample, frame.sigma, parameters, config.free_space, seen_free)
 
     def _segments(
         self,
+        backend: Backend,
         frame: _Comparison,
         dynamic: NDArray[np.bool_],
         seeds: NDArray[np.bool_],
@@ -265,21 +238,21 @@ class DynamicDetector:
         2. Segments that ``classify_segments`` finds to move are dynamic as a whole.
         3. Segments that have settled are static.
         """
-        level, T_world_camera, sample = frame.level, frame.T_world_camera, frame.sample
-        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
-        segmentation = split_mixed_segments(segmentation, before)
-        known = ~frame.unknown
-        started = segmentation.share(seeds) >= STARTED_SHARE
-        labels = segmentation.labels
-        dynamic = dynamic & (known | started[labels])
-        gain, offset = frame.exposure
-        correction = np.float32(1 - gain) * level.intensity - np.float32(offset)
-        difference = np.asarray(sample.difference + correction, np.float32)
-        difference[np.isnan(difference)] = 0  # in the air
+        level, T_world_camera = frame.level, frame.T_world_camera
+        before = self.memory.last_dynamic(backend, level, T_world_camera, MAX_DISPLACEMENT)
+        counts = backend.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
+        split = split_mixed_segments(segmentation, before, *counts[:2])
+        if split is not segmentation:
+            segmentation, counts = split, backend.segment_counts(split.labels, split.count, (before, seeds))
+        size, labels = np.maximum(counts[0], 1), segmentation.labels
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
-        evidence = segment_evidence(segmentation, frame.surface, dynamic, sample.distance, sigma, difference)
-        dynamic = dynamic | classify_segments(evidence, segmentation.share(before))[labels]
-        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
+        dynamic, sums = backend.compare_segments(
+            frame.sample, labels, counts[2] / size >= STARTED_SHARE, dynamic, sigma, level.intensity, frame.exposure,
+            segmentation.gradient, segmentation.window,
+        )  # fmt: skip
+        moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
+        dynamic = dynamic | moving[labels]
+        settled = self.memory.settled(backend, frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
@@ -290,13 +263,13 @@ class DynamicDetector:
         import cv2
 
         level = frame.level
-        distance = np.abs(np.nan_to_num(frame.sample.distance))
+        distance, noise = np.abs(np.nan_to_num(frame.sample.distance)), noise_threshold(self.config, frame.sigma)
         rim = 0.95 * truncation  # a stored distance never exceeds the truncation
         marked = (distance > min(self.config.threshold, rim)) | frame.free
         width = level.camera.width
         core = cv2.erode(marked.astype(np.uint8), elliptical_kernel(EROSION * width)) > 0
         tolerance = np.float32(FLOOD_STEP * 640 / width) * level.depth
-        open_pixels = (distance > frame.noise) | frame.free
+        open_pixels = (distance > noise) | frame.free
         labels, _ = labeling.grow_regions(core & (level.depth > 0), open_pixels, level.depth, tolerance)
         return cv2.dilate((labels > 0).astype(np.uint8), elliptical_kernel(DILATION * width)) > 0
 
@@ -314,4 +287,4 @@ def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.floa
 
 def noise_threshold(config: DynamicsConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:
     """Distance (h, w) to the map below which nothing is called motion (theta in eq. 4.57), metres."""
-    return np.maximum(np.float32(config.noise_threshold), np.float32(config.noise_sigmas) * sigma)
+    return noise_limit(sigma, np.float32(config.noise_threshold), np.float32(config.noise_sigmas))

@@ -6,13 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import labeling
+from dudmap.kernels.evidence import MAX_RESIDUAL, mixture_log_odds
 
-BINS = 128
-"""Bins of the histogram of normalised residuals."""
-MAX_RESIDUAL = 16.0
-"""Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
-EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
-"""Edges of its bins."""
 START = 0.1, 1.0, 6.0
 """Prior of the dynamic density and standard deviations, static and dynamic, from which the EM starts."""
 PRIOR_BOUNDS = 0.02, 0.98
@@ -35,11 +30,16 @@ class Mixture:
     prior: tuple[float, float]
     sigma: tuple[float, float]
 
+    @property
+    def coefficients(self) -> tuple[float, float]:
+        """Offset and slope of the log odds static : dynamic over the squared normalised residual."""
+        (p_static, p_dynamic), (s, d) = self.prior, self.sigma
+        return np.log(p_static / p_dynamic * d / s), 0.5 / d**2 - 0.5 / s**2
+
     def log_odds(self, residual: NDArray[np.floating]) -> NDArray[np.float32]:
         """Log odds static : dynamic of normalised residuals >= 0."""
-        (p_static, p_dynamic), (s, d) = self.prior, self.sigma
-        r2 = np.square(residual, dtype=np.float32)
-        return (np.log(p_static / p_dynamic * d / s) + r2 * np.float32(0.5 / d**2 - 0.5 / s**2)).astype(np.float32)
+        offset, slope = self.coefficients
+        return mixture_log_odds(np.square(residual, dtype=np.float32), offset, np.float32(slope))
 
     def density(self, residual: NDArray[np.floating]) -> NDArray[np.float64]:
         """Densities (2, ...) of both components, priors included."""
@@ -50,12 +50,6 @@ class Mixture:
                 for p, s in zip(self.prior, self.sigma, strict=True)
             ]
         )
-
-
-def residual_histogram(residuals: NDArray[np.float32]) -> NDArray[np.int64]:
-    """Histogram (BINS,) of normalised residuals (n,) >= 0 up to MAX_RESIDUAL."""
-    bins = np.minimum(residuals, np.float32(MAX_RESIDUAL - 1e-3)) * np.float32(BINS / MAX_RESIDUAL)
-    return np.bincount(bins.astype(np.int64), minlength=BINS)
 
 
 def fit_mixture(histogram: NDArray[np.integer], edges: NDArray[np.float64], iterations: int = 30) -> Mixture:

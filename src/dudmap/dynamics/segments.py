@@ -1,14 +1,15 @@
 """Surface segments of an image, and the decision whether a whole segment moves."""
 
 from dataclasses import dataclass, replace
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.frames.observation import Level
-from dudmap.kernels import segmentation as kernels
+from dudmap.kernels.backend import Backend
+from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.segmentation import SegmentSums
 
 EDGE_REACH = 3
 """Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
@@ -53,14 +54,10 @@ class Segmentation:
     min_pixels: float = MIN_PIXELS
     window: int = 3
 
-    @cached_property
-    def sizes(self) -> NDArray[np.int64]:
-        """Number (count + 1,) of each segment's pixels; entry 0 counts those without a reading."""
-        return np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
-
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""
-        return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(self.sizes, 1)
+        total = np.bincount(self.labels.reshape(-1), minlength=self.count + 1)
+        return np.bincount(self.labels[pixels], minlength=self.count + 1) / np.maximum(total, 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +87,16 @@ class SegmentEvidence:
     min_pixels: float = MIN_PIXELS
 
 
-def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
+def segment(level: Level, tolerance: NDArray[np.float32], backend: Backend | None = None) -> Segmentation:
     """Cut the surface an image shows along depth edges and concave edges (Stein et al. 2014).
 
     Args:
         level: The image.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        backend: Compute device; None takes the CPU.
     """
     edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
-    labels, count = kernels.segment_surface(
+    labels, count = (backend or CpuBackend()).segment_surface(
         level.depth, level.camera.intrinsics, tolerance, edge_reach, normal_reach, CONCAVITY
     )
     return Segmentation(labels, count, intensity_gradient(level), scaled_area(MIN_PIXELS, level), scaled_side(1, level))
@@ -114,7 +112,9 @@ def intensity_gradient(level: Level) -> NDArray[np.float32]:
     return np.asarray(cv2.blur(cv2.magnitude(du, dv), (window, window)), dtype=np.float32)
 
 
-def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.bool_]) -> Segmentation:
+def split_mixed_segments(
+    segmentation: Segmentation, dynamic_before: NDArray[np.bool_], total: NDArray[np.int64], part: NDArray[np.int64]
+) -> Segmentation:
     """Segmentation in which segments that were separate in the last frame, a dynamic and a static one, stay separate.
 
     A segment is split where each part holds at least a fifth of its pixels; a smaller part has merely come into view.
@@ -122,11 +122,8 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     Args:
         segmentation: The segments.
         dynamic_before: (h, w) bool, pixels that belonged to a dynamic segment in the last frame.
+        total, part: (count + 1,) pixels of each segment, and those that did.
     """
-    if not dynamic_before.any():
-        return segmentation
-    total = segmentation.sizes
-    part = np.bincount(segmentation.labels[dynamic_before], minlength=segmentation.count + 1)
     mixed = np.minimum(part, total - part) >= np.maximum(segmentation.min_pixels, 0.2 * total)
     mixed[0] = False
     if not mixed.any():
@@ -134,40 +131,13 @@ def split_mixed_segments(segmentation: Segmentation, dynamic_before: NDArray[np.
     count = segmentation.count + int(np.count_nonzero(mixed))
     number = np.zeros(segmentation.count + 1, dtype=np.int32)
     number[mixed] = np.arange(segmentation.count + 1, count + 1)
-    split = dynamic_before & mixed[segmentation.labels]
+    split = np.asarray(dynamic_before) & mixed[segmentation.labels]
     labels = np.where(split, number[segmentation.labels], segmentation.labels)
     return replace(segmentation, labels=labels, count=count)
 
 
-def segment_evidence(
-    segmentation: Segmentation,
-    compared: NDArray[np.bool_],
-    dynamic: NDArray[np.bool_],
-    distance: NDArray[np.float32],
-    sigma: NDArray[np.float32],
-    difference: NDArray[np.float32],
-) -> SegmentEvidence:
-    """Evidence of motion of each segment.
-
-    Args:
-        segmentation: The segments.
-        compared: (h, w) bool, pixels whose distance and difference are known.
-        dynamic: (h, w) bool, pixels that are dynamic by themselves.
-        distance: (h, w) float32, metres; arbitrary where not compared.
-        sigma: (h, w) float32, standard deviation of the distance, metres.
-        difference: (h, w) float32, of intensities; arbitrary where not compared.
-    """
-    import cv2
-
-    ones = compared.astype(np.float32)
-    window = segmentation.window, segmentation.window
-    mean_difference = cv2.blur(np.where(compared, difference, np.float32(0)), window) / np.maximum(
-        cv2.blur(ones, window), np.float32(1e-3)
-    )
-    sums = kernels.segment_sums(
-        segmentation.labels, segmentation.count, compared, dynamic, distance, sigma,
-        np.asarray(mean_difference, np.float32), segmentation.gradient,
-    )  # fmt: skip
+def evidence_of(sums: SegmentSums, min_pixels: float) -> SegmentEvidence:
+    """Evidence of motion of each segment, from the sums over its pixels and the fewest pixels of a large one."""
     size, static = np.maximum(sums.pixels, 1), np.maximum(sums.static, 1)
     texture = sums.gradient / static
     return SegmentEvidence(
@@ -176,7 +146,7 @@ def segment_evidence(
         dynamic=sums.moving / size,
         distance=sums.distance / static,
         mismatch=sums.deviation / static * texture / (texture + GRADIENT_NOISE) ** 2,
-        min_pixels=segmentation.min_pixels,
+        min_pixels=min_pixels,
     )
 
 

@@ -9,10 +9,11 @@ from numpy.typing import NDArray
 
 from dudmap.config import DynamicsConfig
 from dudmap.dynamics.label_scale import scaled_side
-from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, segment_evidence, upper_quartile
+from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels import segmentation as kernels
+from dudmap.kernels.backend import Backend
 
 SETTLE_FRAMES = 4
 """Frames kept of ``settle_time``, in which a segment must stand still to be released."""
@@ -124,61 +125,64 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+    def last_dynamic(
+        self, backend: Backend, level: Level, T_world_camera: NDArray[np.float64], max_gap: float
+    ) -> NDArray[np.bool_]:
         """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
+            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
         """
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, dtype=bool)
-        ((gap, _, marks),) = reproject(level, T_world_camera, [self._last])
-        return (marks > 0) & (np.abs(gap) < max_gap)
+        (target,) = _targets(T_world_camera, [self._last])
+        return backend.seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
 
-    def free(
-        self,
-        timestamp: float,
+    def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
+        """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
+
+        Single frames are compared while the map is young, and where it does not know much of what is in view;
+        otherwise there are none. In the first seconds of a second pass later frames are compared, too.
+
+        Args:
+            timestamp: Seconds.
+            unknown: Share of the readings that lie in space unknown to the map.
+        """
+        if timestamp < self._young_until:
+            candidates = self._start_frames if self._imported else self._recent_frames
+        else:
+            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
+        return [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
+
+    @staticmethod
+    def seen_free(
+        backend: Backend,
         level: Level,
         T_world_camera: NDArray[np.float64],
         noise: NDArray[np.float32],
-        unknown: float = 0.0,
+        frames: Sequence[RememberedFrame],
     ) -> NDArray[np.bool_]:
         """Pixels (h, w) in space that single frames have seen to be free.
-
-        Single frames are compared while the map is young, and where it does not know much of what is in view;
-        otherwise the mask is empty. In the first seconds of a second pass later frames are compared, too.
 
         A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
         at least half as many frames have as have seen a surface at it.
 
         Args:
-            timestamp: Seconds.
+            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest depth difference between two readings of one point, metres.
-            unknown: Share of the readings that lie in space unknown to the map.
+            frames: As of ``free_space_frames``.
         """
-        import cv2
-
-        if timestamp < self._young_until:
-            candidates = self._start_frames if self._imported else self._recent_frames
-        else:
-            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
-        frames = [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
-        if not frames:
-            return np.zeros(level.depth.shape, dtype=bool)
-        num_free, num_surface = (np.zeros(level.depth.shape, dtype=np.float32) for _ in range(2))
-        for gap, _, _ in reproject(level, T_world_camera, frames):
-            num_free += gap > noise
-            num_surface += np.abs(gap) <= noise
-        free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
-        side = scaled_side(SEAM, level)
-        return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+        targets, side = _targets(T_world_camera, frames), scaled_side(SEAM, level)
+        return backend.free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
 
     def settled(
         self,
+        backend: Backend,
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
@@ -193,6 +197,7 @@ class TemporalMemory:
         sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
 
         Args:
+            backend: Compute device.
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
@@ -209,11 +214,12 @@ class TemporalMemory:
         parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
         settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
         settled[: count + 1] = False
-        for frame in frames:
-            ((gap, difference, _),) = reproject(level, T_world_camera, [frame])
-            compared = ~np.isnan(gap)
-            displaced = np.abs(gap) > 4 * sigma  # not where it is NaN
-            evidence = segment_evidence(parts, compared, displaced, gap, sigma, difference)
+        for target in _targets(T_world_camera, frames):
+            sums = backend.compare_with_frame(
+                level.depth, level.intensity, level.camera.intrinsics, target, labels, 2 * count, sigma, 4,
+                parts.gradient, parts.window,
+            )  # fmt: skip
+            evidence = evidence_of(sums, parts.min_pixels)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
             settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
@@ -223,14 +229,13 @@ class TemporalMemory:
         return settled[parts.labels]
 
 
-def reproject(
-    level: Level, T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
-) -> list[kernels.Reprojection]:
-    """Differences of an image at a pose (4, 4) to remembered frames, one for each."""
-    targets = [
+def _targets(
+    T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
+) -> list[kernels.ReprojectionTarget]:
+    """Remembered frames that an image at a pose (4, 4) is compared with."""
+    return [
         kernels.ReprojectionTarget(
             se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
         )
         for frame in frames
     ]
-    return kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, targets)

@@ -5,7 +5,10 @@ from pathlib import Path
 
 import warp as wp  # pyright: ignore[reportMissingImports]
 
-MODULES = tuple(f"dudmap.gpu.kernels.{name}" for name in ("images", "fusion", "surface", "descent", "cubes", "rows"))
+MODULES = tuple(
+    f"dudmap.gpu.kernels.{name}"
+    for name in ("images", "fusion", "surface", "labels", "components", "descent", "cubes", "rows")
+)
 """Modules that hold kernels."""
 
 

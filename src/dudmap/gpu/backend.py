@@ -16,9 +16,10 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
 from dudmap.gpu.descent import DeviceDescent
-from dudmap.gpu.kernels import fusion, images, surface
-from dudmap.gpu.kernels.formulas import Motion
-from dudmap.gpu.kernels.structs import Camera, Lattice, struct
+from dudmap.gpu.kernels import fusion, surface
+from dudmap.gpu.kernels.formulas import motion_of
+from dudmap.gpu.kernels.structs import Lattice, camera_of, struct
+from dudmap.gpu.labels import LabelOperations
 from dudmap.gpu.linearization import Linearization
 from dudmap.gpu.memory import Images, resident, users_of, wrote
 from dudmap.gpu.meshing import extract_surface
@@ -65,6 +66,15 @@ class WarpBackend:
         self._staging = Staging(self._queue)
         self._host = CpuBackend()
         self.color_pixels = self._host.color_pixels
+        labels = LabelOperations(self._images, self._queue, self._staging)
+        self.residual_counts, self.free_space, self.log_odds = (
+            labels.residual_counts,
+            labels.free_space,
+            labels.log_odds,
+        )
+        self.label, self.moving_regions = labels.label, labels.moving_regions
+        self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
+        self.compare_segments, self.compare_with_frame = labels.compare_segments, labels.compare_with_frame
         self._marks = wp.zeros(0, dtype=wp.int32, device=device)
 
     # -- filter ------------------------------------------------------------------------------------------------------
@@ -89,6 +99,18 @@ class WarpBackend:
         """See ``Backend.footprint_colors``."""
         return self._preparation.footprint_colors(color, depth, focal, voxel_size)
 
+    def segment_surface(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        reach: int,
+        normal_reach: int,
+        sine: float,
+    ) -> tuple[NDArray[np.int32], int]:
+        """See ``Backend.segment_surface``."""
+        return self._preparation.segment_surface(depth, intrinsics, tolerance, reach, normal_reach, sine)
+
     # -- integrate ---------------------------------------------------------------------------------------------------
 
     def view(
@@ -112,7 +134,7 @@ class WarpBackend:
         """See ``Backend.reading_weights``."""
         out = self._empty(depth.shape, wp.uint8)
         self._launch(
-            fusion.reading_weights, depth.shape, self._up(depth), _camera(intrinsics), struct(noise), best, out
+            fusion.reading_weights, depth.shape, self._up(depth), camera_of(intrinsics), struct(noise), best, out
         )
         return self._images.down(out)
 
@@ -131,9 +153,9 @@ class WarpBackend:
         marks = self._cleared_marks(lattice.cells.size)
         shape = -(-view.depth.shape[0] // stride), -(-view.depth.shape[1] // stride)
         self._launch(
-            fusion.mark_cells, shape, self._up(view.depth), _camera(view.intrinsics),
-            _motion(view.T_grid_camera / np.float32(BLOCK)), stride, lattice, self._bytes(grid.free_count), free_after,
-            struct(p.band), BLOCK * p.voxel_size, marks,
+            fusion.mark_cells, shape, self._up(view.depth), camera_of(view.intrinsics),
+            motion_of(view.T_grid_camera / np.float32(BLOCK)), stride, lattice, self._bytes(grid.free_count),
+            free_after, struct(p.band), BLOCK * p.voxel_size, marks,
         )  # fmt: skip
         return self._down(self._marked(marks))
 
@@ -151,7 +173,7 @@ class WarpBackend:
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
         p, (height, width) = struct(parameters), view.depth.shape
-        camera, t = _camera(view.intrinsics), _motion(view.T_camera_world)
+        camera, t = camera_of(view.intrinsics), motion_of(view.T_camera_world)
         coords, slots = wp.array(grid.slot_coords, device=self.device), wp.array(candidates, device=self.device)
         marks, repeats = self._empty(len(candidates), wp.int32), self._empty(len(candidates))
         self._launch(
@@ -188,9 +210,9 @@ class WarpBackend:
         marks, counts = self._cleared_marks(lattice.cells.size), self._bytes(grid.free_count)
         self._launch(
             fusion.observe_free, (int(grid.shape[0]) // 2, int(grid.shape[1])), lattice,
-            wp.vec3i(*(int(n) for n in grid.origin)), parity, _motion(view.T_camera_world), _camera(view.intrinsics),
-            height, width, BLOCK * p.voxel_size, view.tiles.nearest, view.tiles.valid, struct(p.band), p.depth_max,
-            counts, count, free_after, marks,
+            wp.vec3i(*(int(n) for n in grid.origin)), parity, motion_of(view.T_camera_world),
+            camera_of(view.intrinsics), height, width, BLOCK * p.voxel_size, view.tiles.nearest, view.tiles.valid,
+            struct(p.band), p.depth_max, counts, count, free_after, marks,
         )  # fmt: skip
         found = self._down(self._marked(marks))
         grid.free_count[:] = self._down(counts)
@@ -217,7 +239,7 @@ class WarpBackend:
         recorded = users.get(key)
         if recorded is None or recorded.lattice.cells is not lattice.cells:
             recorded = users[key] = Linearization(
-                self._queue, images, _camera(intrinsics), lattice, parameters, float(grid.voxel_size),
+                self._queue, images, camera_of(intrinsics), lattice, parameters, float(grid.voxel_size),
                 float(grid.sdf_unit),
             )  # fmt: skip
         return recorded(images, parameters, T_grid_camera)
@@ -242,7 +264,7 @@ class WarpBackend:
         steps = users.get(key)
         if steps is None or steps.lattice.cells is not lattice.cells:
             steps = users[key] = DeviceDescent(
-                self._queue, depth.shape, _camera(intrinsics), lattice, grid, damping.limit
+                self._queue, depth.shape, camera_of(intrinsics), lattice, grid, damping.limit
             )
         return steps(images, grid, T_world_camera, damping, parameters)
 
@@ -258,26 +280,11 @@ class WarpBackend:
         """See ``Backend.sample``."""
         out = self._empty(depth.shape), self._empty(depth.shape), self._empty(depth.shape, wp.uint8)
         self._launch(
-            surface.sample, depth.shape, self._up(depth), self._up(intensity), _camera(intrinsics),
-            _motion(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count), free_after,
-            *out,
+            surface.sample, depth.shape, self._up(depth), self._up(intensity), camera_of(intrinsics),
+            motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count),
+            free_after, *out,
         )  # fmt: skip
-        return MapSample(*(self._down(image) for image in out))
-
-    def label(
-        self,
-        log_odds: NDArray[np.float32],
-        depth: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        coupling: float,
-        sweeps: int,
-    ) -> NDArray[np.float32]:
-        """See ``Backend.label``."""
-        shape, evidence, z, step = depth.shape, self._up(log_odds), self._up(depth), self._up(tolerance)
-        spin = self._run(images.first_spins, shape, evidence)
-        for _ in range(sweeps):
-            spin = self._run(images.mean_field_sweep, shape, evidence, z, step, coupling / 8, spin)
-        return self._down(self._run(images.probabilities, shape, spin))
+        return MapSample(*self._images.down_all(out, self._staging))
 
     def raycast(
         self,
@@ -288,20 +295,20 @@ class WarpBackend:
         parameters: RaycastParameters,
     ) -> RaycastResult:
         """See ``Backend.raycast``."""
-        lattice, camera, (height, width) = self._lattice(grid), _camera(intrinsics), size
+        lattice, camera, (height, width) = self._lattice(grid), camera_of(intrinsics), size
         to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
         tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
         near = wp.full(tiles, float(raycasting.INFINITE), dtype=wp.float32, device=self.device)
         far = wp.zeros(tiles, dtype=wp.float32, device=self.device)
         limits = float(parameters.depth_min), float(parameters.depth_max)
         self._launch(
-            surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, _motion(to_camera), camera, height, width,
-            radius, *limits, near, far,
+            surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height,
+            width, radius, *limits, near, far,
         )  # fmt: skip
         depth, color = self._empty(size), self._empty((*size, 3), wp.uint8)
         normals = self._empty(size, wp.vec3)
         self._launch(
-            surface.trace, size, lattice, resident(grid.colors, self.device), camera, _motion(to_lattice), near, far,
+            surface.trace, size, lattice, resident(grid.colors, self.device), camera, motion_of(to_lattice), near, far,
             *limits, grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1), depth, color, normals,
         )  # fmt: skip
         return RaycastResult(self._down(depth), self._down(color), self._down(normals))
@@ -346,12 +353,6 @@ class WarpBackend:
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
         self._queue.launch(kernel, dim, *arguments)
 
-    def _run(self, kernel: Any, shape: tuple[int, ...], *arguments: Any) -> Any:  # noqa: ANN401
-        """A float32 image that a kernel, whose last argument it is, computes."""
-        out = self._empty(shape)
-        self._launch(kernel, shape, *arguments, out)
-        return out
-
     def _empty(self, shape: Any, dtype: Any = wp.float32) -> Any:  # noqa: ANN401
         return wp.empty(shape, dtype=dtype, device=self.device)
 
@@ -386,13 +387,3 @@ class WarpBackend:
         out = self._empty(int(self._down(ends[-1:])[0]), wp.int32)
         self._launch(fusion.compact, marks.size, marks, ends, out)
         return out
-
-
-def _motion(T: NDArray[np.float32]) -> Any:  # noqa: ANN401
-    return Motion(*(float(value) for value in T.reshape(-1)))
-
-
-def _camera(intrinsics: NDArray[np.float32]) -> Any:  # noqa: ANN401
-    camera = Camera()
-    camera.fx, camera.fy, camera.cx, camera.cy = (float(value) for value in intrinsics)
-    return camera

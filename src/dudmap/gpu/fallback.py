@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from dudmap.gpu import faults
 from dudmap.gpu.backend import WarpBackend
-from dudmap.gpu.memory import OnDevice
-from dudmap.kernels.backend import Backend
+from dudmap.gpu.memory import DeviceImage, OnDevice
+from dudmap.kernels.backend import OPERATIONS
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
@@ -57,6 +57,8 @@ class FallbackBackend:
                     again = grid, *images[:-1], T_grid_camera, parameters
                     residuals = _Residuals(self, result.equations.residuals, again)
                     return result._replace(equations=result.equations._replace(residuals=residuals))
+                if isinstance(result, DeviceImage):
+                    return _Image(self, result, name, arguments)
                 if isinstance(result, FusedBlocks):
                     self._keep(arguments[0])
                 return result
@@ -68,7 +70,7 @@ class FallbackBackend:
 
     def perform_on_cpu(self, name: str, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
         """The same by the CPU, whatever the device can do."""
-        found = [self._viewed(value) if isinstance(value, DepthView) else value for value in arguments]
+        found = [self._on_host(value) for value in arguments]
         result = getattr(self._on_cpu, name)(*found)
         if isinstance(result, FusedBlocks):
             for array in _mirrors(arguments[:1]):
@@ -76,9 +78,11 @@ class FallbackBackend:
                     array.wrote(result.slots)
         return result
 
-    def _viewed(self, view: DepthView) -> DepthView:
-        """The view with tiles in the host's memory."""
-        return self._on_cpu.view(view.depth, view.intrinsics, view.T_grid_camera, view.T_camera_world)
+    def _on_host(self, value: Any) -> Any:  # noqa: ANN401
+        """An argument in the host's memory: a view with its tiles, an image."""
+        if isinstance(value, DepthView):
+            return self._on_cpu.view(value.depth, value.intrinsics, value.T_grid_camera, value.T_camera_world)
+        return np.asarray(value) if isinstance(value, DeviceImage) else value
 
     def _leave(self, arguments: tuple[Any, ...]) -> None:
         """Bring the map to the host, which has all of it from now on."""
@@ -92,6 +96,22 @@ class FallbackBackend:
         if self._num_fused - self._num_kept >= min(max(self._num_kept, 1), KEPT_EVERY):
             self._num_kept = self._num_fused
             grid.on_host()
+
+
+class _Image(DeviceImage):
+    """Result of an operation on a device, which the CPU computes anew if the device fails before it was read."""
+
+    def __init__(self, backend: FallbackBackend, image: DeviceImage, name: str, arguments: tuple[Any, ...]) -> None:
+        super().__init__(image.twin, image.queue, image.dtype)
+        self._backend, self._name, self._arguments = backend, name, arguments
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:  # noqa: ANN401
+        if not faults.is_lost(self._backend.device):
+            try:
+                return super().__array__(dtype, copy)
+            except Exception as error:
+                faults.handle(error, self._backend.device, f"the result of {self._name}")
+        return np.asarray(self._backend.perform_on_cpu(self._name, self._arguments), dtype)
 
 
 class _Residuals:
@@ -124,6 +144,5 @@ def _operation(name: str) -> Callable[..., Any]:
     return operation
 
 
-for _name in vars(Backend):
-    if not _name.startswith("_"):
-        setattr(FallbackBackend, _name, _operation(_name))
+for _name in OPERATIONS:
+    setattr(FallbackBackend, _name, _operation(_name))

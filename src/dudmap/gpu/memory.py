@@ -4,7 +4,7 @@
 # pyright: reportArgumentType=false, reportReturnType=false
 
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -254,13 +254,16 @@ class Images:
         self.device = device
         self._twins: dict[int, tuple[weakref.ref, Any, bool]] = {}
 
-    def up(self, array: NDArray, staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
-        """The array on the device, for the main queue, to which the staging belongs."""
+    def up(self, array: "NDArray | DeviceImage", staging: Staging) -> Any:  # noqa: ANN401 - an array of Warp
+        """The array on the device, for the main queue, to which the staging belongs; bools as bytes."""
+        if isinstance(array, DeviceImage):
+            return array.twin
         known = self._twins.get(id(array))
         if known is not None and known[0]() is array:
             return known[1]
-        twin = wp.empty(array.shape, dtype=WARP_TYPES[array.dtype], device=self.device)
-        staging.upload(array, twin)
+        words = array.view(np.uint8) if array.dtype == np.bool_ else array
+        twin = wp.empty(words.shape, dtype=WARP_TYPES[words.dtype], device=self.device)
+        staging.upload(words, twin)
         if not array.flags.writeable and array.base is None:
             self.remember(array, twin, uploading=self.device != "cpu")
         return twin
@@ -268,9 +271,19 @@ class Images:
     def down(self, twin: Any) -> NDArray:  # noqa: ANN401
         """A copy in the host's memory, read-only, so that the device's array stays its equal."""
         array = main_queue(self.device).download(twin)
+        self._keep(array, twin)
+        return array
+
+    def down_all(self, twins: Sequence[Any], staging: Staging) -> list[NDArray]:
+        """The same of several images at once, by the staging of the main queue: see ``Staging.download_all``."""
+        arrays = staging.download_all(twins)
+        for array, twin in zip(arrays, twins, strict=True):
+            self._keep(array, twin)
+        return arrays
+
+    def _keep(self, array: NDArray, twin: Any) -> None:  # noqa: ANN401
         array.flags.writeable = False
         self.remember(array, twin)
-        return array
 
     def twin(self, array: NDArray) -> Any:  # noqa: ANN401
         """The device's equal of an array of the host that is ready for every queue; None where there is none."""
@@ -300,6 +313,23 @@ class Images:
                 give_back(twin)
 
         self._twins[key] = weakref.ref(array, forget), twin, uploading
+
+
+class DeviceImage:
+    """Image (h, w) on a device, downloaded when the host reads it with ``np.asarray``, and not uploaded again.
+
+    Args:
+        twin: The image, an array of Warp that nothing changes any more.
+        queue: What has written it.
+        dtype: Type on the host where it is not the device's: that of a mask is a byte there.
+    """
+
+    def __init__(self, twin: Any, queue: Queue, dtype: Any = None) -> None:  # noqa: ANN401
+        self.twin, self.queue, self.dtype = twin, queue, dtype
+
+    def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:  # noqa: ANN401
+        found = self.queue.download(self.twin)
+        return np.asarray(found if self.dtype is None else found.view(self.dtype), dtype)
 
 
 class OnDevice:

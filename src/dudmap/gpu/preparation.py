@@ -1,4 +1,4 @@
-"""Preparation of a frame on a device: filter, intensities and pyramid, in a queue of its own.
+"""Preparation of a frame on a device: filter, intensities, pyramid and segments, in a queue of its own.
 
 While the main queue processes a frame, the next one is uploaded and prepared beside it by the thread that reads it.
 """
@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.gpu.components import Components
 from dudmap.gpu.kernels import images as kernels
 from dudmap.gpu.memory import Images
 from dudmap.gpu.staging import WARP_TYPES, ImagePool, Staging
@@ -35,6 +36,8 @@ class Preparation:
         self._scratch: dict[tuple[Any, ...], Any] = {}
         self._weights: tuple[NDArray, Any] = np.empty(0), None
         self._lock, self._gate = threading.RLock(), gate(device)
+        # another thread may wait for events, which no thread may do while this one captures a graph
+        self._components = Components(self._queue, self._buffer, self._staging.download, as_graph=False)
 
     def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
         """See ``Backend.filter``."""
@@ -84,6 +87,23 @@ class Preparation:
             self._queue.launch(kernels.halve, shape, z, shade, tolerance, *out)
             return self._down(out[0]), self._down(out[1])
 
+    def segment_surface(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        reach: int,
+        normal_reach: int,
+        sine: float,
+    ) -> tuple[NDArray[np.int32], int]:
+        """See ``Backend.segment_surface``."""
+        with self._lock, self._gate.use():
+            images = self._up(depth, "depth"), self._up(tolerance, "tolerance")
+            twin = self._pool.take(depth.shape, wp.int32)
+            labels, count = self._components.segment_surface(*images, intrinsics, reach, normal_reach, sine, twin)
+            self._remember(labels, twin)
+            return labels, count
+
     def _up(self, array: NDArray, use: str) -> Any:  # noqa: ANN401 - an array of Warp
         """The array on the device; one that is not there already is copied to a buffer of this queue alone."""
         twin = self._images.twin(array)
@@ -95,9 +115,13 @@ class Preparation:
     def _down(self, image: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
         """A copy in the host's memory, read-only, whose equal on the device is used again when it has gone."""
         array = self._staging.download(image)
+        self._remember(array, image)
+        return array
+
+    def _remember(self, array: NDArray, image: Any) -> None:  # noqa: ANN401
+        """The image on the device is the array's equal until that has gone."""
         array.flags.writeable = False
         self._images.remember(array, image, self._pool.give_back)
-        return array
 
     def _buffer(self, shape: tuple[int, ...], dtype: Any, use: Any) -> Any:  # noqa: ANN401
         """The array of this queue alone for a use, which is overwritten in the order of the queue."""

@@ -4,6 +4,7 @@
 # pyright: reportArgumentType=false, reportReturnType=false
 
 from collections import deque
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +16,11 @@ from dudmap.gpu.streams import Queue
 
 BUFFERS = 2
 """Buffers of the host for one kind of image: one that the device reads, one that the host fills meanwhile."""
-KINDS = 16
+KINDS = 32
 """Kinds of images, by direction, shape and type, that have buffers."""
 WARP_TYPES = {
     np.dtype(np.float32): wp.float32, np.dtype(np.float64): wp.float64, np.dtype(np.int32): wp.int32,
-    np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
+    np.dtype(np.int64): wp.int64, np.dtype(np.int16): wp.int16, np.dtype(np.uint8): wp.uint8,
 }  # fmt: skip
 NUMPY_TYPES = {one: other for other, one in WARP_TYPES.items()}
 
@@ -56,11 +57,21 @@ class Staging:
 
     def download(self, source: Any) -> NDArray:  # noqa: ANN401 - an array of Warp
         """A copy of an array of the device, which is waited for."""
-        buffer = self._next("down", source.shape, NUMPY_TYPES[source.dtype])
-        self._queue.copy(buffer.array, source)
-        buffer.copied = self._queue.record(buffer.copied)
-        self._queue.finish(buffer.copied)
-        return buffer.words.copy()
+        return self.download_all([source])[0]
+
+    def download_all(self, sources: Sequence[Any]) -> list[NDArray]:
+        """Copies of arrays of the device, which are waited for together; at most BUFFERS of one kind."""
+        buffers: list[_Buffer] = []
+        for source in sources:
+            buffer = self._next("down", source.shape, NUMPY_TYPES[source.dtype])
+            if any(other is buffer for other in buffers):
+                raise ValueError(f"there are more than {BUFFERS} arrays of one kind to download at once")
+            self._queue.copy(buffer.array, source)
+            buffer.copied = self._queue.record(buffer.copied)
+            buffers.append(buffer)
+        for buffer in buffers:
+            self._finish(buffer)
+        return [buffer.words.copy() for buffer in buffers]
 
     def _next(self, way: str, shape: tuple[int, ...], dtype: np.dtype) -> _Buffer:
         """The next buffer of a kind, whose last copy is done."""

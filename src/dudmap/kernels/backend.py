@@ -5,6 +5,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.label_backend import LabelBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -26,8 +27,8 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(Protocol):
-    """Operations of a compute device.
+class Backend(LabelBackend, Protocol):
+    """Operations of a compute device, with those on the label image.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -75,6 +76,18 @@ class Backend(Protocol):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
         ``max(tolerance, tolerance z)`` behind the nearest one z."""
+        ...
+
+    def segment_surface(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        tolerance: NDArray[np.float32],
+        reach: int,
+        normal_reach: int,
+        sine: float,
+    ) -> tuple[NDArray[np.int32], int]:
+        """Connected segments of surface; see ``segmentation.segment_surface``. May run beside other operations."""
         ...
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -233,25 +246,6 @@ class Backend(Protocol):
         ``linearize``; ``free_after`` observations make free space."""
         ...
 
-    def label(
-        self,
-        log_odds: NDArray[np.float32],
-        depth: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        coupling: float,
-        sweeps: int,
-    ) -> NDArray[np.float32]:
-        """Static probability (h, w) of each pixel, consistent with its neighbours on the same surface (algorithm 3).
-
-        Args:
-            log_odds: (h, w) float32 log odds static : dynamic of each pixel alone; 0 = unknown.
-            depth: (h, w) float32, metres, 0 = none.
-            tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-            coupling: Log odds that all neighbours together can add.
-            sweeps: Iterations of the mean field.
-        """
-        ...
-
     def raycast(
         self,
         grid: VoxelGrid,
@@ -308,3 +302,7 @@ class Backend(Protocol):
                 complete if the up to seven blocks at +(dx, dy, dz) from each of its blocks are among ``slots``.
         """
         ...
+
+
+OPERATIONS = tuple(name for protocol in (Backend, LabelBackend) for name in vars(protocol) if not name.startswith("_"))
+"""Names of all operations."""

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from dudmap.kernels import (
     antialiasing,
     color_registration,
+    evidence,
     filtering,
     integration,
     labeling,
@@ -18,6 +19,7 @@ from dudmap.kernels import (
     raycasting,
     registration,
     sampling,
+    segmentation,
     visibility,
 )
 from dudmap.kernels.parameters import (
@@ -61,6 +63,15 @@ class CpuBackend:
     extract_mesh = staticmethod(meshing.extract)
     extract_chunks = staticmethod(meshing.extract_chunks)
     raycast = staticmethod(raycasting.raycast)
+    segment_surface = staticmethod(segmentation.segment_surface)
+    residual_counts = staticmethod(evidence.residual_counts)
+    free_space = staticmethod(evidence.free_space)
+    log_odds = staticmethod(evidence.log_odds)
+    moving_regions = staticmethod(evidence.moving_regions)
+    seen_marked = staticmethod(evidence.seen_marked)
+    segment_counts = staticmethod(evidence.segment_counts)
+    compare_segments = staticmethod(evidence.compare_segments)
+    compare_with_frame = staticmethod(evidence.compare_with_frame)
 
     def __init__(self) -> None:
         self._padded = np.empty((0, 0), dtype=np.float32)

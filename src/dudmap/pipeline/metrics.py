@@ -148,14 +148,14 @@ class RunRecord:
         ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
         (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
         """
-        from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL, fit_mixture
+        from dudmap.dynamics.mixture import fit_mixture
+        from dudmap.kernels.evidence import EDGES
 
         if not self.residuals.any():
             return
-        edges = np.linspace(0, MAX_RESIDUAL, BINS + 1)
-        mixture = fit_mixture(self.residuals, edges)
+        mixture = fit_mixture(self.residuals, EDGES)
         with atomic_file(path) as file:
-            np.savez(file, edges=edges, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
+            np.savez(file, edges=EDGES, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
 
     def metrics(self) -> dict[str, Any]:
         """Counts and times of all frames, under the keys of metrics.json."""

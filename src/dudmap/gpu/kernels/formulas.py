@@ -14,13 +14,18 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.kernels import filtering, labeling, pixel, raycasting, residual, sampling, voxel
+from dudmap.kernels import evidence, filtering, labeling, pixel, raycasting, residual, sampling, segmentation, voxel
 from dudmap.kernels import surface as vertex
 
 wp.set_module_options({"enable_backward": False})
 
 Motion = wp.types.vector(12, wp.float32)
 """The elements of a rigid motion (3, 4), row by row."""
+
+
+def motion_of(T: np.ndarray) -> wp.types.vector:
+    """The elements of a matrix (3, 4) float32."""
+    return Motion(*(float(value) for value in T.reshape(-1)))
 
 
 @wp.func
@@ -62,6 +67,7 @@ def upper_half(word: wp.int32):
 _NUMPY = types.SimpleNamespace(
     float32=wp.float32, float64=wp.float64, int32=wp.int32, int64=wp.int32, uint8=wp.uint8,
     floor=wp.floor, ceil=wp.ceil, sqrt=wp.sqrt, exp=wp.exp, sin=wp.sin, cos=wp.cos,
+    minimum=wp.min, maximum=wp.max, where=wp.where,
 )  # fmt: skip
 """What the formulas use of NumPy, and of ``math``. Indices of 64 bits fit into 32 there."""
 _OF_NUMPY = {
@@ -89,7 +95,7 @@ def warp_function(formula: Dispatcher | types.FunctionType) -> wp.Function:
 
 def _counterpart(value: object) -> object:
     """What Warp has for a global of a formula."""
-    if isinstance(value, Dispatcher):
+    if isinstance(value, Dispatcher | types.FunctionType):
         return warp_function(value)
     if value is np or value is math:
         return _NUMPY
@@ -114,6 +120,10 @@ corner_weight = warp_function(sampling.corner_weight)
 mean_spin, same_surface = warp_function(labeling.mean_spin), warp_function(labeling.same_surface)
 dynamic_responsibility = warp_function(labeling.dynamic_responsibility)
 bounded_sigma = warp_function(labeling.bounded_sigma)
+residual_bin, noise_limit = warp_function(evidence.residual_bin), warp_function(evidence.noise_limit)
+surface_log_odds = warp_function(evidence.surface_log_odds)
+normal_of_gradient, is_concave = warp_function(segmentation.normal_of_gradient), warp_function(segmentation.is_concave)
+plane_distance = warp_function(segmentation.plane_distance)
 range_weight, between = warp_function(filtering.range_weight), warp_function(filtering.between)
 foreground_mean = warp_function(filtering.foreground_mean)
 step_length, corner_gradient = warp_function(raycasting.step_length), warp_function(raycasting.corner_gradient)

@@ -2,9 +2,11 @@
 
 from typing import Any
 
+import numpy as np
 import warp as wp
+from numpy.typing import NDArray
 
-from dudmap.kernels import parameters
+from dudmap.kernels import evidence, parameters
 
 _STRUCTS: dict[type, Any] = {}
 
@@ -20,6 +22,7 @@ SensorNoise = _struct_of(parameters.SensorNoise)
 TruncationBand = _struct_of(parameters.TruncationBand)
 FusionParameters = _struct_of(parameters.FusionParameters)
 RegistrationParameters = _struct_of(parameters.RegistrationParameters)
+EvidenceParameters = _struct_of(evidence.EvidenceParameters)
 
 
 @wp.struct
@@ -55,3 +58,10 @@ def struct(values: tuple) -> Any:
     for name, value in values._asdict().items():
         setattr(out, name, struct(value) if isinstance(value, tuple) else float(value))
     return out
+
+
+def camera_of(intrinsics: NDArray[np.float32]) -> Any:
+    """The structure of intrinsics (4,) fx, fy, cx, cy."""
+    camera = Camera()
+    camera.fx, camera.fy, camera.cx, camera.cy = (float(value) for value in intrinsics)
+    return camera

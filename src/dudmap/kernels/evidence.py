@@ -1,0 +1,237 @@
+"""Evidence of motion at single pixels: normalised residuals, log odds, and free space that single frames have seen.
+
+The formulas stand first; they are plain arithmetic, which NumPy does on images and a compiler for GPUs on numbers.
+"""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.kernels import labeling
+from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample
+from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums, reproject, segment_sums
+
+BINS = 128
+"""Bins of the histogram of normalised residuals."""
+MAX_RESIDUAL = 16.0
+"""Upper edge of the histogram, standard deviations of a reading; larger residuals count in the last bin."""
+EDGES = np.linspace(0, MAX_RESIDUAL, BINS + 1)
+"""Edges of the bins."""
+LARGEST = np.float32(MAX_RESIDUAL - 1e-3)
+"""Residual that larger ones are counted as."""
+BINS_PER_SIGMA = np.float32(BINS / MAX_RESIDUAL)
+"""Bins per standard deviation of a reading."""
+LEAST_SHARE = np.float32(1e-3)
+"""Least share of the pixels of a window that are compared: keeps a quotient finite."""
+
+
+class ResidualCounts(NamedTuple):
+    """Statistics of an image compared with the map.
+
+    Attributes:
+        histogram: (BINS,) int64 counts of the normalised residuals at the surfaces of the map.
+        unknown: Share of the readings that lie in space unknown to the map.
+    """
+
+    histogram: NDArray[np.int64]
+    unknown: float
+
+
+class EvidenceParameters(NamedTuple):
+    """Log odds static : dynamic of a normalised residual r are offset + slope r^2, bounded.
+
+    Attributes:
+        offset, slope: Coefficients, as of ``Mixture.coefficients``.
+        limit: Log odds of a pixel that is certain.
+        noise_floor: Least distance to the map that can be motion, metres.
+        noise_sigmas: The same, standard deviations of the distance.
+    """
+
+    offset: float
+    slope: float
+    limit: float
+    noise_floor: float
+    noise_sigmas: float
+
+
+def residual_bin(distance: Any, sigma: Any) -> Any:
+    """Bin of the histogram for a distance to the map with this standard deviation, both in metres."""
+    return np.int64(np.minimum(abs(distance) / sigma, LARGEST) * BINS_PER_SIGMA)
+
+
+def mixture_log_odds(square: Any, offset: Any, slope: Any) -> Any:
+    """Log odds static : dynamic of a squared normalised residual: of two half-normal densities (thesis eq. 4.56)."""
+    return np.float32(offset + square * slope)
+
+
+def noise_limit(sigma: Any, floor: Any, sigmas: Any) -> Any:
+    """Distance to the map below which nothing is called motion (theta in eq. 4.57), metres."""
+    return np.maximum(floor, sigmas * sigma)
+
+
+def surface_log_odds(
+    distance: Any,
+    sigma: Any,
+    noise: Any,
+    offset: Any,
+    slope: Any,
+    limit: Any,
+) -> Any:
+    """Log odds static : dynamic at a surface of the map, at least 1 within the noise (eq. 4.57).
+
+    Args:
+        distance, sigma: Distance to the map and its standard deviation, metres.
+        noise: Distance below which nothing is called motion, metres.
+        offset, slope, limit: As of ``EvidenceParameters``.
+    """
+    residual = abs(distance) / sigma
+    odds = mixture_log_odds(residual * residual, offset, slope)
+    odds = np.minimum(np.maximum(odds, -limit), limit)
+    return np.where(abs(distance) < noise, np.maximum(odds, np.float32(1)), odds)
+
+
+def residual_counts(sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> ResidualCounts:
+    """See ``LabelBackend.residual_counts``."""
+    surface, valid = sample.occupancy == SURFACE, depth > 0
+    histogram = np.bincount(residual_bin(sample.distance[surface], sigma[surface]), minlength=BINS)
+    unknown = np.count_nonzero((sample.occupancy == UNKNOWN) & valid) / max(np.count_nonzero(valid), 1)
+    return ResidualCounts(histogram, unknown)
+
+
+def log_odds(
+    sample: MapSample,
+    sigma: NDArray[np.float32],
+    parameters: EvidenceParameters,
+    free_space: bool,
+    seen_free: NDArray[np.bool_] | None,
+) -> NDArray[np.float32]:
+    """See ``LabelBackend.log_odds``."""
+    p = parameters
+    noise = noise_limit(sigma, np.float32(p.noise_floor), np.float32(p.noise_sigmas))
+    limit = np.float32(p.limit)
+    odds = surface_log_odds(sample.distance, sigma, noise, np.float64(p.offset), np.float32(p.slope), limit)
+    odds[sample.occupancy != SURFACE] = 0  # NaN before
+    if free_space:
+        free = sample.occupancy == FREE
+        odds[free if seen_free is None else free | seen_free] = -limit
+    return odds
+
+
+def free_space(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    noise: NDArray[np.float32],
+    targets: Sequence[ReprojectionTarget],
+    side: int,
+) -> NDArray[np.bool_]:
+    """See ``LabelBackend.free_space``."""
+    import cv2
+
+    num_free, num_surface = (np.zeros(depth.shape, dtype=np.float32) for _ in range(2))
+    for gap, _, _ in reproject(depth, intensity, intrinsics, targets):
+        num_free += gap > noise
+        num_surface += np.abs(gap) <= noise
+    free = ((num_free > 0) & (2 * num_free >= num_surface)).astype(np.uint8)
+    return cv2.morphologyEx(free, cv2.MORPH_OPEN, np.ones((side, side), np.uint8)) > 0
+
+
+def moving_regions(
+    seeds: NDArray[np.bool_],
+    log_odds: NDArray[np.float32],
+    depth: NDArray[np.float32],
+    tolerance: NDArray[np.float32],
+    min_area: float,
+    seeded_share: float,
+) -> NDArray[np.bool_]:
+    """See ``LabelBackend.moving_regions``."""
+    labels, count = labeling.grow_regions(seeds, log_odds < 1, depth, tolerance)
+    areas = np.bincount(labels.reshape(-1), minlength=count + 1)
+    seeded = np.bincount(labels[seeds], minlength=count + 1)
+    dynamic = (areas >= min_area) & (seeded >= seeded_share * areas)
+    dynamic[0] = False
+    return dynamic[labels]
+
+
+def seen_marked(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    target: ReprojectionTarget,
+    max_gap: float,
+) -> NDArray[np.bool_]:
+    """See ``LabelBackend.seen_marked``."""
+    ((gap, _, marks),) = reproject(depth, intensity, intrinsics, [target])
+    return (marks > 0) & (np.abs(gap) < max_gap)
+
+
+def segment_counts(
+    labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
+) -> list[NDArray[np.int64]]:
+    """See ``LabelBackend.segment_counts``."""
+    members = labels.reshape(-1), *(labels[mask] for mask in masks)
+    return [np.bincount(found, minlength=count + 1) for found in members]
+
+
+def compare_segments(
+    sample: MapSample,
+    labels: NDArray[np.int32],
+    started: NDArray[np.bool_],
+    dynamic: NDArray[np.bool_],
+    sigma: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    exposure: tuple[float, float],
+    gradient: NDArray[np.float32],
+    window: int,
+) -> tuple[NDArray[np.bool_], SegmentSums]:
+    """See ``LabelBackend.compare_segments``."""
+    surface, known = sample.occupancy == SURFACE, sample.occupancy != UNKNOWN
+    dynamic = dynamic & (known | started[labels])
+    gain, offset = exposure
+    correction = np.float32(1 - gain) * intensity - np.float32(offset)
+    difference = np.asarray(sample.difference + correction, np.float32)
+    difference[np.isnan(difference)] = 0  # in the air
+    arguments = labels, len(started) - 1, surface, dynamic, sample.distance, sigma, difference, gradient, window
+    return dynamic, smoothed_segment_sums(*arguments)
+
+
+def compare_with_frame(
+    depth: NDArray[np.float32],
+    intensity: NDArray[np.float32],
+    intrinsics: NDArray[np.float32],
+    target: ReprojectionTarget,
+    labels: NDArray[np.int32],
+    count: int,
+    sigma: NDArray[np.float32],
+    max_sigmas: float,
+    gradient: NDArray[np.float32],
+    window: int,
+) -> SegmentSums:
+    """See ``LabelBackend.compare_with_frame``."""
+    ((gap, difference, _),) = reproject(depth, intensity, intrinsics, [target])
+    compared = ~np.isnan(gap)
+    displaced = np.abs(gap) > max_sigmas * sigma  # not where it is NaN
+    return smoothed_segment_sums(labels, count, compared, displaced, gap, sigma, difference, gradient, window)
+
+
+def smoothed_segment_sums(
+    labels: NDArray[np.int32],
+    count: int,
+    compared: NDArray[np.bool_],
+    moving: NDArray[np.bool_],
+    distance: NDArray[np.float32],
+    sigma: NDArray[np.float32],
+    difference: NDArray[np.float32],
+    gradient: NDArray[np.float32],
+    window: int,
+) -> SegmentSums:
+    """Sums over segments, as of ``segment_sums``, with the mean difference over the pixels of a window that are
+    compared."""
+    import cv2
+
+    size = window, window
+    ones = cv2.blur(compared.astype(np.float32), size)
+    mean = cv2.blur(np.where(compared, difference, np.float32(0)), size) / np.maximum(ones, LEAST_SHARE)
+    return segment_sums(labels, count, compared, moving, distance, sigma, np.asarray(mean, np.float32), gradient)
