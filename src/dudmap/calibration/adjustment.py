@@ -46,53 +46,53 @@ class _State:
 
     Attributes:
         calibration: Current estimate.
-        frames: Numbers of the two frames of every pair.
-        Ts_camera_world: (4, 4) of every frame; ``tracked``: as tracked.
+        frames: (P, 2) numbers of the two frames of every pair.
+        Ts_camera_world: (F, 4, 4) of every frame; ``tracked``: as tracked.
         light: (P, 2) gain and offset of the second image of every pair over the first.
+        places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames.
     """
 
     def __init__(self, pairs: Sequence[Pair], calibration: Calibration) -> None:
         self.calibration = calibration
         by_time = {frame.timestamp: frame for pair in pairs for frame in (pair.first, pair.second)}
         number = {timestamp: n for n, timestamp in enumerate(sorted(by_time))}
-        self.frames = [(number[pair.first.timestamp], number[pair.second.timestamp]) for pair in pairs]
-        self.tracked = [se3.inverse(by_time[timestamp].T_world_camera) for timestamp in number]
-        self.Ts_camera_world = list(self.tracked)
+        self.frames = np.array([(number[pair.first.timestamp], number[pair.second.timestamp]) for pair in pairs])
+        self.tracked = se3.inverse(np.stack([by_time[timestamp].T_world_camera for timestamp in number]))
+        self.Ts_camera_world = self.tracked
         self.light = np.tile([1.0, 0.0], (len(pairs), 1))
+        own = np.broadcast_to(np.arange(NUM_PARAMETERS), (len(pairs), NUM_PARAMETERS))
+        poses = NUM_PARAMETERS + POSE * self.frames[:, :, None] + np.arange(POSE)
+        self.places = np.concatenate([own, poses.reshape(len(pairs), -1)], axis=1)
 
-    def T_second_first(self, pair: int) -> NDArray[np.float64]:
-        """Relative pose (4, 4) of a pair."""
-        first, second = self.frames[pair]
+    @property
+    def Ts_second_first(self) -> NDArray[np.float64]:
+        """Relative poses (P, 4, 4) of the pairs."""
+        first, second = self.frames.T
         return self.Ts_camera_world[second] @ se3.inverse(self.Ts_camera_world[first])
 
-    def move(self, step: NDArray[np.float64], parts: "Sequence[_PairSystem]") -> None:
+    def move(self, step: NDArray[np.float64], parts: "_PairSystems") -> None:
         """Apply a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
         self.calibration = self.calibration.retract(step[:NUM_PARAMETERS])
-        for n, T in enumerate(self.Ts_camera_world):
-            self.Ts_camera_world[n] = se3.exp(step[_of_frame(n)]) @ T
-        for n, part in enumerate(parts):
-            first, second = self.frames[n]
-            moved = np.concatenate([step[:NUM_PARAMETERS], step[_of_frame(first)], step[_of_frame(second)]])
-            self.light[n] -= part.light_step + part.light_slope @ moved
+        self.Ts_camera_world = se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world
+        self.light = self.light - parts.light_step - _times(parts.light_slope, step[self.places])
 
 
 @dataclass(frozen=True, eq=False)
-class _PairSystem:
-    """Normal equations of a pair with gain and offset eliminated.
+class _PairSystems:
+    """Normal equations of all pairs, each with its gain and offset eliminated.
 
     Attributes:
-        H, b: (25, 25) and (25,) in the parameters and the poses of the first and the second frame.
-        light_slope, light_step: (2, 25) and (2,), minus the step of gain and offset is light_step + light_slope step.
-        residuals: (2, n), see ``linearize_pair``.
-        cost: Mean robust cost of a point.
+        H, b: (P, 25, 25) and (P, 25) in the parameters and the poses of the first and the second frame.
+        light_slope, light_step: (P, 2, 25) and (P, 2), minus the step of gain and offset is light_step + light_slope
+            step.
+        residuals: P times (2, n), see ``linearize_pair``.
     """
 
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     light_slope: NDArray[np.float64]
     light_step: NDArray[np.float64]
-    residuals: NDArray[np.float32]
-    cost: float
+    residuals: list[NDArray[np.float32]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,14 +101,14 @@ class _System:
 
     H: NDArray[np.float64]
     b: NDArray[np.float64]
-    parts: list[_PairSystem]
+    parts: _PairSystems
     scales: tuple[float, float]
 
     def step(self, free: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Gauss-Newton step in all poses and in the parameters that are free."""
         moves = np.concatenate([free, np.ones(len(self.b) - NUM_PARAMETERS, dtype=bool)])
         out = np.zeros(len(self.b))
-        out[moves] = -np.linalg.solve(self.H[np.ix_(moves, moves)], self.b[moves])
+        out[moves] = -_solved(self.H[np.ix_(moves, moves)], self.b[moves])
         return out
 
 
@@ -160,86 +160,111 @@ class Adjustment:
                 system = self._linearize(pairs, state, level, COST_SCALES)
                 state.move(system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system.parts)
         assert system is not None
-        return np.array([part.cost for part in system.parts])
+        return np.array(
+            [sum(_robust_mean(r / scale) for r, scale in zip(residuals, COST_SCALES, strict=True))
+             for residuals in system.parts.residuals]
+        )  # fmt: skip
 
     def _covariance(self, system: _System, state: _State, free: int) -> NDArray[np.float64]:
         """Sandwich (13, 13) with the scores of frames as its meat."""
         own, rest = slice(0, NUM_PARAMETERS), slice(NUM_PARAMETERS, None)
         # the poses follow the parameters: Schur complement, for the curvature and for every score
-        across = np.linalg.solve(system.H[rest, rest], system.H[rest, own]).T
+        across = _solved(system.H[rest, rest], system.H[rest, own]).T
         bread = np.linalg.inv(system.H[own, own] - across @ system.H[rest, own])
         scores = np.zeros((len(state.tracked), NUM_PARAMETERS))
-        for (first, second), part in zip(state.frames, system.parts, strict=True):
-            score = part.b[own].copy()
-            for n, place in ((first, slice(13, 19)), (second, slice(19, 25))):
-                score -= across[:, n * POSE : (n + 1) * POSE] @ part.b[place]
-            scores[[first, second]] += score
+        of_pose = across.T.reshape(-1, POSE, NUM_PARAMETERS)[state.frames]  # (P, 2, 6, 13)
+        b_pose = system.parts.b[:, own.stop :].reshape(-1, 2, POSE)
+        score = system.parts.b[:, own] - np.einsum("pfkc,pfk->pc", of_pose, b_pose)
+        for frames in state.frames.T:
+            np.add.at(scores, frames, score)
         few = len(scores) / max(len(scores) - free, 1)
         meat = few * scores.T @ scores + CORRELATED * np.diag(self.prior)
         return bread @ meat @ bread
 
     def _linearize(self, pairs: Sequence[Pair], state: _State, level: int, scales: tuple[float, float]) -> _System:
-        parts = [self._linearize_pair(pair, state, n, level, scales) for n, pair in enumerate(pairs)]
-        size = NUM_PARAMETERS + POSE * len(state.tracked)
-        H, b = np.zeros((size, size)), np.zeros(size)
-        for (first, second), part in zip(state.frames, parts, strict=True):
-            places = [
-                (slice(0, 13), slice(0, 13)),
-                (_of_frame(first), slice(13, 19)),
-                (_of_frame(second), slice(19, 25)),
-            ]
-            for there, here in places:
-                b[there] += part.b[here]
-                for across, aside in places:
-                    H[there, across] += part.H[here, aside]
+        parts = self._linearize_pairs(pairs, state, level, scales)
+        size, places = NUM_PARAMETERS + POSE * len(state.tracked), state.places
+        flat = size * places[:, :, None] + places[:, None, :]
+        H = np.asarray(np.bincount(flat.reshape(-1), parts.H.reshape(-1), size * size), np.float64)
+        H, b = H.reshape(size, size), np.asarray(np.bincount(places.reshape(-1), parts.b.reshape(-1), size), np.float64)
         diagonal = np.concatenate([self.prior, np.tile(CORRELATED * POSE_SIGMA**-2, len(state.tracked))])
-        away = [se3.log(T @ se3.inverse(was)) for T, was in zip(state.Ts_camera_world, state.tracked, strict=True)]
+        away = se3.log_all(state.Ts_camera_world @ se3.inverse(state.tracked))
         H[np.arange(size), np.arange(size)] += diagonal
-        b += diagonal * np.concatenate([self.given.step_to(state.calibration), *away])
-        residuals = [np.concatenate([part.residuals[kind] for part in parts]) for kind in (0, 1)]
+        b += diagonal * np.concatenate([self.given.step_to(state.calibration), away.reshape(-1)])
+        residuals = [np.concatenate([one[kind] for one in parts.residuals]) for kind in (0, 1)]
         new = (1.4826 * _median_abs(values, old) for values, old in zip(residuals, scales, strict=True))
         color, depth = (max(scale, LEAST_SCALE) for scale in new)
         return _System(H, b, parts, (color, depth))
 
-    def _linearize_pair(
-        self, pair: Pair, state: _State, number: int, level: int, scales: tuple[float, float]
-    ) -> _PairSystem:
-        first, second = pair.first, pair.second
-        calibration, light = state.calibration, state.light[number]
-        T, camera, size = state.T_second_first(number), calibration.camera.scaled(level), self.levels.index(level)
-        H, b = np.empty((UNKNOWNS, UNKNOWNS)), np.empty(UNKNOWNS)
-        residuals = np.empty((2, len(first.points)), np.float32)
-        linearize_pair(
-            first.points, first.tangents, T[:3].astype(np.float32),
-            second.depth, second.camera.intrinsics,
-            first.intensities[size], second.intensities[size],
-            first.velocity.astype(np.float32), second.velocity.astype(np.float32),
-            np.float32(first.color_offset + calibration.delay), np.float32(second.color_offset + calibration.delay),
-            calibration.T_color_depth[:3].astype(np.float32), camera.intrinsics, calibration.lens.astype(np.float32),
-            np.float32(1 / (1 << level)), np.float32(calibration.readout),
-            np.float32(light[0]), np.float32(light[1]), np.float32(SAME_SURFACE),
-            np.array([self.sensor.sigma_base, self.sensor.sigma_scale], np.float32),
-            np.float32(1 / scales[0]), np.float32(1 / scales[1]), np.float32(HUBER), residuals, H, b,
-        )  # fmt: skip
-        known, of_light, prior = slice(0, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), CORRELATED * LIGHT_SIGMA**-2
-        inverse = np.linalg.inv(H[of_light, of_light] + np.diag(prior))
-        light_step = inverse @ (b[of_light] + prior * (light - [1.0, 0.0]))
-        light_slope = inverse @ H[of_light, known]
-        reduced, gradient = (
-            H[known, known] - H[known, of_light] @ light_slope,
-            b[known] - H[known, of_light] @ light_step,
-        )
-        # T exp(-d_first) = exp(-Ad(T) d_first) T: a twist of the first frame is one of the relative pose
-        M = np.zeros((SHARED + POSE, SHARED + 2 * POSE))
-        M[:SHARED, :SHARED], M[SHARED:, -POSE:] = np.eye(SHARED), np.eye(POSE)
-        M[SHARED:, SHARED : SHARED + POSE] = -se3.adjoint(T)
-        cost = sum(_robust_mean(r / scale) for r, scale in zip(residuals, scales, strict=True))
-        return _PairSystem(M.T @ reduced @ M, M.T @ gradient, light_slope @ M, light_step, residuals, cost)
+    def _linearize_pairs(
+        self, pairs: Sequence[Pair], state: _State, level: int, scales: tuple[float, float]
+    ) -> _PairSystems:
+        Ts, calibration = state.Ts_second_first, state.calibration
+        H, b = np.empty((len(pairs), UNKNOWNS, UNKNOWNS)), np.empty((len(pairs), UNKNOWNS))
+        place, lens = calibration.T_color_depth[:3].astype(np.float32), calibration.lens.astype(np.float32)
+        intrinsics, size = calibration.camera.scaled(level).intrinsics, self.levels.index(level)
+        noise, residuals = np.array([self.sensor.sigma_base, self.sensor.sigma_scale], np.float32), []
+        for number, (pair, T, light) in enumerate(zip(pairs, Ts.astype(np.float32), state.light, strict=True)):
+            first, second = pair.first, pair.second
+            residuals.append(np.empty((2, len(first.points)), np.float32))
+            linearize_pair(
+                first.points, first.tangents, T[:3], second.depth, second.camera.intrinsics,
+                first.intensities[size], second.intensities[size],
+                first.velocity.astype(np.float32), second.velocity.astype(np.float32),
+                np.float32(first.color_offset + calibration.delay), np.float32(second.color_offset + calibration.delay),
+                place, intrinsics, lens, np.float32(1 / (1 << level)), np.float32(calibration.readout),
+                np.float32(light[0]), np.float32(light[1]), np.float32(SAME_SURFACE), noise,
+                np.float32(1 / scales[0]), np.float32(1 / scales[1]), np.float32(HUBER), residuals[-1], H[number],
+                b[number],
+            )  # fmt: skip
+        return _without_light(H, b, state.light, Ts, residuals)
 
 
-def _of_frame(number: int) -> slice:
-    """Unknowns of the pose of a frame."""
-    return slice(NUM_PARAMETERS + POSE * number, NUM_PARAMETERS + POSE * (number + 1))
+def _without_light(
+    H: NDArray[np.float64],
+    b: NDArray[np.float64],
+    light: NDArray[np.float64],
+    Ts: NDArray[np.float64],
+    residuals: list[NDArray[np.float32]],
+) -> _PairSystems:
+    """Normal equations of all pairs in the parameters and the poses of the frames, from those of ``linearize_pair``.
+
+    Args:
+        H, b: (P, 21, 21) and (P, 21).
+        light: (P, 2) gains and offsets.
+        Ts: (P, 4, 4) relative poses, the first to the second camera.
+        residuals: As of ``_PairSystems``.
+    """
+    known, of_light, prior = slice(0, SHARED + POSE), slice(SHARED + POSE, UNKNOWNS), CORRELATED * LIGHT_SIGMA**-2
+    inverse = np.asarray(np.linalg.inv(H[:, of_light, of_light] + np.diag(prior)), np.float64)
+    light_step = _times(inverse, b[:, of_light] + prior * (light - [1.0, 0.0]))
+    light_slope = inverse @ H[:, of_light, known]
+    reduced = H[:, known, known] - H[:, known, of_light] @ light_slope
+    gradient = b[:, known] - _times(H[:, known, of_light], light_step)
+    # T exp(-d_first) = exp(-Ad(T) d_first) T: a twist of the first frame is one of the relative pose
+    M = np.zeros((len(Ts), SHARED + POSE, SHARED + 2 * POSE))
+    M[:, :SHARED, :SHARED], M[:, SHARED:, -POSE:] = np.eye(SHARED), np.eye(POSE)
+    M[:, SHARED:, SHARED : SHARED + POSE] = -se3.adjoint(Ts)
+    M_transposed = np.swapaxes(M, 1, 2)
+    return _PairSystems(
+        M_transposed @ reduced @ M, _times(M_transposed, gradient), light_slope @ M, light_step, residuals
+    )
+
+
+def _solved(H: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Solution of ``H x = right`` by SciPy (SuperLU): most frames make no pair.
+
+    The threads of a dense solver would keep the cores that the tracking needs busy for 50 ms after every call.
+    """
+    from scipy.sparse import csc_array
+    from scipy.sparse.linalg import splu
+
+    return splu(csc_array(H)).solve(np.ascontiguousarray(right))
+
+
+def _times(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Products (n, i) of matrices (n, i, j) and vectors (n, j)."""
+    return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
 def _robust_mean(values: NDArray[np.float32]) -> float:
