@@ -176,10 +176,10 @@ def png_parts(data):
 
 
 def png(parts):
-    out = b"\x89PNG\r\n\x1a\n"
-    for kind, body in parts:
-        out += struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body))
-    return out
+    chunks = (
+        struct.pack(">I", len(body)) + kind + body + struct.pack(">I", zlib.crc32(kind + body)) for kind, body in parts
+    )
+    return b"\x89PNG\r\n\x1a\n" + b"".join(chunks)
 
 
 def png_chunk(rng, data):
