@@ -37,6 +37,8 @@ CONFIG = Config().override(
         "sensor.self_calibration=false",
     ]
 )
+EVERY = 0.3
+"""Seconds from one checkpoint to the next."""
 TIMES = "ms_per_frame_median", "ms_per_frame_p95", "ms_reading_median", "wall_s", "cpu_s", "peak_rss_mb"
 
 
@@ -70,7 +72,7 @@ def lost_and_found():
     return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0))
 
 
-def begin(sequence, out, every=0.3, **options):
+def begin(sequence, out, every=EVERY, **options):
     """The run whose processes are killed."""
     return run(sequence, CONFIG, out, save_masks=True, progress=False, storing=Storing({}, every), **options)
 
@@ -134,11 +136,12 @@ def after(calls, function):
 def killed(sequence, out, moment, rng, duration, go=begin):
     """Run and be killed at a random moment of a kind."""
     if moment == "anywhere":
-        timer = threading.Timer(rng.uniform(0, duration), die)
+        timer = threading.Timer(rng.uniform(0, 0.9 * duration), die)
         timer.daemon = True
         timer.start()
     elif moment == "checkpoint":  # between two statements of a transaction
-        StateDatabase._execute = after(int(rng.integers(8, 60)), StateDatabase._execute)
+        most = 4 * max(duration / EVERY, 3)  # four statements each, if they take no time
+        StateDatabase._execute = after(int(rng.integers(4, 0.7 * most)), StateDatabase._execute)
     elif moment == "join":  # a map is half rebuilt from stored frames
         Atlas.join = after(0, Atlas.join)
         FrameStore.__getitem__ = after(int(rng.integers(0, 3)), FrameStore.__getitem__)
