@@ -108,3 +108,10 @@ def test_interpolation_in_time_and_beyond_its_ends():
     for time, x in ((0.0, 0.0), (1.0, 0.0), (1.5, 0.05), (3.0, 0.2), (9.0, 0.2)):
         T = se3.interpolate_in_time(np.array([1.0, 3.0]), Ts, time)
         np.testing.assert_allclose(T[:3, 3], [x, 0, 0], atol=1e-12)
+
+
+def test_angles_of_many_rotations_are_those_of_each():
+    rng = np.random.default_rng(5)
+    twists = np.concatenate([rng.normal(0, 1, (20, 6)), rng.normal(0, 1e-9, (3, 6)), np.zeros((1, 6))])
+    Ts = se3.exp_all(twists)
+    np.testing.assert_allclose(se3.rotation_angles(Ts), [se3.rotation_angle(T) for T in Ts], rtol=1e-9, atol=1e-12)

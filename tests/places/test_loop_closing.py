@@ -187,14 +187,11 @@ def test_a_loop_takes_the_drift_out(round_trip):
         print(f"loops {enabled}: end off by {gaps[enabled][0]:.3f} m, {gaps[enabled][1]:.2f} deg; map off by "
               f"{maps[enabled].accuracy.mean:.3f} m, ghosts {maps[enabled].ghost_share:.1%}")  # fmt: skip
         np.testing.assert_allclose(results[-1].T_world_camera, slam.trajectory.Ts_world_camera[-1])
-    # With focal lengths 1.8, 2.2 and 2.6 % too long the angle drifts by 1.8, 2.7 and 3.7 degrees. What the loop leaves
-    # is 0.04 to 0.07 of that, 1.7 to 3.4 cm at the end, 0.70 to 0.73 of the map's error and 0.68 to 0.76 of its ghosts:
-    # such a lens also feigns a motion of 5 cm half-way round, of which the end of the loop tells nothing.
-    assert gaps[False][1] > 1.5
+    assert gaps[False][1] > 3
     assert gaps[True][1] < 0.3 * gaps[False][1]
-    assert gaps[True][0] < 0.05
+    assert gaps[True][0] < 0.5 * gaps[False][0]
     assert maps[True].accuracy.mean < 0.8 * maps[False].accuracy.mean
-    assert maps[True].ghost_share < 0.85 * maps[False].ghost_share
+    assert maps[True].ghost_share < 0.5 * maps[False].ghost_share
 
 
 def test_maps_are_joined_when_a_place_is_recognised():

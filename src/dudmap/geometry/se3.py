@@ -142,6 +142,13 @@ def rotation_angle(T: Matrix) -> float:
     return float(np.linalg.norm(log_rotation(T[:3, :3])))
 
 
+def rotation_angles(Ts: Matrix) -> Matrix:
+    """Angles (n,) in radians, in [0, pi], of the rotations of ``Ts`` (n, 4, 4) or (n, 3, 3)."""
+    R = Ts[:, :3, :3]
+    twice_sine = np.linalg.norm(R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]], axis=1)
+    return np.arctan2(twice_sine, np.trace(R, axis1=1, axis2=2) - 1)
+
+
 def interpolate(T_a: Matrix, T_b: Matrix, share: float) -> Matrix:
     """Motion on the screw from ``T_a`` (share 0) to ``T_b`` (share 1)."""
     return T_a @ exp(share * log(inverse(T_a) @ T_b))

@@ -15,7 +15,7 @@ from dudmap.config import Config
 from dudmap.geometry import se3
 from dudmap.places.atlas import Atlas
 from dudmap.places.glimpse import Visibility
-from dudmap.places.loop_correction import LoopCorrector, odometry_sigmas
+from dudmap.places.loop_correction import LoopCorrector, lengths, odometry_sigmas
 from dudmap.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE, LOCAL_FRAMES
 
 NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
@@ -96,7 +96,9 @@ class FrameThinning:
         if len(alike) < LOCAL_FRAMES or not self._is_known(nodes, Ts, i):
             return None
         T_alike_frame = se3.inverse(Ts[alike]) @ Ts[i]
-        return int(alike[np.argmin(np.linalg.norm(T_alike_frame[:, :3, 3], axis=1) + _angles(T_alike_frame))])
+        return int(
+            alike[np.argmin(np.linalg.norm(T_alike_frame[:, :3, 3], axis=1) + se3.rotation_angles(T_alike_frame))]
+        )
 
     def _is_known(self, nodes: list[int], Ts: NDArray[np.float64], i: int) -> bool:
         """Whether newer frames tell what frame ``nodes[i]`` shows, too."""
@@ -136,7 +138,9 @@ class FrameThinning:
     def _near(Ts: NDArray[np.float64], T: NDArray[np.float64], distance: float, angle_deg: float) -> NDArray[np.bool_]:
         """Which poses (n, 4, 4) are nearer to a pose (4, 4) than a distance and an angle."""
         relative = se3.inverse(T) @ Ts
-        return (np.linalg.norm(relative[:, :3, 3], axis=1) < distance) & (_angles(relative) < np.radians(angle_deg))
+        return (np.linalg.norm(relative[:, :3, 3], axis=1) < distance) & (
+            se3.rotation_angles(relative) < np.radians(angle_deg)
+        )
 
     def _remove(self, numbers: list[int], heir: int) -> None:
         """Remove the second of three stored frames that follow each other in the submap; ``heir`` shows its place."""
@@ -158,8 +162,3 @@ def chained(first: tuple[float, float], second: tuple[float, float], distance: f
     """
     swing = 2 / 3 * (first[1] * distance) ** 2  # mean over the axes
     return float(np.sqrt(first[0] ** 2 + second[0] ** 2 + swing)), float(np.hypot(first[1], second[1]))
-
-
-def _angles(Ts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Angles (n,) of rotations (n, 4, 4), radians."""
-    return np.arccos(np.clip((np.trace(Ts[:, :3, :3], axis1=1, axis2=2) - 1) / 2, -1, 1))

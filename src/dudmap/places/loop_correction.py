@@ -197,8 +197,10 @@ def odometry_sigmas(Ts: NDArray[np.float64]) -> list[float]:
 
 
 def step_lengths(Ts: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Lengths (n - 1,) of the steps along a path (n, 4, 4), metres; a turn by one radian counts as one metre."""
-    steps = se3.inverse(Ts[:-1]) @ Ts[1:]
-    R = steps[:, :3, :3]
-    twice_sine = np.linalg.norm(R[:, [2, 0, 1], [1, 2, 0]] - R[:, [1, 2, 0], [2, 0, 1]], axis=1)
-    return np.linalg.norm(steps[:, :3, 3], axis=1) + np.arctan2(twice_sine, np.trace(R, axis1=1, axis2=2) - 1)
+    """Lengths (n - 1,) of the steps along a path (n, 4, 4), as of ``lengths``."""
+    return lengths(se3.inverse(Ts[:-1]) @ Ts[1:])
+
+
+def lengths(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n,) of motions (n, 4, 4), metres; a turn by one radian counts as one metre."""
+    return np.linalg.norm(motions[:, :3, 3], axis=1) + se3.rotation_angles(motions)
