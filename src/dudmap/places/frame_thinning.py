@@ -15,7 +15,7 @@ from dudmap.config import Config
 from dudmap.geometry import se3
 from dudmap.places.atlas import Atlas
 from dudmap.places.glimpse import Visibility
-from dudmap.places.loop_correction import LoopCorrector, lengths, odometry_sigmas
+from dudmap.places.loop_correction import LoopCorrector, odometry_sigmas
 from dudmap.places.loop_verification import LOCAL_ANGLE_DEG, LOCAL_DISTANCE, LOCAL_FRAMES
 
 NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
