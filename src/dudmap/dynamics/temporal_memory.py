@@ -215,10 +215,8 @@ class TemporalMemory:
         settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
         settled[: count + 1] = False
         for target in _targets(T_world_camera, frames):
-            sums = backend.compare_with_frame(
-                level.depth, level.intensity, level.camera.intrinsics, target, labels, 2 * count, sigma, 4,
-                parts.gradient, parts.window,
-            )  # fmt: skip
+            image = level.depth, level.intensity, level.camera.intrinsics
+            sums = backend.compare_with_frame(*image, target, parts.with_noise(sigma), 4)
             evidence = evidence_of(sums, parts.min_pixels)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])

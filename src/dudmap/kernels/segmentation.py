@@ -43,6 +43,24 @@ class SegmentSums(NamedTuple):
     deviation: NDArray[np.float64]
 
 
+class SegmentImage(NamedTuple):
+    """The segments of an image, and what residuals within them are compared with.
+
+    Attributes:
+        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
+        count: Number of segments.
+        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+        gradient: (h, w) float32, magnitude of the intensity gradient.
+        window: Side of the window over which differences of intensities are averaged, pixels, odd.
+    """
+
+    labels: NDArray[np.int32]
+    count: int
+    sigma: NDArray[np.float32]
+    gradient: NDArray[np.float32]
+    window: int
+
+
 class ReprojectionTarget(NamedTuple):
     """An older frame that an image is compared with.
 
@@ -103,26 +121,22 @@ def segment_surface(
 
 
 def segment_sums(
-    labels: NDArray[np.int32],
-    count: int,
+    segments: SegmentImage,
     compared: NDArray[np.bool_],
     moving: NDArray[np.bool_],
     distance: NDArray[np.float32],
-    sigma: NDArray[np.float32],
     difference: NDArray[np.float32],
-    gradient: NDArray[np.float32],
 ) -> SegmentSums:
     """Sums over the pixels of each segment.
 
     Args:
-        labels: (h, w) int32 numbers from 1, 0 = none.
-        count: Number of segments.
+        segments: The segments.
         compared: (h, w) bool, pixels whose distance and difference are known.
         moving: (h, w) bool.
-        distance, sigma: (h, w) float32, metres.
-        difference: (h, w) float32, of intensities.
-        gradient: (h, w) float32, intensity per pixel.
+        distance: (h, w) float32, metres.
+        difference: (h, w) float32, of intensities, averaged.
     """
+    labels, count, sigma, gradient, _ = segments
     out = np.zeros((count + 1, len(SegmentSums._fields)))
     add_segment_sums(labels, compared, moving, distance, sigma, difference, gradient, out)
     return SegmentSums(*out.T)
