@@ -23,7 +23,8 @@ from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import HostQueue
 from dudmap.kernels.evidence import BINS, EvidenceParameters
 from dudmap.kernels.parameters import SURFACE, UNKNOWN, MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentImage
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage
 from small_maps import CAMERA
 
 PARAMETERS = EvidenceParameters(2.3, -0.45, 6.0, 0.02, 3.0)

@@ -20,7 +20,8 @@ from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import Queue
 from dudmap.kernels.evidence import BINS, EvidenceParameters, ResidualCounts
 from dudmap.kernels.parameters import MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentImage, SegmentSums
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums
 
 RUN = kernels.RUN
 STEPS = np.array([1, 1, 1, 1, 2.0**20, 2.0**30, 2.0**30, 2.0**30])

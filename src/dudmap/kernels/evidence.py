@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dudmap.kernels import labeling
 from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentImage, SegmentSums, reproject, segment_sums
+from dudmap.kernels.reprojection import ReprojectionTarget, reproject
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums, segment_sums
 
 BINS = 128
 """Bins of the histogram of normalised residuals."""

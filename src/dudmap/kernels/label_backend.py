@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.evidence import EvidenceParameters, ResidualCounts
 from dudmap.kernels.parameters import MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentImage, SegmentSums
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums
 
 
 class LabelBackend(Protocol):
