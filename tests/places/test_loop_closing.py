@@ -10,7 +10,7 @@ from dudmap.config import Config, RelocalizationConfig, SensorConfig, TrackerCon
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import moved
 from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Observation
+from dudmap.frames.observation import Level, Observation
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
@@ -110,6 +110,28 @@ def test_drift_must_be_plausible_for_the_path():
     for drift, plausible in ((shifted(0.05), True), (shifted(0.06), False), (turn, False)):
         place = PlaceMatch(atlas.keyframes.keyframes[0], T @ drift, 20)
         assert verifier.is_plausible(place, T) == plausible
+
+
+@pytest.mark.parametrize("off_now", [True, False])
+def test_a_correction_is_made_only_if_the_newest_frame_is_off_too(off_now):
+    """A correction of 3 cm towards a wall, for a frame that was tracked there or has found back to the wall."""
+    atlas = made_up_atlas([0, 0, 0, 0])
+    verifier = LoopVerifier(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
+    atlas.keyframes.keyframes[0].last_seen = 1.0
+    correction = np.eye(4)
+    correction[2, 3] = 0.03
+    true = atlas.poses[-1].T_world_camera
+    query = query_of(se3.inverse(correction) @ true if off_now else true, 3.0)
+    query.levels.append(Level(TINY, np.full(TINY.shape, 1.0, np.float32), np.zeros(TINY.shape, np.float32)))
+    place = PlaceMatch(atlas.keyframes.keyframes[0], true, 20)
+    assert verifier.is_drifted(place, query, correction) == off_now
+
+
+def test_a_correction_where_the_older_pass_shows_nothing_is_believed():
+    atlas = made_up_atlas([0, 0, 0, 0])
+    verifier = LoopVerifier(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
+    far = shifted(3.0)
+    assert verifier.is_drifted(PlaceMatch(atlas.keyframes.keyframes[0], far, 20), query_of(far, 3.0), np.eye(4))
 
 
 def test_join_brings_one_map_into_the_other():
