@@ -61,7 +61,8 @@ class LoopCloser:
     """Detects, verifies and closes loops, and joins submaps.
 
     A match is accepted if its features (3D-3D RANSAC), the distances to the local map of the matched time and the
-    intensities of that map give the same camera pose, and a second frame confirms the correction.
+    intensities of that map give the same camera pose, a second frame confirms the correction, and the newest frame has
+    not been registered to the older surfaces meanwhile.
 
     Features are matched in one background thread. The result is evaluated ``CHECK_INTERVAL`` frames later whether or
     not it is ready earlier, so that the same recording always gives the same result.
@@ -107,7 +108,7 @@ class LoopCloser:
                 return None
             search, self._search = self._search, None
             if search.submap == self.atlas.current:
-                return self._evaluate(search, monitor)
+                return self._evaluate(search, query, monitor)
         keyframes = self.atlas.keyframes.keyframes
         newest = keyframes[-1].timestamp if keyframes else None
         new_keyframe, self._newest_keyframe = newest != self._newest_keyframe, newest
@@ -155,7 +156,7 @@ class LoopCloser:
         correctable = self.config.loops.enabled and self.atlas.current != self.atlas.saved
         return correctable and self._is_old(keyframe, now)
 
-    def _evaluate(self, search: LoopSearch, monitor: QualityMonitor) -> NDArray[np.float64] | None:
+    def _evaluate(self, search: LoopSearch, newest: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
         """Verify the matches of a search; returns the motion of the pose by a correction, None if none was made."""
         query, limits = search.query, self.config.loops
         T = query.tracking.T_world_camera
@@ -185,7 +186,12 @@ class LoopCloser:
                 self._pending = PendingCorrection(submap, T_found @ se3.inverse(T))
                 self._next_search = self._frame
                 return None
-            return self._correct(place, query, T_found) if in_current else self._join(submap, T_found @ se3.inverse(T))
+            T_corrected_tracked = T_found @ se3.inverse(T)
+            if not in_current:
+                return self._join(submap, T_corrected_tracked)
+            if self.verifier.is_drifted(place, newest, T_corrected_tracked):
+                return self._correct(place, query, T_found)
+            failed = True
         if failed:  # registration is expensive: linear back-off
             self._failures = min(self._failures + 1, MAX_BACKOFF)
             self._next_search = self._frame + self._failures * limits.gap

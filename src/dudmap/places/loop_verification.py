@@ -1,7 +1,8 @@
 """Geometric verification of recognised places: plausible drift, and registration against the map of that time."""
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from itertools import islice
 
 import numpy as np
@@ -12,8 +13,9 @@ from dudmap.frames.observation import Level, Observation
 from dudmap.geometry import se3
 from dudmap.geometry.alignment import agree
 from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.atlas import Atlas
-from dudmap.places.loop_correction import step_lengths
+from dudmap.places.atlas import Atlas, TimedPose
+from dudmap.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
+from dudmap.places.map_rebuilding import view_distances
 from dudmap.places.place_recognition import PlaceMatch
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import Tracker, TrackingResult
@@ -66,9 +68,7 @@ class LoopVerifier:
             place: Match in the current submap.
             T_world_camera: (4, 4) tracked pose of the frame.
         """
-        poses = self.atlas.poses
-        begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
-        since = [pose.T_world_camera for pose in islice(poses, begin, None) if pose.submap == self.atlas.current]
+        since = [pose.T_world_camera for pose in self._poses_since(place)]
         path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
         limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
         drift = se3.inverse(place.T_world_camera) @ T_world_camera
@@ -98,6 +98,34 @@ class LoopVerifier:
             return found.T_world_camera
         return None
 
+    def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
+        """Whether the newest frame, too, fits the map of the time of a place better where a correction puts it.
+
+        Frames are registered to the whole map, also to what was seen long ago. Where the passes come near each other,
+        the registration finds back to the older surfaces by itself: a correction that was measured a few frames before
+        would then move the camera away from where it belongs. The older pass is what was stored before the way since
+        the place was last seen has led farthest from here; where it does not show what the frame sees, nothing speaks
+        against the correction.
+
+        Args:
+            place: Match in the current submap.
+            newest: The newest frame.
+            T_corrected_tracked: (4, 4) the correction.
+        """
+        T_tracked = newest.tracking.T_world_camera
+        T_corrected = T_corrected_tracked @ T_tracked
+        since = list(self._poses_since(place))
+        distances = view_distances(np.reshape([pose.T_world_camera for pose in since], (-1, 4, 4)), T_corrected)
+        older_pass = replace(place.keyframe, last_seen=since[int(np.argmax(distances))].timestamp)
+        local = self._local_map(PlaceMatch(older_pass, T_corrected, place.num_inliers))
+        return local is None or _misfit(local, newest, T_corrected) < _misfit(local, newest, T_tracked)
+
+    def _poses_since(self, place: PlaceMatch) -> Iterator[TimedPose]:
+        """The poses in the current submap since a place was last seen."""
+        poses = self.atlas.poses
+        begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
+        return (pose for pose in islice(poses, begin, None) if pose.submap == self.atlas.current)
+
     def _local_map(self, place: PlaceMatch) -> TsdfVolume | None:
         """Map around a place at the time when it was last seen; None without stored frames of it."""
         history, keyframe = self.atlas.history, place.keyframe
@@ -118,3 +146,13 @@ class LoopVerifier:
         local = self.atlas.make_volume()
         history.reintegrate(local, nearest)
         return local
+
+
+def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
+    """Mean truncated distance of the static readings of a frame at a pose (4, 4) to a map, metres."""
+    level = query.levels[-1]
+    weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
+    volume.look_at(T_world_camera)
+    sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
+    distances = np.minimum(np.nan_to_num(np.abs(sample.distance), nan=TRUNCATED_DISTANCE), TRUNCATED_DISTANCE)
+    return float(np.average(distances, weights=np.where(level.depth > 0, weights, 0)))
