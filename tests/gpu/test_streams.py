@@ -78,7 +78,16 @@ def processed(device, recording, submit=at_once):
         found += [image.copy() for level in view.levels for image in level]
         del view
     mesh = volume.extract_mesh(1)
-    return [*found, volume.blocks.geometry.copy(), mesh.vertices, mesh.colors, volume.raycast(T).depth]
+    index = [array.copy() for array in volume.blocks.arrays(volume.window.near)]
+    return [
+        *found,
+        *index,
+        volume.window.cells,
+        volume.blocks.geometry.copy(),
+        mesh.vertices,
+        mesh.colors,
+        volume.raycast(T).depth,
+    ]
 
 
 @pytest.fixture(scope="module")

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from dudmap.gpu import faults
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.memory import DeviceImage, OnDevice
+from dudmap.kernels import block_index
 from dudmap.kernels.backend import OPERATIONS
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.mirror import Mirror
@@ -26,6 +27,9 @@ KEPT_EVERY = 100
 """Fused frames after which the host takes over what the device has written, some ten megabytes for the blocks in view:
 so many are missing in the map at most if the device is lost. It does so more often at the start, after 1, 2, 4, 8, ...
 frames, so that at least half of a small map is there."""
+
+ON_HOST = {"allocate_touched": "touched_cells", "fuse_near": "fuse", "record_free": "observe_free"}
+"""Operations that take the place of another one and the host's part of the work; what is told names that one."""
 
 
 class FallbackBackend:
@@ -59,17 +63,19 @@ class FallbackBackend:
                     return result._replace(equations=result.equations._replace(residuals=residuals))
                 if isinstance(result, DeviceImage):
                     return _Image(self, result, name, arguments)
-                if isinstance(result, FusedBlocks):
+                if _ends_fusion(name, arguments):
                     self._keep(arguments[0])
                 return result
             except Exception as error:
-                faults.handle(error, self.device, f"the operation {name}")
+                faults.handle(error, self.device, f"the operation {ON_HOST.get(name, name)}")
                 if isinstance(error, faults.DeviceFullError):
                     self._leave(arguments)
         return self.perform_on_cpu(name, arguments)
 
     def perform_on_cpu(self, name: str, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
         """The same by the CPU, whatever the device can do."""
+        if name in block_index.OPERATIONS:
+            return False
         found = [self._on_host(value) for value in arguments]
         result = getattr(self._on_cpu, name)(*found)
         if isinstance(result, FusedBlocks):
@@ -87,6 +93,9 @@ class FallbackBackend:
     def _leave(self, arguments: tuple[Any, ...]) -> None:
         """Bring the map to the host, which has all of it from now on."""
         self._is_full = True
+        for grid in arguments:
+            if isinstance(grid, VoxelGrid) and grid.index is not None:
+                grid.index.leave()
         for array in _mirrors(arguments):
             array.detach()
 
@@ -134,6 +143,14 @@ def _mirrors(arguments: tuple[Any, ...]) -> list[Mirror]:
     """Arrays of the map among the arguments of an operation, which may have a copy on a device."""
     values = [value for one in arguments for value in (one if isinstance(one, VoxelGrid) else (one,))]
     return [value for value in values if isinstance(value, Mirror)]
+
+
+def _ends_fusion(name: str, arguments: tuple[Any, ...]) -> bool:
+    """Whether an operation is the last one of a frame that writes to the map on the device."""
+    if name == "fuse_near":
+        *_, release_as, _parameters = arguments
+        return release_as < 0
+    return name in ("fuse", "record_free")
 
 
 def _operation(name: str) -> Callable[..., Any]:

@@ -310,6 +310,12 @@ class CpuBackend:
         )  # fmt: skip
         return _concatenated(found, counts)
 
+    def allocate_touched(self, *_: Any, **__: Any) -> bool:
+        """See ``IndexBackend``: the host numbers the blocks, by the operations above."""
+        return False
+
+    fuse_near = record_free = place_window = allocate_touched
+
     # -- read the map ------------------------------------------------------------------------------------------------
 
     def linearize(

@@ -76,6 +76,7 @@ class AdaptiveVolume(TsdfVolume):
     """
 
     levels: Sequence[FineBlocks]
+    _numbered_on_host = True  # the finer levels refer to the slots of the coarser ones
 
     def __init__(
         self,
@@ -151,6 +152,7 @@ class AdaptiveVolume(TsdfVolume):
     ) -> NDArray[np.int32]:
         weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
         fused = super()._fuse(depth, color, weights, T_world_camera, count)
+        assert fused is not None
         number = self._frame_number
         view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
         slots, updated = self.window.near, fused

@@ -188,16 +188,16 @@ class TsdfVolume(PagedMap):
         weights: NDArray[np.uint8] | None,
         T_world_camera: NDArray[np.float64],
         count: int,
-    ) -> NDArray[np.int32]:
+    ) -> NDArray[np.int32] | None:
         """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
         return self._integrator.integrate(
-            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+            self._index, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
         )
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
-        self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
+        self._index, self.pager = other._index, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
 
     def for_camera(
@@ -206,13 +206,14 @@ class TsdfVolume(PagedMap):
         """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
         volume must not be used afterwards."""
         other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
-        other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
+        other.pager, other._frame_number = self.pager or other.pager, self._frame_number
+        other.blocks = self.blocks
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
-        origin = self.window.moved(middle, self._left)
+        origin = self._index.place.moved(middle, self._left)
         if origin is not None:
             self._left = None
             self._place_window(origin)
@@ -222,7 +223,11 @@ class TsdfVolume(PagedMap):
     @property
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
-        return self._integrator.grid(self.blocks, self.window)
+        return self._integrator.grid(self._index)
+
+    def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
+        return self._index.place.T_grid_camera(T_world_camera)
 
     def sample(
         self,
@@ -233,7 +238,7 @@ class TsdfVolume(PagedMap):
     ) -> MapSample:
         """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
         at a pose inside the window."""
-        T = self.window.T_grid_camera(T_world_camera)
+        T = self.T_grid_camera(T_world_camera)
         return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
 
     def known_share(
@@ -253,9 +258,9 @@ class TsdfVolume(PagedMap):
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
-        slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
+        slots, local = self._index.slots_at(voxels // BLOCK), voxels % BLOCK
         numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
-        words = self.blocks.geometry_mirror.take(np.maximum(slots, 0), numbers)
+        words = self._index.latest.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
         out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])

@@ -52,6 +52,21 @@ class Lattice:
     nz: wp.int32
 
 
+@wp.struct
+class Index:
+    """Entries and slots of a map: see ``block_index.IndexArrays``."""
+
+    coords: wp.array2d(dtype=wp.int32)
+    slot_of: wp.array(dtype=wp.int32)
+    free_count: wp.array(dtype=wp.uint8)
+    entry_of: wp.array(dtype=wp.int32)
+    slot_coords: wp.array2d(dtype=wp.int32)
+    written: wp.array(dtype=wp.int32)
+    fused: wp.array(dtype=wp.uint8)
+    released: wp.array(dtype=wp.int32)
+    near: wp.array(dtype=wp.int32)
+
+
 def struct(values: tuple) -> Any:
     """The structure of a named tuple of parameters."""
     out = _STRUCTS[type(values)]()
