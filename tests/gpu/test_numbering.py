@@ -21,7 +21,7 @@ from dudmap.mapping.voxel_blocks import MAX_COORDINATE
 from small_maps import CAMERA
 
 SMALL = CAMERA.scaled(1)
-CONFIG = VolumeConfig(voxel_size=0.04, free_after=2)
+CONFIG = VolumeConfig(voxel_size=0.04, free_after=2, carve_rate=8)
 KERNELS = ("mark_cells", "find_unknown", "allocate", "visible_slots", "pack_pixels", "observe_free", "enter_free")
 
 
@@ -37,7 +37,7 @@ def scene(seed, frames=14):
     way = np.concatenate([np.linspace(0, 2.5, frames // 2), np.linspace(2.5, 0, frames - frames // 2)])
     for number, x in enumerate(way):
         depth = np.full(SMALL.shape, random.uniform(1.8, 2.6), np.float32)
-        if number % 4 < 2:
+        if number % 2 == 0:
             v, u = random.integers(0, 30), random.integers(0, 40)
             depth[v : v + 25, u : u + 30] = random.uniform(0.7, 1.2)
         depth[random.random(SMALL.shape) < 0.05] = 0
@@ -64,13 +64,13 @@ def assert_equal(found, expected, *, but=()):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_numbers_are_those_of_the_host(seed):
-    """The index to the bit, with the window, the hash table and, from the same kernels, the voxels. Blocks are released
-    and taken again, the window moves, and the host reads the map now and then."""
+    """The index to the bit, with the window, the hash table and the voxels, which the same kernels fuse. Blocks are
+    released and taken again, the window moves, and the host reads the map now and then."""
     random = np.random.default_rng(seed)
-    on_host, cpu, device = volume("warp-cpu", on_host=True), volume("cpu"), volume("warp-cpu")
+    on_host, device = volume("warp-cpu", on_host=True), volume("warp-cpu")
     released, moves = [], set()
     for number, (frame, T) in enumerate(scene(seed)):
-        for one in (on_host, cpu, device):
+        for one in (on_host, device):
             one.integrate(frame, T, count=1 + number % 3)
         assert device._index.copy is not None
         assert device.num_blocks == on_host.num_blocks
@@ -83,7 +83,19 @@ def test_numbers_are_those_of_the_host(seed):
     assert max(released) > 5
     assert np.diff(released).min() < 0
     assert_equal(content(device), content(on_host))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_numbers_are_those_of_the_cpu(seed):
+    """Nothing is carved, since whether the last voxel of a block is empty may depend on a rounding."""
+    config = CONFIG.model_copy(update={"carving": False})
+    cpu, device = volume("cpu", config=config), volume("warp-cpu", config=config)
+    for frame, T in scene(10 + seed, frames=8):
+        for one in (cpu, device):
+            one.integrate(frame, T)
     assert_equal(content(device), content(cpu), but=("geometry", "colors"))
+    assert device.num_blocks > 300
+    assert device.num_bytes == cpu.num_bytes
 
 
 @pytest.mark.parametrize("settings", [{"carving": False}, {"take_turns": False}, {"antialias": True}])
