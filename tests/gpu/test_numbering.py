@@ -12,12 +12,15 @@ make_backend("warp-cpu")
 
 from failing import FULL, Device
 
-from dudmap.config import VolumeConfig
+from dudmap import synthetic
+from dudmap.config import Config, VolumeConfig
 from dudmap.geometry import se3
 from dudmap.gpu import faults
+from dudmap.gpu.numbering import IndexCopy
 from dudmap.gpu.streams import HostQueue
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import MAX_COORDINATE
+from dudmap.slam import Slam
 from small_maps import CAMERA
 
 SMALL = CAMERA.scaled(1)
@@ -197,7 +200,7 @@ def test_voxels_of_another_block_are_not_kept():
     _ = device.blocks.geometry, device.blocks.colors
     for one in others:
         device.integrate(*one)
-    before = device._index.latest.arrays(np.empty(0, np.int32))
+    before = device._index.held.arrays(np.empty(0, np.int32))
     coords = before.slot_coords.copy()
     blocks = device.blocks
     other = np.any(blocks.slot_coords[: len(coords)] != coords, axis=1) | (blocks.entry_of[: len(coords)] < 0)
@@ -206,13 +209,30 @@ def test_voxels_of_another_block_are_not_kept():
     assert blocks.geometry[: len(coords)][other].any()
 
 
-def test_what_the_map_knows_is_read_through_the_window(monkeypatch):
+def test_what_the_map_knows_is_read_through_the_window():
     """The share of the information needs no hash table, and the host does not hear of new blocks."""
     on_host, device = volume("warp-cpu", on_host=True), volume("warp-cpu")
     for frame, T in scene(9, frames=3):
         for one in (on_host, device):
             one.integrate(frame, T)
     expected, found = (one.known_share(frame.depth, SMALL, T) for one in (on_host, device))
+    assert device._index.copy.is_ahead
+    device.grid.on_host()
+    np.testing.assert_array_equal(device.known_share(frame.depth, SMALL, T), expected)
     assert device._index.copy is not None
     assert (expected > 0).mean() > 0.5
     np.testing.assert_array_equal(found, expected)
+
+
+def test_a_system_leaves_the_index_on_the_device(monkeypatch):
+    """Nothing that it does from frame to frame reads the blocks, so that the device takes them over once."""
+    made, init = [], IndexCopy.__init__
+    monkeypatch.setattr(IndexCopy, "__init__", lambda self, *arguments: made.append(self) or init(self, *arguments))
+    recording = synthetic.sequence(frames=10, camera=CAMERA)
+    slam = Slam(CAMERA, Config().override(["volume.voxel_size=0.03", "device=warp-cpu"]))
+    for index in range(10):
+        assert slam.process(recording[index]).state == "tracked"
+    assert len(made) == 1
+    assert made[0].is_ahead
+    slam.volume.extract_mesh(1)
+    assert slam.volume._index.copy is made[0]

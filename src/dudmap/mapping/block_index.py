@@ -12,8 +12,8 @@ from dudmap.mapping.voxel_blocks import MAX_COORDINATE, VoxelBlocks
 class BlockIndex:
     """Where the blocks of a map are; see ``kernels/block_index.py``.
 
-    The host follows the device when the blocks are read here, and the device has to take them over again after that,
-    since whoever reads them may change them.
+    The host follows the device when the blocks are asked for here; where they may be changed, the device has to take
+    them over again.
 
     Args:
         blocks, window: In the host's memory.
@@ -45,8 +45,14 @@ class BlockIndex:
         return self._window
 
     @property
-    def latest(self) -> VoxelBlocks:
-        """The blocks, for the voxels that a back end has of them alone: all else may be that of an earlier frame."""
+    def held(self) -> VoxelBlocks:
+        """The blocks, for their mirrors of voxels alone: all else may be that of an earlier frame."""
+        return self._blocks
+
+    @property
+    def to_read(self) -> VoxelBlocks:
+        """The blocks, up to date; they must not be changed."""
+        self.catch_up()
         return self._blocks
 
     @property
@@ -71,12 +77,12 @@ class BlockIndex:
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32 in the window; -1 where there are no voxels."""
-        if self._ahead is not None and self._window.origin is not None:
+        if self.copy is not None and self._window.origin is not None:
             cells = self._window.cells_at(coords)
             found = self._window.mirror.take(np.maximum(cells, 0), np.zeros_like(cells))
-            if self._ahead is not None and not self._ahead.is_lost:
+            if not self.copy.is_lost:
                 return np.where(cells >= 0, np.maximum(found, -1), -1).astype(np.int32)
-        return self.blocks.slots_at(coords)
+        return self.to_read.slots_at(coords)
 
     def arrays(self) -> IndexArrays:
         """See ``kernels.block_index.BlockIndex``."""

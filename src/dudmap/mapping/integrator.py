@@ -122,7 +122,7 @@ class Integrator:
     def grid(self, index: BlockIndex) -> VoxelGrid:
         """The blocks around the view as a back end takes them, which a device may number; valid until blocks are
         added."""
-        return self._grid(index.latest, index.place)._replace(index=index)
+        return self._grid(index.held, index.place)._replace(index=index)
 
     def _grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
         """The same of blocks that are up to date in the host's memory."""

@@ -62,7 +62,7 @@ class PagedMap:
     @property
     def view_bytes(self) -> int:
         """Memory of the voxels around the view."""
-        return self._index.num_near * self._index.latest.slot_bytes
+        return self._index.num_near * self._index.held.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
         """Empty blocks, with room for as many as will be in memory."""
@@ -90,7 +90,7 @@ class PagedMap:
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
         """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
-        if self.pager is None and (room := self._index.latest.colors_mirror.max_rows):
+        if self.pager is None and (room := self._index.held.colors_mirror.max_rows):
             self.pager, self._index.on_host = BlockPager(room), True
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)

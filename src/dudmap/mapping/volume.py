@@ -124,7 +124,7 @@ class TsdfVolume(PagedMap):
     @property
     def num_free_blocks(self) -> int:
         """Blocks in memory known to be free space; they own no voxels."""
-        return self.blocks.num_free(self.config.free_after)
+        return self._index.to_read.num_free(self.config.free_after)
 
     @property
     def num_bytes(self) -> int:
@@ -134,17 +134,17 @@ class TsdfVolume(PagedMap):
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
         is the window, whose size depends on the view and the voxels, not on the map.
         """
-        return self.blocks.num_bytes
+        return self._index.to_read.num_bytes
 
     @property
     def entry_bytes(self) -> float:
         """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self.blocks.entry_bytes
+        return self._index.to_read.entry_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return self.blocks.active_slots
+        return self._index.to_read.active_slots
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -260,7 +260,7 @@ class TsdfVolume(PagedMap):
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
         slots, local = self._index.slots_at(voxels // BLOCK), voxels % BLOCK
         numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
-        words = self._index.latest.geometry_mirror.take(np.maximum(slots, 0), numbers)
+        words = self._index.held.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
         out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
@@ -283,7 +283,7 @@ class TsdfVolume(PagedMap):
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
             return joined(list(self.extract_pieces(min_weight)))
-        slots, blocks = self.active_slots, self.blocks
+        slots, blocks = self.active_slots, self._index.to_read
         return Mesh(
             *self.backend.extract_mesh(
                 blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
@@ -319,7 +319,7 @@ class TsdfVolume(PagedMap):
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
             min_weight: As of ``extract_mesh``.
         """
-        blocks = self.blocks
+        blocks = self._index.to_read
         meshes = self.backend.extract_chunks(
             blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
             self._mesh_parameters(min_weight), chunks,
@@ -336,12 +336,13 @@ class TsdfVolume(PagedMap):
 
         A slot that was released is among them, with the coordinates of the block that had it or of the next one.
         """
-        slots = np.flatnonzero(self.blocks.written[: self.blocks.num_slots] > num_integrated).astype(np.int32)
-        return slots, self.blocks.slot_coords[slots].astype(np.int32)
+        blocks = self._index.to_read
+        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
+        return slots, blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        return self.blocks.slots_at(coords)
+        return self._index.to_read.slots_at(coords)
 
     # -- files -------------------------------------------------------------------------------------------------------
 
