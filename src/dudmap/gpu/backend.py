@@ -1,8 +1,7 @@
 """The back end for GPUs: Warp kernels behind the operations of ``kernels/backend.py``.
 
 The map stays on the device (``memory.py``); images that the device computed are not uploaded again. What is not ported
-is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs, and the division of a mesh
-into chunks.
+is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs.
 """
 
 # Warp's annotations name float where any type of number is meant
@@ -23,14 +22,13 @@ from dudmap.gpu.kernels.structs import camera_of, struct
 from dudmap.gpu.labels import LabelOperations
 from dudmap.gpu.linearization import Linearization
 from dudmap.gpu.memory import Images, resident, users_of, wrote
-from dudmap.gpu.meshing import extract_surface
+from dudmap.gpu.meshing import Meshing
 from dudmap.gpu.numbering import BlockNumbering, IndexCopy
 from dudmap.gpu.preparation import Preparation
 from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import main_queue
-from dudmap.kernels import meshing, raycasting, visibility
+from dudmap.kernels import raycasting, visibility
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     BLOCK,
     Damping,
@@ -41,8 +39,6 @@ from dudmap.kernels.parameters import (
     FusedBlocks,
     FusionParameters,
     MapSample,
-    MeshArrays,
-    MeshParameters,
     NormalEquations,
     RaycastParameters,
     RaycastResult,
@@ -77,6 +73,8 @@ class WarpBackend:
         self.label, self.moving_regions = labels.label, labels.moving_regions
         self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
         self.compare_segments, self.compare_with_frame = labels.compare_segments, labels.compare_with_frame
+        meshing = Meshing(device)
+        self.extract_mesh, self.extract_chunks = meshing.extract_mesh, meshing.extract_chunks
         self._loops = BlockLoops(self._queue, self._up)
         self._lattice, self._marked = self._loops.lattice, self._loops.marked
         numbering = BlockNumbering(self._loops)
@@ -308,42 +306,12 @@ class WarpBackend:
         )  # fmt: skip
         return RaycastResult(self._down(depth), self._down(color), self._down(normals))
 
-    def extract_mesh(
-        self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
-        parameters: MeshParameters,
-    ) -> MeshArrays:
-        """See ``Backend.extract_mesh``."""
-        return MeshArrays(*self._surface(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
-
-    def extract_chunks(
-        self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
-        parameters: MeshParameters,
-        chunks: NDArray[np.integer],
-    ) -> list[MeshArrays]:
-        """See ``Backend.extract_chunks``."""
-        arguments = geometry, colors, slots, coords, neighbours, parameters, chunks
-        return meshing.extract_chunks(*arguments, surface=self._surface)
-
     # -- helpers -----------------------------------------------------------------------------------------------------
 
     @cached_property
     def _preparation(self) -> Preparation:
         """Made at its first use: only a preprocessor's back end has a queue of its own."""
         return Preparation(self.device, self._images)
-
-    def _surface(self, *arguments: Any) -> tuple[NDArray, ...]:  # noqa: ANN401
-        """Vertices, faces, colours, normals and first face of each block, as ``meshing.surface`` gives them."""
-        return extract_surface(self.device, *arguments)
 
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
         self._queue.launch(kernel, dim, *arguments)

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.block_index import IndexBackend
 from dudmap.kernels.label_backend import LabelBackend
+from dudmap.kernels.links import Neighbours
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -268,7 +269,7 @@ class Backend(LabelBackend, IndexBackend, Protocol):
         colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
+        neighbours: Neighbours,
         parameters: MeshParameters,
     ) -> MeshArrays:
         """Triangles of the zero level of the given blocks by marching cubes.
@@ -278,6 +279,7 @@ class Backend(LabelBackend, IndexBackend, Protocol):
             slots: (n,) int32, blocks to mesh; each once.
             coords: (num_slots, 3) int, block coordinates by slot.
             neighbours: (n, 8) int32; column 4 dx + 2 dy + dz holds the slot of the block at +(dx, dy, dz), -1 = none.
+                It follows from the coordinates: a device does not read it.
             parameters: Of the extraction.
 
         Returns:
@@ -291,7 +293,7 @@ class Backend(LabelBackend, IndexBackend, Protocol):
         colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
+        neighbours: Neighbours,
         parameters: MeshParameters,
         chunks: NDArray[np.integer],
     ) -> list[MeshArrays]:

@@ -15,6 +15,7 @@ from dudmap.geometry.mesh import Mesh, joined
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.integration import used_readings
+from dudmap.kernels.links import Lazy
 from dudmap.kernels.parameters import (
     FREE,
     SURFACE,
@@ -286,8 +287,8 @@ class TsdfVolume(PagedMap):
         slots, blocks = self.active_slots, self._index.to_read
         return Mesh(
             *self.backend.extract_mesh(
-                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-                self._mesh_parameters(min_weight),
+                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
+                Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight),
             )
         )  # fmt: skip
 
@@ -321,8 +322,8 @@ class TsdfVolume(PagedMap):
         """
         blocks = self._index.to_read
         meshes = self.backend.extract_chunks(
-            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(min_weight), chunks,
+            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
+            Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]
 
