@@ -23,7 +23,8 @@ from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import HostQueue
 from dudmap.kernels.evidence import BINS, EvidenceParameters
 from dudmap.kernels.parameters import SURFACE, UNKNOWN, MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage
 from small_maps import CAMERA
 
 PARAMETERS = EvidenceParameters(2.3, -0.45, 6.0, 0.02, 3.0)
@@ -75,12 +76,9 @@ def labelled(backend, frame, depth, older):
     before = backend.seen_marked(depth, depth, CAMERA.intrinsics, older[0], 0.1)
     in_segments = backend.segment_counts(labels, count, (before, moving))
     started = in_segments[2] > 0.3 * in_segments[0]
-    known, sums = backend.compare_segments(
-        sample, labels, started, moving, sigma, depth, (0.98, 0.01), np.ascontiguousarray(depth / 10), 3
-    )
-    others = backend.compare_with_frame(
-        depth, depth, CAMERA.intrinsics, older[1], labels, count, sigma, 4, np.ascontiguousarray(depth / 10), 3
-    )
+    segments = SegmentImage(labels, count, sigma, np.ascontiguousarray(depth / 10), 3)
+    known, sums = backend.compare_segments(sample, segments, started, moving, depth, (0.98, 0.01))
+    others = backend.compare_with_frame(depth, depth, CAMERA.intrinsics, older[1], segments, 4)
     images = [np.asarray(image) for image in (free, odds, before, known)]
     return *counts, *images, probability, moving, labels, count, *in_segments, *sums, *others
 
@@ -210,7 +208,8 @@ def test_sums_over_segments_are_those_of_the_cpu(cpu, gpu, frame, smooth, window
     sample, started = frame[0]._replace(difference=difference), random.random(count + 1) < 0.5
     shade, gradient = (random.random(SHAPE).astype(np.float32) for _ in range(2))
     dynamic = random.random(SHAPE) < 0.4
-    arguments = sample, labels, started, dynamic, frame[1], shade, (1.1, -0.02), gradient, window
+    segments = SegmentImage(labels, count, frame[1], gradient, window)
+    arguments = sample, segments, started, dynamic, shade, (1.1, -0.02)
     (mask, expected), (other, found) = (backend.compare_segments(*arguments) for backend in (cpu, gpu))
     np.testing.assert_array_equal(np.asarray(other), mask)
     assert 0.1 < mask.mean() < dynamic.mean()
@@ -232,7 +231,8 @@ def assert_equal_sums(found, expected, rounding=0.0):
 def test_sums_of_older_frames_are_those_of_the_cpu(cpu, gpu, frame, smooth, older, window):
     labels, count = cpu.segment_surface(smooth, CAMERA.intrinsics, tolerances(smooth), *SEGMENTS)
     shade, gradient = (np.random.default_rng(n).random(SHAPE).astype(np.float32) for n in (1, 2))
-    arguments = smooth, shade, CAMERA.intrinsics, older[1], labels, count, frame[1], 4, gradient, window
+    segments = SegmentImage(labels, count, frame[1], gradient, window)
+    arguments = smooth, shade, CAMERA.intrinsics, older[1], segments, 4
     expected, found = (backend.compare_with_frame(*arguments) for backend in (cpu, gpu))
     assert_equal_sums(found, expected, float(np.spacing(smooth.max()) / frame[1][smooth > 0].min()))
 

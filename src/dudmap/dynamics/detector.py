@@ -247,8 +247,8 @@ class DynamicDetector:
         size, labels = np.maximum(counts[0], 1), segmentation.labels
         sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
         dynamic, sums = backend.compare_segments(
-            frame.sample, labels, counts[2] / size >= STARTED_SHARE, dynamic, sigma, level.intensity, frame.exposure,
-            segmentation.gradient, segmentation.window,
+            frame.sample, segmentation.with_noise(sigma), counts[2] / size >= STARTED_SHARE, dynamic, level.intensity,
+            frame.exposure,
         )  # fmt: skip
         moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
         dynamic = dynamic | moving[labels]

@@ -9,7 +9,7 @@ from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length,
 from dudmap.frames.observation import Level
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.segmentation import SegmentSums
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums
 
 EDGE_REACH = 3
 """Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
@@ -53,6 +53,10 @@ class Segmentation:
     gradient: NDArray[np.float32]
     min_pixels: float = MIN_PIXELS
     window: int = 3
+
+    def with_noise(self, sigma: NDArray[np.float32]) -> SegmentImage:
+        """The segments as a compute device takes them; sigma (h, w) is that of the distance of a static point."""
+        return SegmentImage(self.labels, self.count, sigma, self.gradient, self.window)
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:
         """Share (count + 1,) of each segment's pixels that lie in a mask (h, w) bool; entry 0 is meaningless."""

@@ -12,8 +12,8 @@ from dudmap.dynamics.label_scale import scaled_side
 from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels import segmentation as kernels
 from dudmap.kernels.backend import Backend
+from dudmap.kernels.reprojection import ReprojectionTarget
 
 SETTLE_FRAMES = 4
 """Frames kept of ``settle_time``, in which a segment must stand still to be released."""
@@ -215,10 +215,8 @@ class TemporalMemory:
         settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
         settled[: count + 1] = False
         for target in _targets(T_world_camera, frames):
-            sums = backend.compare_with_frame(
-                level.depth, level.intensity, level.camera.intrinsics, target, labels, 2 * count, sigma, 4,
-                parts.gradient, parts.window,
-            )  # fmt: skip
+            image = level.depth, level.intensity, level.camera.intrinsics
+            sums = backend.compare_with_frame(*image, target, parts.with_noise(sigma), 4)
             evidence = evidence_of(sums, parts.min_pixels)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
@@ -229,12 +227,10 @@ class TemporalMemory:
         return settled[parts.labels]
 
 
-def _targets(
-    T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]
-) -> list[kernels.ReprojectionTarget]:
+def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:
     """Remembered frames that an image at a pose (4, 4) is compared with."""
     return [
-        kernels.ReprojectionTarget(
+        ReprojectionTarget(
             se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
         )
         for frame in frames

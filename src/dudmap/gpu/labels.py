@@ -20,7 +20,8 @@ from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import Queue
 from dudmap.kernels.evidence import BINS, EvidenceParameters, ResidualCounts
 from dudmap.kernels.parameters import MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums
 
 RUN = kernels.RUN
 STEPS = np.array([1, 1, 1, 1, 2.0**20, 2.0**30, 2.0**30, 2.0**30])
@@ -153,17 +154,14 @@ class LabelOperations:
     def compare_segments(
         self,
         sample: MapSample,
-        labels: NDArray[np.int32],
+        segments: SegmentImage,
         started: NDArray[np.bool_],
         dynamic: NDArray[np.bool_],
-        sigma: NDArray[np.float32],
         intensity: NDArray[np.float32],
         exposure: tuple[float, float],
-        gradient: NDArray[np.float32],
-        window: int,
     ) -> tuple[NDArray[np.bool_], SegmentSums]:
         """See ``Backend.compare_segments``."""
-        shape, places = labels.shape, _places(len(started) - 1)
+        shape, places = segments.labels.shape, _places(segments.count)
         marks, begun = np.zeros(places, np.uint8), self._buffer((places,), wp.uint8, "started")
         marks[: len(started)] = started
         self._staging.upload(marks, begun)
@@ -172,8 +170,8 @@ class LabelOperations:
         )  # fmt: skip
         moving = self._buffer(shape, wp.uint8, "moving")
         sums = self._sums(
-            (difference, occupancy, self._up(intensity), *exposure), (begun, self._up(dynamic)), distance, sigma,
-            labels, gradient, window, moving,
+            segments, (difference, occupancy, self._up(intensity), *exposure), (begun, self._up(dynamic)), distance,
+            moving,
         )  # fmt: skip
         found, mask = self._staging.download_all([sums, moving])
         return mask.view(np.bool_), SegmentSums(*(found[: len(started)] / STEPS).T)
@@ -184,12 +182,8 @@ class LabelOperations:
         intensity: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         target: ReprojectionTarget,
-        labels: NDArray[np.int32],
-        count: int,
-        sigma: NDArray[np.float32],
+        segments: SegmentImage,
         max_sigmas: float,
-        gradient: NDArray[np.float32],
-        window: int,
     ) -> SegmentSums:
         """See ``Backend.compare_with_frame``."""
         shape, shade = depth.shape, self._up(intensity)
@@ -197,42 +191,40 @@ class LabelOperations:
         occupancy, displaced = (self._buffer(shape, wp.uint8, use) for use in ("seen", "displaced"))
         self._queue.launch(
             kernels.compare_with_frame, shape, self._up(depth), shade, camera_of(intrinsics), *self._older(target),
-            self._up(sigma), max_sigmas, distance, difference, occupancy, displaced,
+            self._up(segments.sigma), max_sigmas, distance, difference, occupancy, displaced,
         )  # fmt: skip
-        all_started = wp.full(_places(count), 1, dtype=wp.uint8, device=self._queue.device)
+        all_started = wp.full(_places(segments.count), 1, dtype=wp.uint8, device=self._queue.device)
         sums = self._sums(
-            (difference, occupancy, shade, 1.0, 0.0), (all_started, displaced), distance, sigma, labels, gradient,
-            window, self._buffer(shape, wp.uint8, "moving"),
+            segments, (difference, occupancy, shade, 1.0, 0.0), (all_started, displaced), distance,
+            self._buffer(shape, wp.uint8, "moving"),
         )  # fmt: skip
-        return SegmentSums(*(self._staging.download(sums)[: count + 1] / STEPS).T)
+        return SegmentSums(*(self._staging.download(sums)[: segments.count + 1] / STEPS).T)
 
     def _sums(
         self,
+        segments: SegmentImage,
         compared: tuple[Any, ...],
         marks: tuple[Any, Any],
         distance: Any,  # noqa: ANN401 - an array of Warp
-        sigma: NDArray[np.float32],
-        labels: NDArray[np.int32],
-        gradient: NDArray[np.float32],
-        window: int,
         moving: Any,  # noqa: ANN401
     ) -> Any:  # noqa: ANN401
         """Sums over segments (places, 8) in steps.
 
         Args:
+            segments: The segments.
             compared: Difference, occupancy, intensity, gain and offset.
             marks: Segments that have started, whose number gives that of the places, and moving pixels.
-            distance, sigma, labels, gradient, window: As of ``compare_segments``.
+            distance: To the map.
             moving: Receives the moving pixels of segments that have started, and those in known space.
         """
-        shape, numbers, occupancy = labels.shape, self._up(labels), compared[1]
+        shape, numbers, occupancy = segments.labels.shape, self._up(segments.labels), compared[1]
         mean = self._buffer(shape, wp.float32, "mean")
-        self._queue.launch(kernels.compare_with_map, shape, *compared, numbers, *marks, window // 2, mean, moving)
-        sums = wp.zeros((marks[0].size, len(SegmentSums._fields)), dtype=wp.int64, device=self._queue.device)
-        images = numbers, occupancy, moving
         self._queue.launch(
-            kernels.add_segments, _runs(shape), *images, distance, self._up(sigma), mean, self._up(gradient), sums
+            kernels.compare_with_map, shape, *compared, numbers, *marks, segments.window // 2, mean, moving
         )
+        sums = wp.zeros((marks[0].size, len(SegmentSums._fields)), dtype=wp.int64, device=self._queue.device)
+        images, sigma, gradient = (numbers, occupancy, moving), self._up(segments.sigma), self._up(segments.gradient)
+        self._queue.launch(kernels.add_segments, _runs(shape), *images, distance, sigma, mean, gradient, sums)
         self._queue.launch(kernels.add_deviations, _runs(shape), *images, mean, sums)
         return sums
 

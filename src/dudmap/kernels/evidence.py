@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dudmap.kernels import labeling
 from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums, reproject, segment_sums
+from dudmap.kernels.reprojection import ReprojectionTarget, reproject
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums, segment_sums
 
 BINS = 128
 """Bins of the histogram of normalised residuals."""
@@ -177,24 +178,20 @@ def segment_counts(
 
 def compare_segments(
     sample: MapSample,
-    labels: NDArray[np.int32],
+    segments: SegmentImage,
     started: NDArray[np.bool_],
     dynamic: NDArray[np.bool_],
-    sigma: NDArray[np.float32],
     intensity: NDArray[np.float32],
     exposure: tuple[float, float],
-    gradient: NDArray[np.float32],
-    window: int,
 ) -> tuple[NDArray[np.bool_], SegmentSums]:
     """See ``LabelBackend.compare_segments``."""
     surface, known = sample.occupancy == SURFACE, sample.occupancy != UNKNOWN
-    dynamic = dynamic & (known | started[labels])
+    dynamic = dynamic & (known | started[segments.labels])
     gain, offset = exposure
     correction = np.float32(1 - gain) * intensity - np.float32(offset)
     difference = np.asarray(sample.difference + correction, np.float32)
     difference[np.isnan(difference)] = 0  # in the air
-    arguments = labels, len(started) - 1, surface, dynamic, sample.distance, sigma, difference, gradient, window
-    return dynamic, smoothed_segment_sums(*arguments)
+    return dynamic, smoothed_segment_sums(segments, surface, dynamic, sample.distance, difference)
 
 
 def compare_with_frame(
@@ -202,36 +199,28 @@ def compare_with_frame(
     intensity: NDArray[np.float32],
     intrinsics: NDArray[np.float32],
     target: ReprojectionTarget,
-    labels: NDArray[np.int32],
-    count: int,
-    sigma: NDArray[np.float32],
+    segments: SegmentImage,
     max_sigmas: float,
-    gradient: NDArray[np.float32],
-    window: int,
 ) -> SegmentSums:
     """See ``LabelBackend.compare_with_frame``."""
     ((gap, difference, _),) = reproject(depth, intensity, intrinsics, [target])
     compared = ~np.isnan(gap)
-    displaced = np.abs(gap) > max_sigmas * sigma  # not where it is NaN
-    return smoothed_segment_sums(labels, count, compared, displaced, gap, sigma, difference, gradient, window)
+    displaced = np.abs(gap) > max_sigmas * segments.sigma  # not where it is NaN
+    return smoothed_segment_sums(segments, compared, displaced, gap, difference)
 
 
 def smoothed_segment_sums(
-    labels: NDArray[np.int32],
-    count: int,
+    segments: SegmentImage,
     compared: NDArray[np.bool_],
     moving: NDArray[np.bool_],
     distance: NDArray[np.float32],
-    sigma: NDArray[np.float32],
     difference: NDArray[np.float32],
-    gradient: NDArray[np.float32],
-    window: int,
 ) -> SegmentSums:
     """Sums over segments, as of ``segment_sums``, with the mean difference over the pixels of a window that are
     compared."""
     import cv2
 
-    size = window, window
+    size = segments.window, segments.window
     ones = cv2.blur(compared.astype(np.float32), size)
     mean = cv2.blur(np.where(compared, difference, np.float32(0)), size) / np.maximum(ones, LEAST_SHARE)
-    return segment_sums(labels, count, compared, moving, distance, sigma, np.asarray(mean, np.float32), gradient)
+    return segment_sums(segments, compared, moving, distance, np.asarray(mean, np.float32))

@@ -77,6 +77,16 @@ def rebuild(table, coords, num_entries):
 
 
 @kernel
+def in_use(slots, entry_of):
+    """Those of the slots (n,) that an entry has."""
+    kept, count = np.empty_like(slots), 0
+    for slot in slots:
+        kept[count] = slot
+        count += np.int64(entry_of[slot] >= 0)
+    return kept[:count]
+
+
+@kernel
 def fill_window(window, origin, coords, slot_of, num_entries, inside):
     """Write every entry that lies in the window: its voxel slot, or ``-2 - entry`` for one without voxels.
 

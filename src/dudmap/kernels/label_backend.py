@@ -8,7 +8,8 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.evidence import EvidenceParameters, ResidualCounts
 from dudmap.kernels.parameters import MapSample
-from dudmap.kernels.segmentation import ReprojectionTarget, SegmentSums
+from dudmap.kernels.reprojection import ReprojectionTarget
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums
 
 
 class LabelBackend(Protocol):
@@ -135,28 +136,22 @@ class LabelBackend(Protocol):
     def compare_segments(
         self,
         sample: MapSample,
-        labels: NDArray[np.int32],
+        segments: SegmentImage,
         started: NDArray[np.bool_],
         dynamic: NDArray[np.bool_],
-        sigma: NDArray[np.float32],
         intensity: NDArray[np.float32],
         exposure: tuple[float, float],
-        gradient: NDArray[np.float32],
-        window: int,
     ) -> tuple[NDArray[np.bool_], SegmentSums]:
         """Dynamic pixels (h, w) bool, without those in unknown space whose segment has not started to move, and sums
         over the segments, of a frame compared with the map.
 
         Args:
             sample: The map at the points of the image.
-            labels: (h, w) int32 numbers of the segments from 1, 0 = none.
+            segments: The segments of the image.
             started: (count + 1,) bool, segments that have started.
             dynamic: (h, w) bool.
-            sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
             intensity: (h, w) float32.
             exposure: Gain and offset that make the image's intensities those of the map.
-            gradient: (h, w) float32, magnitude of the intensity gradient.
-            window: Side of the window over which the intensity difference is averaged, pixels, odd.
         """
         ...
 
@@ -166,13 +161,9 @@ class LabelBackend(Protocol):
         intensity: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         target: ReprojectionTarget,
-        labels: NDArray[np.int32],
-        count: int,
-        sigma: NDArray[np.float32],
+        segments: SegmentImage,
         max_sigmas: float,
-        gradient: NDArray[np.float32],
-        window: int,
     ) -> SegmentSums:
         """Sums over the segments of a frame compared with an older one, in which points move that are off by more than
-        ``max_sigmas``; other arguments as of ``seen_marked``, ``segment_counts`` and ``compare_segments``."""
+        ``max_sigmas``; other arguments as of ``seen_marked`` and ``compare_segments``."""
         ...

@@ -34,11 +34,12 @@ Result = TypeVar("Result")
 def num_threads() -> int:
     """Cores this process may use; the environment variable DUDMAP_THREADS overrides."""
     override = os.environ.get("DUDMAP_THREADS", "")
-    if override.isdigit() and int(override) > 0:
-        return int(override)
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return int(override) if override.isdigit() and int(override) > 0 else _num_cores()
+
+
+@cache
+def _num_cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 @cache

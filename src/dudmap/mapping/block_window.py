@@ -106,7 +106,7 @@ class BlockWindow:
         coords = tuple((blocks.coords[entries] - self.origin).T)
         cells = np.asarray(np.ravel_multi_index(coords, tuple(self.shape)))
         self._set(cells, -2 - entries)
-        self.near = self.near[blocks.entry_of[self.near] >= 0]
+        self.near = hashing.in_use(self.near, blocks.entry_of)
 
     def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
         """Make entries for unknown cells (n,) with so many observations of emptiness."""

@@ -206,7 +206,7 @@ class KeyframeDatabase:
         Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
         close = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
         cosine = (np.einsum("iab,ab->i", Ts[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
-        close &= np.degrees(np.arccos(np.clip(cosine, -1, 1))) < angle_deg
+        close &= cosine > np.cos(np.radians(angle_deg))
         return [self.keyframes[n] for n in np.flatnonzero(close) if self.keyframes[n].submap == submap]
 
     def _remove_most_redundant(self) -> None:

@@ -18,7 +18,7 @@ from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import Tracker, TrackingResult
+from dudmap.tracking.tracker import Minimum, Tracker, TrackingResult
 
 UNCHANGED_SHARE = 0.02
 """Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
@@ -99,16 +99,16 @@ class FrontEnd:
             return PoseEstimate(tracking, labels, unverified)
         split = max(1, len(levels) - 1)
         with view.timer("track"):
-            coarse = levels[:split]
-            tracking = tracker.align(volume, coarse, T_init, initial_weights(coarse, self.last_dynamic, excluded))
-        view = self.color_motion.refined(view, tracking.T_world_camera)
+            coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
+            found = tracker.minimize(volume, coarse, T_init, weights)
+        view = self.color_motion.refined(view, found.T_world_camera)
         levels = view.pyramid.tracked
-        labels = self._label(volume, view, prediction, tracking)
+        labels = self._label(volume, view, prediction, found)
         with view.timer("track_again"):
-            finest_suffices = split < len(levels) and tracking.settled and self._labels_unchanged(labels)
+            finest_suffices = split < len(levels) and found.settled and self._labels_unchanged(labels)
             first = split if finest_suffices else split - 1
             weights = static_weights(labels, levels[first:], unverified)
-            pose, exposure = tracking.T_world_camera, tracking.exposure
+            pose, exposure = found.T_world_camera, found.exposure
             color_weight = tracker.config.color_weight * self._motion_discount(volume, view, pose)
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.blind:
@@ -150,7 +150,7 @@ class FrontEnd:
         return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
 
     def _label(
-        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult | Minimum
     ) -> Labels:
         """Labels of a registered frame."""
         with view.timer("label"):

@@ -15,8 +15,8 @@ from dudmap.frames.exposure import LARGE_GAIN, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import reduced
 from dudmap.geometry import se3
-from dudmap.kernels import segmentation as kernels
 from dudmap.kernels.median import median
+from dudmap.kernels.reprojection import ReprojectionTarget, reproject
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import MotionModel
@@ -110,8 +110,8 @@ class ImageConsistency:
             return np.nan
         level, (last, marks) = view.pyramid.coarse, self._last
         T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
-        target = kernels.ReprojectionTarget(T_last_camera, last.depth, last.intensity, marks)
-        seen = kernels.reproject(level.depth, level.intensity, level.camera.intrinsics, [target])[0]
+        target = ReprojectionTarget(T_last_camera, last.depth, last.intensity, marks)
+        seen = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])[0]
         tolerance = depth_tolerance(distance_sigma(self.sensor, level.depth, 0.0), level)
         common = (np.abs(seen.gap) < tolerance) & (seen.marks == 0) & ~_dynamic(estimate, level)
         if np.count_nonzero(common) < MIN_PIXELS:

@@ -61,6 +61,30 @@ class TrackingResult:
     unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
 
 
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a registration has ended.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that map the frame's intensities to those of the map.
+        equations: Normal equations there.
+        level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
+        iterations: Number of linearisations over all levels.
+        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
+        seen: Directions of motion that the view determines.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    equations: NormalEquations
+    level: Level
+    weights: NDArray[np.float32]
+    iterations: int
+    settled: bool
+    seen: Observability
+
+
 class Tracker:
     """Coarse-to-fine registration of a frame to the map by Levenberg-Marquardt.
 
@@ -83,7 +107,24 @@ class Tracker:
         exposure: tuple[float, float] = (1.0, 0.0),
         color_weight: float | None = None,
     ) -> TrackingResult:
-        """Pose that minimises the distances and intensity differences of a frame to the map (eq. 4.32).
+        """Pose that minimises the distances and intensity differences of a frame to the map, and whether it can be
+        trusted; arguments as of ``minimize``."""
+        found = self.minimize(volume, levels, T_init, static_weights, first_level, exposure, color_weight)
+        T = found.T_world_camera.copy()
+        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
+        return self._judge(replace(found, T_world_camera=T))
+
+    def minimize(
+        self,
+        volume: TsdfVolume,
+        levels: list[Level],
+        T_init: NDArray[np.float64],
+        static_weights: list[NDArray[np.float32]] | None = None,
+        first_level: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
+        color_weight: float | None = None,
+    ) -> Minimum:
+        """Minimum of the distances and intensity differences of a frame to the map (eq. 4.32).
 
         Args:
             volume: The map.
@@ -121,9 +162,7 @@ class Tracker:
             iterations += used
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
-        T = T.copy()
-        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return replace(self._judge(T, exposure, system, lit, weights, iterations, seen or COMPLETE), settled=settled)
+        return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
 
     def _observability(
         self,
@@ -267,16 +306,7 @@ class Tracker:
             noise_weighting=float(config.noise_weighting),
         )
 
-    def _judge(
-        self,
-        T: NDArray[np.float64],
-        exposure: tuple[float, float],
-        system: NormalEquations,
-        level: Level,
-        weights: NDArray[np.float32],
-        iterations: int,
-        seen: Observability,
-    ) -> TrackingResult:
+    def _judge(self, found: Minimum) -> TrackingResult:
         """Result of a registration with the first check it fails: overlap, residual, conditioning of H.
 
         Directions that are known not to be determined do not count as badly conditioned, as long as others remain.
@@ -285,7 +315,7 @@ class Tracker:
         the registration does not weigh by it, and intensities after the best gain and offset even if the registration
         does not apply them.
         """
-        config = self.config
+        config, system, level, weights = self.config, found.equations, found.level, found.weights
         share = system.weight / max(system.readings, 1.0)
         chi_square = system.chi_square if config.noise_weighting else self._chi_square(system, level, weights)
         residual = float(np.sqrt(chi_square / max(system.weight, 1e-9)))
@@ -298,7 +328,7 @@ class Tracker:
             reason = f"only {share:.0%} of the static readings fall on the map"
         elif residual > config.max_residual * self.sensor.sigma(1.0):
             reason = f"readings lie {1000 * residual:.1f} mm off the map"
-        elif seen.observable.shape[1] == 0 or (seen.is_complete and condition < config.min_condition):
+        elif found.seen.observable.shape[1] == 0 or (found.seen.is_complete and condition < config.min_condition):
             reason = "the view does not constrain all directions of motion"
         else:
             reason = ""
@@ -310,8 +340,8 @@ class Tracker:
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
         return TrackingResult(
-            T, exposure, not reason, reason, share, residual, condition, iterations, color_residual,
-            unobservable=seen.unobservable,
+            found.T_world_camera, found.exposure, not reason, reason, share, residual, condition, found.iterations,
+            color_residual, found.settled, found.seen.unobservable,
         )  # fmt: skip
 
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:

@@ -1,6 +1,6 @@
 """Loops over the label image: histogram of residuals, log odds, comparison with older frames, opening of a mask.
 
-One thread per pixel; the loops are those of ``kernels/evidence.py`` and ``kernels/segmentation.py``.
+One thread per pixel; the loops are those of ``evidence``, ``reprojection`` and ``segmentation`` in ``kernels/``.
 """
 
 import warp as wp
@@ -15,14 +15,14 @@ from dudmap.gpu.kernels.formulas import (
     transform,
 )
 from dudmap.gpu.kernels.structs import Camera, EvidenceParameters
-from dudmap.kernels import evidence, parameters, segmentation
+from dudmap.kernels import evidence, parameters, reprojection
 
 wp.set_module_options({"enable_backward": False})
 
 BINS = wp.constant(evidence.BINS)
 UNKNOWN, SURFACE, FREE = (wp.constant(n) for n in (parameters.UNKNOWN, parameters.SURFACE, parameters.FREE))
-NEAREST = wp.constant(wp.float32(float(segmentation.NEAREST)))
-LEAST_WEIGHT = wp.constant(wp.float32(float(segmentation.LEAST_WEIGHT)))
+NEAREST = wp.constant(wp.float32(float(reprojection.NEAREST)))
+LEAST_WEIGHT = wp.constant(wp.float32(float(reprojection.LEAST_WEIGHT)))
 FAR = wp.constant(wp.float32(1.0e9))
 Image = wp.array2d(dtype=wp.float32)
 Bytes = wp.array2d(dtype=wp.uint8)
@@ -74,7 +74,7 @@ def log_odds(
 
 @wp.func
 def older(z: wp.float32, v: int, u: int, camera: Camera, t: Motion, depth: Image, intensity: Image, marks: Bytes):
-    """Gap to an older frame, its intensity and its mark at a point, as of ``segmentation.Reprojection``; the gap is NaN
+    """Gap to an older frame, its intensity and its mark at a point, as of ``reprojection.Reprojection``; the gap is NaN
     where there is none."""
     zero, one = wp.float32(0.0), wp.float32(1.0)
     gap, grey, total, mark = float(wp.nan), float(0.0), float(0.0), int(0)
