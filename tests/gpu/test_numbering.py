@@ -146,9 +146,7 @@ def test_no_list_of_blocks_crosses_the_bus(monkeypatch):
         device.integrate(frame, T)
         moves.add(tuple(device._index.place.origin))
     assert len(moves) > 2
-    weights = SMALL.width * SMALL.height
-    assert set(came) == {1, weights}
-    assert came.count(weights) == 4
+    assert set(came) == {1}
     assert not went
 
 

@@ -21,7 +21,7 @@ from dudmap.gpu.kernels.formulas import motion_of
 from dudmap.gpu.kernels.structs import camera_of, struct
 from dudmap.gpu.labels import LabelOperations
 from dudmap.gpu.linearization import Linearization
-from dudmap.gpu.memory import Images, resident, users_of, wrote
+from dudmap.gpu.memory import DeviceImage, Images, resident, users_of, wrote
 from dudmap.gpu.meshing import Meshing
 from dudmap.gpu.numbering import BlockNumbering, IndexCopy
 from dudmap.gpu.preparation import Preparation
@@ -134,13 +134,13 @@ class WarpBackend:
 
     def reading_weights(
         self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
-    ) -> NDArray[np.uint8]:
-        """See ``Backend.reading_weights``."""
+    ) -> Any:  # noqa: ANN401 - a DeviceImage stands for an array
+        """See ``Backend.reading_weights``; the image stays on the device."""
         out = self._empty(depth.shape, wp.uint8)
         self._launch(
             fusion.reading_weights, depth.shape, self._up(depth), camera_of(intrinsics), struct(noise), best, out
         )
-        return self._images.down(out)
+        return DeviceImage(out, self._queue)
 
     def touched_cells(
         self,

@@ -264,7 +264,8 @@ class TsdfVolume(PagedMap):
         words = self._index.held.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
+        gains = np.asarray(self._integrator.reading_weights(depth, camera))
+        out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
