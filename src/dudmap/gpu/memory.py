@@ -300,14 +300,9 @@ class Images:
             self.remember(array, twin, uploading=self.device != "cpu")
         return twin
 
-    def down(self, twin: Any) -> NDArray:  # noqa: ANN401
-        """A copy in the host's memory, read-only, so that the device's array stays its equal."""
-        array = main_queue(self.device).download(twin)
-        self._keep(array, twin)
-        return array
-
     def down_all(self, twins: Sequence[Any], staging: Staging) -> list[NDArray]:
-        """The same of several images at once, by the staging of the main queue: see ``Staging.download_all``."""
+        """Copies in the host's memory, read-only, so that the device's arrays stay their equals; all at once by the
+        staging of the main queue: see ``Staging.download_all``."""
         arrays = staging.download_all(twins)
         for array, twin in zip(arrays, twins, strict=True):
             self._keep(array, twin)
