@@ -65,11 +65,8 @@ class WarpBackend:
         self._host = CpuBackend()
         self.color_pixels = self._host.color_pixels
         labels = LabelOperations(self._images, self._queue, self._staging)
-        self.residual_counts, self.free_space, self.log_odds = (
-            labels.residual_counts,
-            labels.free_space,
-            labels.log_odds,
-        )
+        self.reading_noise, self.residual_counts = labels.reading_noise, labels.residual_counts
+        self.free_space, self.log_odds = labels.free_space, labels.log_odds
         self.label, self.moving_regions = labels.label, labels.moving_regions
         self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
         self.compare_segments, self.compare_with_frame = labels.compare_segments, labels.compare_with_frame

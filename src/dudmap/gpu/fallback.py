@@ -12,6 +12,7 @@ from dudmap.gpu.memory import DeviceImage, OnDevice
 from dudmap.kernels import block_index
 from dudmap.kernels.backend import OPERATIONS
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.evidence import ReadingNoise
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     DepthView,
@@ -22,6 +23,7 @@ from dudmap.kernels.parameters import (
     VoxelGrid,
     to_lattice,
 )
+from dudmap.kernels.segmentation import SegmentImage
 
 KEPT_EVERY = 100
 """Fused frames after which the host takes over what the device has written, some ten megabytes for the blocks in view:
@@ -63,6 +65,9 @@ class FallbackBackend:
                     return result._replace(equations=result.equations._replace(residuals=residuals))
                 if isinstance(result, DeviceImage):
                     return _Image(self, result, name, arguments)
+                if isinstance(result, ReadingNoise):
+                    images: list[Any] = [_Image(self, one, name, arguments, n) for n, one in enumerate(result)]
+                    return ReadingNoise(*images)
                 if _ends_fusion(name, arguments):
                     self._keep(arguments[0])
                 return result
@@ -88,6 +93,8 @@ class FallbackBackend:
         """An argument in the host's memory: a view with its tiles, an image."""
         if isinstance(value, DepthView):
             return self._on_cpu.view(value.depth, value.intrinsics, value.T_grid_camera, value.T_camera_world)
+        if isinstance(value, SegmentImage):
+            return value._replace(sigma=np.asarray(value.sigma))
         return np.asarray(value) if isinstance(value, DeviceImage) else value
 
     def _leave(self, arguments: tuple[Any, ...]) -> None:
@@ -108,11 +115,23 @@ class FallbackBackend:
 
 
 class _Image(DeviceImage):
-    """Result of an operation on a device, which the CPU computes anew if the device fails before it was read."""
+    """Result of an operation on a device, which the CPU computes anew if the device fails before it was read.
 
-    def __init__(self, backend: FallbackBackend, image: DeviceImage, name: str, arguments: tuple[Any, ...]) -> None:
+    Args:
+        backend, image, name, arguments: The operation and its result.
+        number: Of the image, where the result has several.
+    """
+
+    def __init__(
+        self,
+        backend: FallbackBackend,
+        image: Any,  # noqa: ANN401 - a DeviceImage
+        name: str,
+        arguments: tuple[Any, ...],
+        number: int | None = None,
+    ) -> None:
         super().__init__(image.twin, image.queue, image.dtype)
-        self._backend, self._name, self._arguments = backend, name, arguments
+        self._backend, self._name, self._arguments, self._number = backend, name, arguments, number
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> NDArray:  # noqa: ANN401
         if not faults.is_lost(self._backend.device):
@@ -120,7 +139,8 @@ class _Image(DeviceImage):
                 return super().__array__(dtype, copy)
             except Exception as error:
                 faults.handle(error, self._backend.device, f"the result of {self._name}")
-        return np.asarray(self._backend.perform_on_cpu(self._name, self._arguments), dtype)
+        result = self._backend.perform_on_cpu(self._name, self._arguments)
+        return np.asarray(result if self._number is None else result[self._number], dtype)
 
 
 class _Residuals:

@@ -64,6 +64,7 @@ class CpuBackend:
     extract_chunks = staticmethod(meshing.extract_chunks)
     raycast = staticmethod(raycasting.raycast)
     segment_surface = staticmethod(segmentation.segment_surface)
+    reading_noise = staticmethod(evidence.reading_noise)
     residual_counts = staticmethod(evidence.residual_counts)
     free_space = staticmethod(evidence.free_space)
     log_odds = staticmethod(evidence.log_odds)

@@ -121,6 +121,7 @@ mean_spin, same_surface = warp_function(labeling.mean_spin), warp_function(label
 dynamic_responsibility = warp_function(labeling.dynamic_responsibility)
 bounded_sigma = warp_function(labeling.bounded_sigma)
 residual_bin, noise_limit = warp_function(evidence.residual_bin), warp_function(evidence.noise_limit)
+static_sigma, edge_tolerance = warp_function(evidence.static_sigma), warp_function(evidence.edge_tolerance)
 surface_log_odds = warp_function(evidence.surface_log_odds)
 normal_of_gradient, is_concave = warp_function(segmentation.normal_of_gradient), warp_function(segmentation.is_concave)
 plane_distance = warp_function(segmentation.plane_distance)

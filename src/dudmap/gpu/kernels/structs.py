@@ -23,6 +23,7 @@ TruncationBand = _struct_of(parameters.TruncationBand)
 FusionParameters = _struct_of(parameters.FusionParameters)
 RegistrationParameters = _struct_of(parameters.RegistrationParameters)
 EvidenceParameters = _struct_of(evidence.EvidenceParameters)
+NoiseParameters = _struct_of(evidence.NoiseParameters)
 
 
 @wp.struct
