@@ -7,7 +7,7 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 
 MODULES = tuple(
     f"dudmap.gpu.kernels.{name}"
-    for name in ("images", "fusion", "surface", "labels", "components", "descent", "cubes", "rows")
+    for name in ("images", "fusion", "surface", "labels", "components", "descent", "cubes", "levels", "rows")
 )
 """Modules that hold kernels."""
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.label_backend import LabelBackend
+from dudmap.kernels.level_backend import LevelBackend
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -27,8 +28,8 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(LabelBackend, Protocol):
-    """Operations of a compute device, with those on the label image.
+class Backend(LabelBackend, LevelBackend, Protocol):
+    """Operations of a compute device, with those on the label image and on maps with several voxel sizes.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -304,5 +305,7 @@ class Backend(LabelBackend, Protocol):
         ...
 
 
-OPERATIONS = tuple(name for protocol in (Backend, LabelBackend) for name in vars(protocol) if not name.startswith("_"))
+OPERATIONS = tuple(
+    name for protocol in (Backend, LabelBackend, LevelBackend) for name in vars(protocol) if not name.startswith("_")
+)
 """Names of all operations."""

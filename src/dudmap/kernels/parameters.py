@@ -213,6 +213,28 @@ class VoxelGrid(NamedTuple):
         return self._replace(window=window, geometry=geometry, colors=colors)
 
 
+class FinerLevels(NamedTuple):
+    """Two finer levels of a map, as back ends read them; one that the map does not have holds no children.
+
+    Attributes:
+        children1, children2: (slots of the next coarser level, 8) int32: slot of the block with half the voxel size in
+            each octant of a block, -1 = none. There may be fewer rows than slots: those have no children.
+        geometry1, geometry2: (slots, 512) int32 packed voxels of the levels.
+        colors1, colors2: (slots, 512) int32 packed colours.
+    """
+
+    children1: NDArray[np.int32]
+    children2: NDArray[np.int32]
+    geometry1: Mirror | NDArray[np.int32]
+    geometry2: Mirror | NDArray[np.int32]
+    colors1: Mirror | NDArray[np.int32]
+    colors2: Mirror | NDArray[np.int32]
+
+    def on_host(self) -> "FinerLevels":
+        """The levels with plain arrays, up to date."""
+        return FinerLevels(*(on_host(array) for array in self))
+
+
 def to_lattice(
     T_world_camera: NDArray[np.float64], voxel_size: float, origin: NDArray[np.int64]
 ) -> NDArray[np.float32]:
