@@ -18,7 +18,7 @@ from warp._src.context import invoke
 NAME = "cuda:0"
 MODULES = (
     "backend", "clock", "components", "descent", "labels", "linearization", "memory", "meshing", "preparation",
-    "staging", "streams",
+    "refinement", "staging", "streams", "views",
 )  # fmt: skip
 """Modules that call Warp."""
 
