@@ -14,6 +14,7 @@ from dudmap import synthetic
 from dudmap.config import Config, SensorConfig
 from dudmap.geometry import se3
 from dudmap.gpu import faults, memory
+from dudmap.kernels.cpu import CpuBackend
 from dudmap.mapping.adaptive_volume import AdaptiveVolume
 from dudmap.mapping.incremental_mesh import IncrementalMesh
 from dudmap.mapping.volume_mirror import VolumeMirror
@@ -120,6 +121,8 @@ def test_a_system_is_continued_on_either_device(frames, runs, first, second):
     """On the same device bit for bit, on the other within the tolerance of a registration."""
     path, whole, poses, _ = runs[first]
     slam = Slam.resume(path, second)
+    assert slam.volume._refinements[0].backend is slam.volume.backend
+    assert isinstance(slam.volume.backend, CpuBackend) == (second == "cpu")
     for frame in frames[SAVED_AFTER:]:
         assert slam.process(frame).state == "tracked"
     expected, found = content(whole.volume), content(slam.volume)
