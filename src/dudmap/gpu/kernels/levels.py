@@ -108,29 +108,28 @@ def refine(
 ):  # fmt: skip
     """Zero between two depths by false position (Illinois variant): see ``adaptive_raycasting._refine``."""
     a, at_a, b, at_b = float(outside), float(at_outside), float(inside), float(at_inside)
-    side = int(0)
-    done = bool(False)
+    side, turn = int(0), int(0)
     t = float(a + (b - a) * at_a / (at_a - at_b))
-    for _turn in range(5):
-        if not done:
-            steps, _level = value_at(lattice, levels, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2], least)
-            value = steps * unit
-            if wp.isnan(value) or abs(value) < wp.float32(0.005):
-                done = True
+    while turn < 5:  # a loop that Warp does not write out, which would take long to compile
+        turn += 1
+        steps, _level = value_at(lattice, levels, o[0] + t * d[0], o[1] + t * d[1], o[2] + t * d[2], least)
+        value = steps * unit
+        if wp.isnan(value) or abs(value) < wp.float32(0.005):
+            turn = 5
+        else:
+            if value > wp.float32(0.0):
+                a = t
+                at_a = value
+                if side > 0:
+                    at_b *= wp.float32(0.5)
+                side = 1
             else:
-                if value > wp.float32(0.0):
-                    a = t
-                    at_a = value
-                    if side > 0:
-                        at_b *= wp.float32(0.5)
-                    side = 1
-                else:
-                    b = t
-                    at_b = value
-                    if side < 0:
-                        at_a *= wp.float32(0.5)
-                    side = -1
-                t = a + (b - a) * at_a / (at_a - at_b)
+                b = t
+                at_b = value
+                if side < 0:
+                    at_a *= wp.float32(0.5)
+                side = -1
+            t = a + (b - a) * at_a / (at_a - at_b)
     return t
 
 
