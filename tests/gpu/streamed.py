@@ -18,7 +18,7 @@ from warp._src.context import invoke
 NAME = "cuda:0"
 MODULES = (
     "backend", "block_loops", "clock", "components", "descent", "labels", "linearization", "memory", "meshing",
-    "numbering", "preparation", "staging", "streams",
+    "numbering", "preparation", "refinement", "staging", "streams", "views",
 )  # fmt: skip
 """Modules that call Warp."""
 

@@ -14,6 +14,7 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.gpu import views
 from dudmap.gpu.block_loops import BlockLoops
 from dudmap.gpu.descent import DeviceDescent
 from dudmap.gpu.kernels import fusion, surface
@@ -21,14 +22,16 @@ from dudmap.gpu.kernels.formulas import motion_of
 from dudmap.gpu.kernels.structs import camera_of, struct
 from dudmap.gpu.labels import LabelOperations
 from dudmap.gpu.linearization import Linearization
-from dudmap.gpu.memory import DeviceImage, Images, resident, users_of, wrote
+from dudmap.gpu.memory import DeviceImage, Images, users_of, wrote
 from dudmap.gpu.meshing import Meshing
 from dudmap.gpu.numbering import BlockNumbering, IndexCopy
 from dudmap.gpu.preparation import Preparation
+from dudmap.gpu.refinement import RefinementOperations
 from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import main_queue
-from dudmap.kernels import raycasting, visibility
+from dudmap.kernels import visibility
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.parameters import (
     BLOCK,
     Damping,
@@ -77,6 +80,8 @@ class WarpBackend:
         numbering = BlockNumbering(self._loops)
         self.allocate_touched, self.fuse_near = numbering.allocate_touched, numbering.fuse_near
         self.record_free, self.place_window = numbering.record_free, numbering.place_window
+        refinement = RefinementOperations(self._queue)
+        self.examine, self.prolong = refinement.examine, refinement.prolong
 
     # -- filter ------------------------------------------------------------------------------------------------------
 
@@ -285,23 +290,21 @@ class WarpBackend:
         parameters: RaycastParameters,
     ) -> RaycastResult:
         """See ``Backend.raycast``."""
-        lattice, camera, (height, width) = self._lattice(grid), camera_of(intrinsics), size
-        to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
-        tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
-        near = wp.full(tiles, float(raycasting.INFINITE), dtype=wp.float32, device=self.device)
-        far = wp.zeros(tiles, dtype=wp.float32, device=self.device)
-        limits = float(parameters.depth_min), float(parameters.depth_max)
-        self._launch(
-            surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height,
-            width, radius, *limits, near, far,
-        )  # fmt: skip
-        depth, color = self._empty(size), self._empty((*size, 3), wp.uint8)
-        normals = self._empty(size, wp.vec3)
-        self._launch(
-            surface.trace, size, lattice, resident(grid.colors, self.device), camera, motion_of(to_lattice), near, far,
-            *limits, grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1), depth, color, normals,
-        )  # fmt: skip
-        return RaycastResult(self._down(depth), self._down(color), self._down(normals))
+        arguments = T_world_camera, intrinsics, size, parameters
+        return views.raycast(self._queue, self._lattice(grid), grid, None, *arguments)
+
+    def raycast_levels(
+        self,
+        grid: VoxelGrid,
+        levels: FinerLevels,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: NDArray[np.float32],
+        size: tuple[int, int],
+        parameters: RaycastParameters,
+    ) -> RaycastResult:
+        """See ``LevelBackend.raycast_levels``."""
+        arguments = T_world_camera, intrinsics, size, parameters
+        return views.raycast(self._queue, self._lattice(grid), grid, levels, *arguments)
 
     # -- helpers -----------------------------------------------------------------------------------------------------
 

@@ -1,5 +1,6 @@
 """A device with the CPU behind it: what the device cannot do is done there, and the run goes on."""
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -13,6 +14,7 @@ from dudmap.kernels import block_index
 from dudmap.kernels.backend import OPERATIONS
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.evidence import ReadingNoise
+from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     DepthView,
@@ -48,10 +50,12 @@ class FallbackBackend:
         self.device = device
         self._on_device, self._on_cpu = WarpBackend(device), CpuBackend()
         self._is_full = False
-        self._num_fused = self._num_kept = 0
+        self._num_fused, self._num_kept = Counter[float](), Counter[float]()  # by the voxel size of the level
 
     def perform(self, name: str, arguments: tuple[Any, ...]) -> Any:  # noqa: ANN401
         """Result of an operation of ``Backend``."""
+        if self._is_full:
+            self._leave(arguments)  # also finer levels that were not among the arguments before
         if not (self._is_full or faults.is_lost(self.device)):
             try:
                 result = getattr(self._on_device, name)(*arguments)
@@ -108,9 +112,11 @@ class FallbackBackend:
 
     def _keep(self, grid: VoxelGrid) -> None:
         """Bring the voxels to the host now and then."""
-        self._num_fused += 1
-        if self._num_fused - self._num_kept >= min(max(self._num_kept, 1), KEPT_EVERY):
-            self._num_kept = self._num_fused
+        level = grid.voxel_size
+        self._num_fused[level] += 1
+        kept = self._num_kept[level]
+        if self._num_fused[level] - kept >= min(max(kept, 1), KEPT_EVERY):
+            self._num_kept[level] = self._num_fused[level]
             grid.on_host()
 
 
@@ -161,7 +167,7 @@ class _Residuals:
 
 def _mirrors(arguments: tuple[Any, ...]) -> list[Mirror]:
     """Arrays of the map among the arguments of an operation, which may have a copy on a device."""
-    values = [value for one in arguments for value in (one if isinstance(one, VoxelGrid) else (one,))]
+    values = [value for one in arguments for value in (one if isinstance(one, VoxelGrid | FinerLevels) else (one,))]
     return [value for value in values if isinstance(value, Mirror)]
 
 

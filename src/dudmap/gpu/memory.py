@@ -16,7 +16,7 @@ from dudmap.gpu.faults import DeviceFullError
 from dudmap.gpu.kernels import rows as kernels
 from dudmap.gpu.staging import WARP_TYPES, Staging
 from dudmap.gpu.streams import Queue, main_queue
-from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.mirror import DeviceCopy, Mirror
 
 SPARE = 1.2
 """Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
@@ -174,19 +174,19 @@ class RowCopy:
         self.pull(self._host)
         return self._wide(self._host)[rows, columns]
 
-    def max_rows(self) -> int | None:
+    def max_rows(self, others: Sequence[DeviceCopy]) -> int | None:
         """See ``mirror.DeviceCopy``; it is told that the map has reached the bound.
 
         The device must finish all its work to answer, so that it is asked after the map has grown only.
         """
-        size = len(self.array)
+        size = len(self.array) + sum(len(other.array) for other in others if isinstance(other, RowCopy))
         if self._checked_rows == (size,) * CHECKS:
             return None
         free, own = free_memory(self.device), 2 * size * self._row_bytes()  # geometry and colours
         if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
             self._checked_rows = (*self._checked_rows[1 - CHECKS :], size)
             return None
-        rows = int(USED * len(self.array))
+        rows = int(USED * size)
         faults.tell(
             f"{self.device} has room for {rows} blocks of the map; those farthest from the camera wait on disk, "
             "as with --max-memory"

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.kernels.block_index import IndexBackend
 from dudmap.kernels.label_backend import LabelBackend
+from dudmap.kernels.level_backend import LevelBackend
 from dudmap.kernels.links import Neighbours
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
@@ -29,8 +30,9 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(LabelBackend, IndexBackend, Protocol):
-    """Operations of a compute device, with those on the label image and those that number blocks.
+class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
+    """Operations of a compute device, with those on the label image, on maps with several voxel sizes, and those that
+    number blocks.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -310,6 +312,6 @@ class Backend(LabelBackend, IndexBackend, Protocol):
         ...
 
 
-_PROTOCOLS = Backend, LabelBackend, IndexBackend
+_PROTOCOLS = Backend, LabelBackend, IndexBackend, LevelBackend
 OPERATIONS = tuple(name for protocol in _PROTOCOLS for name in vars(protocol) if not name.startswith("_"))
 """Names of all operations."""

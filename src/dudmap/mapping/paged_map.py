@@ -1,6 +1,6 @@
 """The blocks of a map, of which those far from the view may wait on disk: which are in memory, and reading them all."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from dudmap.mapping.block_index import BlockIndex
 from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
 from dudmap.mapping.block_tree import BlockTree
 from dudmap.mapping.block_window import BlockWindow
+from dudmap.mapping.fine_blocks import FineBlocks
 from dudmap.mapping.integrator import Integrator
 from dudmap.mapping.voxel_blocks import BlockRecords, VoxelBlocks
 
@@ -20,6 +21,7 @@ class PagedMap:
 
     config: VolumeConfig
     backend: Backend
+    levels: Sequence[FineBlocks]
     pager: BlockPager | None
     block_size: float
     _index: BlockIndex
@@ -90,7 +92,8 @@ class PagedMap:
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
         """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
-        if self.pager is None and (room := self._index.held.colors_mirror.max_rows):
+        finer = [level.blocks.colors_mirror for level in self.levels]
+        if self.pager is None and (room := self._index.held.colors_mirror.max_rows(finer)):
             self.pager, self._index.on_host = BlockPager(room), True
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)

@@ -14,7 +14,19 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.kernels import evidence, filtering, labeling, pixel, raycasting, residual, sampling, segmentation, voxel
+from dudmap.kernels import (
+    evidence,
+    filtering,
+    finest,
+    labeling,
+    pixel,
+    raycasting,
+    refinement,
+    residual,
+    sampling,
+    segmentation,
+    voxel,
+)
 from dudmap.kernels import surface as vertex
 
 wp.set_module_options({"enable_backward": False})
@@ -71,8 +83,8 @@ _NUMPY = types.SimpleNamespace(
 )  # fmt: skip
 """What the formulas use of NumPy, and of ``math``. Indices of 64 bits fit into 32 there."""
 _OF_NUMPY = {
-    np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.floor: wp.floor, np.sqrt: wp.sqrt,
-    np.exp: wp.exp,
+    np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.int64: wp.int32, np.floor: wp.floor,
+    np.sqrt: wp.sqrt, np.exp: wp.exp,
 }  # fmt: skip
 _OWN = {"bits": bits, "upper_half": upper_half}
 _compiled: dict[Dispatcher | types.FunctionType, wp.Function] = {}
@@ -131,3 +143,8 @@ step_length, corner_gradient = warp_function(raycasting.step_length), warp_funct
 to_block_boundary = warp_function(raycasting.to_block_boundary)
 crossing, mixed_channel = warp_function(vertex.crossing), warp_function(vertex.mixed_channel)
 slope = warp_function(vertex.slope)
+half_word, quarter_word = warp_function(finest.half_word), warp_function(finest.quarter_word)
+finest_at = warp_function(finest.finest_at)
+distance_bend, intensity_bend = warp_function(refinement.distance_bend), warp_function(refinement.intensity_bend)
+root_mean = warp_function(refinement.root_mean)
+mean_voxel, mean_color = warp_function(refinement.mean_voxel), warp_function(refinement.mean_color)
