@@ -354,19 +354,6 @@ class Config(ConfigSection):
     submaps: SubmapsConfig = SubmapsConfig()
     movers: MoversConfig = MoversConfig()
 
-    @property
-    def compute_device(self) -> str:
-        """The device, where ``auto`` is the CPU for maps with several voxel sizes, which no GPU computes.
-
-        Raises:
-            ConfigError: Such a map is to be computed on a GPU.
-        """
-        if not self.volume.adaptive:
-            return self.device
-        if self.device not in ("auto", "cpu"):
-            raise ConfigError(f"volume.adaptive is computed on the CPU, not on {self.device}; take --device cpu")
-        return "cpu"
-
     @classmethod
     def load(cls, path: str | Path) -> "Config":
         """Configuration of a TOML file; parameters it does not set keep the value of its preset.

@@ -90,7 +90,7 @@ class Slam(SlamResults):
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        self.device = config.compute_device
+        self.device = config.device
         backend = make_backend(self.device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera

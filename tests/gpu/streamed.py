@@ -17,8 +17,8 @@ from warp._src.context import invoke
 
 NAME = "cuda:0"
 MODULES = (
-    "backend", "clock", "components", "descent", "labels", "linearization", "memory", "meshing", "preparation",
-    "staging", "streams",
+    "backend", "block_loops", "clock", "components", "descent", "labels", "linearization", "memory", "meshing",
+    "numbering", "preparation", "refinement", "staging", "streams", "views",
 )  # fmt: skip
 """Modules that call Warp."""
 

@@ -11,6 +11,7 @@ pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has 
 pytestmark = pytest.mark.skipif(bool(obstacle()), reason=f"no GPU: {obstacle()}")
 make_backend("warp-cpu")
 
+from test_levels import everything
 from test_streams import processed, same
 
 from dudmap.gpu import faults, sequence
@@ -59,6 +60,11 @@ def test_another_thread_may_prepare(recording, found, told):
     for _ in range(5):
         with ThreadPoolExecutor(1) as reader:
             assert same(processed(NAME, recording, reader.submit), found)
+    assert told == []
+
+
+def test_maps_with_several_voxel_sizes_are_equal(recording, told):
+    assert same(everything(recording, NAME), everything(recording, NAME))
     assert told == []
 
 

@@ -282,7 +282,8 @@ def test_the_farthest_blocks_leave_a_device_that_is_full(monkeypatch, told):
     per_row = 2 * 512 * 4  # geometry and colours
 
     def free(device):
-        copies = paged.blocks.geometry_mirror.copy, paged.blocks.colors_mirror.copy
+        blocks = paged._index.held
+        copies = blocks.geometry_mirror.copy, blocks.colors_mirror.copy
         return 1.25 * 2304 * per_row - sum(copy.array.size * 4 for copy in copies if copy is not None)
 
     monkeypatch.setattr(memory, "free_memory", free)

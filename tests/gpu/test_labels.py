@@ -21,7 +21,7 @@ from dudmap.gpu import faults
 from dudmap.gpu.backend import WarpBackend
 from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import HostQueue
-from dudmap.kernels.evidence import BINS, EvidenceParameters
+from dudmap.kernels.evidence import BINS, EvidenceParameters, NoiseParameters
 from dudmap.kernels.parameters import SURFACE, UNKNOWN, MapSample
 from dudmap.kernels.reprojection import ReprojectionTarget
 from dudmap.kernels.segmentation import SegmentImage
@@ -58,6 +58,30 @@ def older(recording, cpu):
     ]
 
 
+@pytest.mark.parametrize("scale", [0.0, 0.0019])
+def test_the_noise_of_readings_is_that_of_the_cpu(cpu, gpu, depth, scale):
+    """To rounding; the images come down when they are read, also after the device was lost."""
+    parameters = NoiseParameters(0.001, scale, 6.4e-5, 3.0, 0.05, 0.02, 3.0, 1.5, 0.01)
+    expected, found = cpu.reading_noise(depth, parameters), gpu.reading_noise(depth, parameters)
+    for one, other in zip(expected, found, strict=True):
+        assert one.dtype == np.float32
+        np.testing.assert_allclose(np.asarray(other), one, rtol=3e-7)
+    z = depth.astype(np.float64)
+    np.testing.assert_allclose(expected.sigma, np.hypot(0.001 + scale * z**2, 0.008), rtol=1e-6)
+    assert (expected.bounded_sigma >= np.float32(0.01)).all()
+    assert (expected.gap >= np.float32(0.03)).all()
+
+
+def test_noise_that_is_lost_with_the_device_is_computed_anew(cpu, gpu, depth, monkeypatch):
+    parameters = NoiseParameters(0.001, 0.0019, 6.4e-5, 3.0, 0.05, 0.02, 3.0, 1.5, 0.01)
+    found, device = gpu.reading_noise(depth, parameters), Device(monkeypatch)
+    device.breaks(LOST)
+    with faults.told_to(lambda sentence: None):
+        for one, other in zip(cpu.reading_noise(depth, parameters), found, strict=True):
+            np.testing.assert_array_equal(np.asarray(other), one)
+    faults.forget()
+
+
 def tolerances(depth):
     return (0.01 + 0.02 * depth).astype(np.float32)
 
@@ -66,7 +90,8 @@ def labelled(backend, frame, depth, older):
     """Everything that the labels of a frame need from a device."""
     sample, sigma = frame
     noise, tolerance = np.full(SHAPE, 0.05, np.float32), tolerances(depth)
-    counts = backend.residual_counts(sample, depth, sigma)
+    made = backend.reading_noise(depth, NoiseParameters(0.002, 0.002, 0.0, 3.0, 0.02, 0.02, 3.0, 1.5, 0.01))
+    counts = backend.residual_counts(sample, depth, made.sigma)
     free = backend.free_space(depth, np.zeros(SHAPE, np.float32), CAMERA.intrinsics, noise, older, 3)
     odds = backend.log_odds(sample, sigma, PARAMETERS, True, free)
     probability = backend.label(odds, depth, tolerance, 4.0, 4)
@@ -76,7 +101,7 @@ def labelled(backend, frame, depth, older):
     before = backend.seen_marked(depth, depth, CAMERA.intrinsics, older[0], 0.1)
     in_segments = backend.segment_counts(labels, count, (before, moving))
     started = in_segments[2] > 0.3 * in_segments[0]
-    segments = SegmentImage(labels, count, sigma, np.ascontiguousarray(depth / 10), 3)
+    segments = SegmentImage(labels, count, made.bounded_sigma, np.ascontiguousarray(depth / 10), 3)
     known, sums = backend.compare_segments(sample, segments, started, moving, depth, (0.98, 0.01))
     others = backend.compare_with_frame(depth, depth, CAMERA.intrinsics, older[1], segments, 4)
     images = [np.asarray(image) for image in (free, odds, before, known)]

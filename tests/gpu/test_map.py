@@ -5,11 +5,15 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dudmap.gpu.device import make_backend
+from dudmap.kernels.links import links
 from dudmap.kernels.parameters import RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from small_maps import CAMERA, CONFIG, integrated, voxels
 
-pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
+make_backend("warp-cpu")
+
+from dudmap.gpu.meshing import Meshing
 
 
 def registration(volume, tukey):
@@ -116,14 +120,47 @@ def test_meshes_are_equal(maps):
     np.testing.assert_allclose(found.normals, expected.normals, atol=1e-5)
 
 
-def test_chunks_are_equal(maps):
-    other = on_device(maps[0], maps[1].backend)
-    count = maps[0].num_blocks
-    chunks = np.where(np.arange(count) % 5 == 4, -1, np.arange(count) % 3).astype(np.int64)
-    expected, found = (volume.extract_chunks(volume.active_slots, chunks) for volume in (maps[0], other))
+@pytest.mark.parametrize("seed", range(4))
+def test_chunks_are_equal(maps, seed):
+    """Of any blocks, some of which only lend their voxels; there are chunks without blocks and without faces."""
+    other, random = on_device(maps[0], maps[1].backend), np.random.default_rng(seed)
+    slots = random.permutation(maps[0].active_slots)
+    chunks = random.integers(-1, 10 * 4**seed // 4, len(slots))
+    chunks[chunks == 3] = 4
+    expected = maps[0].extract_chunks(slots, chunks, 1)
+    found = other.extract_chunks(other.slots_at(maps[0].blocks.slot_coords[slots]), chunks, 1)
+    assert len(found) == chunks.max() + 1
+    assert sum(len(mesh.faces) for mesh in found) > 1000
     for a, b in zip(expected, found, strict=True):
         np.testing.assert_array_equal(b.faces, a.faces)
+        np.testing.assert_array_equal(b.colors, a.colors)
         np.testing.assert_allclose(b.vertices, a.vertices, atol=1e-6)
+        np.testing.assert_allclose(b.normals, a.normals, atol=1e-5)
+
+
+def test_no_blocks_have_no_mesh(maps):
+    nothing = np.empty(0, np.int32)
+    for volume in maps:
+        assert volume.extract_chunks(nothing, nothing.astype(np.int64)) == []
+        (mesh,) = volume.extract_chunks(volume.active_slots[:1], np.zeros(1, np.int64), 200)
+        assert len(mesh.faces) == len(mesh.vertices) == 0
+
+
+@pytest.mark.parametrize("spread", [2, 6, 1 << 17])
+def test_links_of_blocks_are_those_of_the_host(spread):
+    """Dense and scattered blocks, also with negative coordinates, in slots of any order."""
+    random = np.random.default_rng(spread)
+    coords = np.unique(random.integers(-spread, spread, (300, 3)), axis=0).astype(np.int32)
+    coords = np.unique(np.concatenate([coords, coords[:50] + np.array([1, 0, 1], np.int32)]), axis=0)
+    num_slots = 2 * len(coords)
+    slots = random.permutation(num_slots)[: len(coords)].astype(np.int32)
+    at = {tuple(place): slot for place, slot in zip(coords.tolist(), slots.tolist(), strict=True)}
+    steps = [(m >> 2, (m >> 1) & 1, m & 1) for m in range(8)]
+    ahead = [[at.get((x + a, y + b, z + c), -1) for a, b, c in steps] for x, y, z in coords.tolist()]
+    _, near, behind, row_of = links(slots, np.array(ahead), num_slots)
+    found = Meshing("cpu")._links(wp.array(slots), wp.array(coords), num_slots)
+    for array, expected in zip(found, (near, behind, row_of), strict=True):
+        np.testing.assert_array_equal(array.numpy(), expected)
 
 
 def test_the_mesh_of_a_map_made_on_the_device_is_within_a_quarter_voxel(maps):

@@ -88,13 +88,13 @@ def test_memory_is_asked_for_when_the_map_has_grown(mirror, monkeypatch):
     monkeypatch.setattr(memory, "free_memory", lambda device: asked.append(device) or 1 << 40)
     resident(mirror, "cpu")
     asked.clear()
-    assert [mirror.max_rows for _ in range(5)] == [None] * 5
+    assert [mirror.max_rows() for _ in range(5)] == [None] * 5
     assert len(asked) == 2
     mirror.grow(6, -1)
     mirror.use(6)
     resident(mirror, "cpu")
     asked.clear()
-    assert [mirror.max_rows for _ in range(5)] == [None] * 5
+    assert [mirror.max_rows() for _ in range(5)] == [None] * 5
     assert len(asked) == 2
     monkeypatch.setattr(memory, "free_memory", lambda device: 10)
     mirror.grow(9, -1)
@@ -102,4 +102,4 @@ def test_memory_is_asked_for_when_the_map_has_grown(mirror, monkeypatch):
     monkeypatch.setattr(memory, "has_room", lambda num_bytes, device: True)
     resident(mirror, "cpu")
     with faults.told_to(lambda sentence: None):
-        assert mirror.max_rows is not None
+        assert mirror.max_rows() is not None

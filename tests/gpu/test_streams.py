@@ -77,8 +77,12 @@ def processed(device, recording, submit=at_once):
         volume.integrate(SimpleNamespace(depth=view.levels[1][0], color=view.color), T)
         found += [image.copy() for level in view.levels for image in level]
         del view
-    mesh = volume.extract_mesh(1)
-    return [*found, volume.blocks.geometry.copy(), mesh.vertices, mesh.colors, volume.raycast(T).depth]
+    mesh, slots = volume.extract_mesh(1), volume.active_slots
+    parts = volume.extract_chunks(slots, slots.astype(np.int64) % 5 - 1, 1)
+    chunks = [array for part in parts for array in (part.vertices, part.faces)]
+    index = [array.copy() for array in volume.blocks.arrays(volume.window.near)]
+    voxels = volume.window.cells, volume.blocks.geometry.copy()
+    return [*found, *index, *voxels, mesh.vertices, mesh.colors, *chunks, volume.raycast(T).depth]
 
 
 @pytest.fixture(scope="module")

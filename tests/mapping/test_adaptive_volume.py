@@ -5,7 +5,6 @@ import pytest
 
 from dudmap import synthetic
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.errors import ConfigError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.mapping.adaptive_volume import AdaptiveVolume
@@ -197,12 +196,6 @@ def test_views_are_those_of_the_smaller_voxels():
         normal = (rays * view.depth[..., None] - (0, 0, 0.6)) / 0.1
         assert np.median(np.sum(normal * view.normals, axis=-1)[hit]) > 0.99
     assert depths[1] < 0.3 * depths[0]
-
-
-def test_what_is_not_supported_is_said_in_one_sentence():
-    with pytest.raises(ConfigError, match="on the CPU, not on cuda; take --device cpu"):
-        Slam(CAMERA, Config().override(["volume.adaptive=true", "device=cuda"]))
-    assert Config().override(["volume.adaptive=true"]).compute_device == "cpu"
 
 
 def test_colours_can_be_replaced_where_the_other_map_is_not_refined():

@@ -27,7 +27,7 @@ BYTES_PER_THREAD = {
     "tile_ranges": 268, "reading_weights": 5, "pack_pixels": 16, "integrate": 8, "linearize": 288,
     "linearize_trial": 288, "sample": 17,
     "first_spins": 8, "mean_field_sweep": 20, "probabilities": 8, "trace": 19, "classify": 9, "find_vertices": 10,
-    "scatter": 8, "gather": 8,
+    "trace_levels": 19, "prolong": 8, "scatter": 8, "gather": 8,
 }  # fmt: skip
 """Bytes that each thread of a kernel must read and write at least: its elements of each image and each sum once, and
 the words of the voxels that belong to it alone; not those of the map that neighbouring pixels share."""

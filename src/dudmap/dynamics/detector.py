@@ -24,12 +24,22 @@ from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.kernels import labeling
 from dudmap.kernels.backend import Backend
-from dudmap.kernels.evidence import EDGES, EvidenceParameters, noise_limit
+from dudmap.kernels.evidence import (
+    EDGES,
+    EvidenceParameters,
+    NoiseParameters,
+    ReadingNoise,
+    edge_tolerance,
+    noise_limit,
+    static_sigma,
+)
 from dudmap.kernels.threads import submit
 from dudmap.mapping.volume import FREE, MapSample, TsdfVolume
 
 MAX_DISPLACEMENT = 0.1
 """Largest distance of a point from the last frame's reading of it, metres: 3 m/s at 30 frames per second."""
+MAX_GAP = 1.5
+"""Largest depth difference of two readings of one point, in units of the distance below which nothing is motion."""
 MAP_ROUGHNESS = 0.4
 """Standard deviation of the map's surface, voxels."""
 DEPTH_EDGE_SIGMAS, DEPTH_EDGE_SLOPE = 3, 0.02
@@ -63,8 +73,7 @@ class _Comparison:
         T_world_camera: (4, 4).
         exposure: Gain and offset that make the image's intensities those of the map.
         sample: The map at the points of the image.
-        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
-        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        noise: Of the readings.
     """
 
     timestamp: float
@@ -72,8 +81,7 @@ class _Comparison:
     T_world_camera: NDArray[np.float64]
     exposure: tuple[float, float]
     sample: MapSample
-    sigma: NDArray[np.float32]
-    tolerance: NDArray[np.float32]
+    noise: ReadingNoise
 
     @property
     def free(self) -> NDArray[np.bool_]:
@@ -156,22 +164,22 @@ class DynamicDetector:
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        sigma, backend = distance_sigma(self.sensor, level.depth, volume.voxel_size), volume.backend
-        tolerance = depth_tolerance(sigma, level)
-        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, sigma, tolerance)
-        histogram, unknown = backend.residual_counts(sample, level.depth, sigma)
+        backend = volume.backend
+        noise = backend.reading_noise(level.depth, self._noise_parameters(level, volume.voxel_size))
+        frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, noise)
+        histogram, unknown = backend.residual_counts(sample, level.depth, noise.sigma)
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, EDGES)
         evidence = self._evidence(backend, frame, mixture, unknown)
-        probability = backend.label(evidence, level.depth, tolerance, COUPLING, SWEEPS)
+        probability = backend.label(evidence, level.depth, noise.tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
         if self.config.regions:
             seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
             least = MIN_REGION * seeds.size
-            dynamic = backend.moving_regions(seeds, evidence, level.depth, tolerance, least, SEEDED_SHARE)
+            dynamic = backend.moving_regions(seeds, evidence, level.depth, noise.tolerance, least, SEEDED_SHARE)
             if self.config.pieces:
                 dynamic, segments = self._segments(backend, frame, dynamic, seeds, segmentation())
             if moving is not None:
@@ -209,6 +217,15 @@ class DynamicDetector:
         self.memory.reset()
         self.background.reset()
 
+    def _noise_parameters(self, level: Level, voxel_size: float) -> NoiseParameters:
+        """What the noise of the readings of an image follows from, with a map whose voxels have that edge, metres."""
+        config, sensor = self.config, self.sensor
+        return NoiseParameters(
+            sensor.sigma_base, sensor.sigma_scale, (MAP_ROUGHNESS * voxel_size) ** 2, DEPTH_EDGE_SIGMAS,
+            DEPTH_EDGE_SLOPE / pixel_scale(level), config.noise_threshold, config.noise_sigmas, MAX_GAP,
+            config.noise_threshold / 3,
+        )  # fmt: skip
+
     def _evidence(self, backend: Backend, frame: _Comparison, mixture: Mixture, unknown: float) -> NDArray[np.float32]:
         """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown.
 
@@ -217,12 +234,11 @@ class DynamicDetector:
         """
         config, level, seen_free = self.config, frame.level, None
         if config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown)):
-            max_gap = np.float32(1.5) * noise_threshold(config, frame.sigma)
-            seen_free = self.memory.seen_free(backend, level, frame.T_world_camera, max_gap, older)
+            seen_free = self.memory.seen_free(backend, level, frame.T_world_camera, frame.noise.gap, older)
         parameters = EvidenceParameters(
             *mixture.coefficients, MAX_LOG_ODDS, config.noise_threshold, config.noise_sigmas
         )
-        return backend.log_odds(frame.sample, frame.sigma, parameters, config.free_space, seen_free)
+        return backend.log_odds(frame.sample, frame.noise.sigma, parameters, config.free_space, seen_free)
 
     def _segments(
         self,
@@ -245,7 +261,7 @@ class DynamicDetector:
         if split is not segmentation:
             segmentation, counts = split, backend.segment_counts(split.labels, split.count, (before, seeds))
         size, labels = np.maximum(counts[0], 1), segmentation.labels
-        sigma = np.maximum(np.float32(self.config.noise_threshold / 3), frame.sigma)
+        sigma = frame.noise.bounded_sigma
         dynamic, sums = backend.compare_segments(
             frame.sample, segmentation.with_noise(sigma), counts[2] / size >= STARTED_SHARE, dynamic, level.intensity,
             frame.exposure,
@@ -263,7 +279,8 @@ class DynamicDetector:
         import cv2
 
         level = frame.level
-        distance, noise = np.abs(np.nan_to_num(frame.sample.distance)), noise_threshold(self.config, frame.sigma)
+        distance = np.abs(np.nan_to_num(frame.sample.distance))
+        noise = noise_threshold(self.config, np.asarray(frame.noise.sigma))
         rim = 0.95 * truncation  # a stored distance never exceeds the truncation
         marked = (distance > min(self.config.threshold, rim)) | frame.free
         width = level.camera.width
@@ -276,13 +293,14 @@ class DynamicDetector:
 
 def distance_sigma(sensor: SensorConfig, depth: NDArray[np.float32], voxel_size: float) -> NDArray[np.float32]:
     """Standard deviation (h, w) of the distance of a static point, metres: of the reading and of the map."""
-    return np.asarray(np.sqrt(np.square(sensor.sigma(depth)) + (MAP_ROUGHNESS * voxel_size) ** 2), np.float32)
+    map_variance = (MAP_ROUGHNESS * voxel_size) ** 2
+    return np.asarray(static_sigma(depth, sensor.sigma_base, sensor.sigma_scale, map_variance), np.float32)
 
 
 def depth_tolerance(sigma: NDArray[np.float32], level: Level) -> NDArray[np.float32]:
     """Largest depth step (h, w) to a neighbour of the same surface, metres; ``sigma`` (h, w) is that of the depth."""
     slope = np.float32(DEPTH_EDGE_SLOPE / pixel_scale(level))
-    return np.asarray(DEPTH_EDGE_SIGMAS * sigma + slope * level.depth, np.float32)
+    return np.asarray(edge_tolerance(sigma, level.depth, DEPTH_EDGE_SIGMAS, slope), np.float32)
 
 
 def noise_threshold(config: DynamicsConfig, sigma: NDArray[np.float32]) -> NDArray[np.float32]:

@@ -7,7 +7,19 @@ import warp as wp  # pyright: ignore[reportMissingImports]
 
 MODULES = tuple(
     f"dudmap.gpu.kernels.{name}"
-    for name in ("images", "fusion", "surface", "labels", "components", "descent", "cubes", "rows")
+    for name in (
+        "images",
+        "fusion",
+        "blocks",
+        "surface",
+        "labels",
+        "components",
+        "descent",
+        "cubes",
+        "levels",
+        "links",
+        "rows",
+    )
 )
 """Modules that hold kernels."""
 

@@ -1,8 +1,7 @@
 """The back end for GPUs: Warp kernels behind the operations of ``kernels/backend.py``.
 
 The map stays on the device (``memory.py``); images that the device computed are not uploaded again. What is not ported
-is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs, and the division of a mesh
-into chunks.
+is delegated to the CPU's back end by name: ``color_pixels``, whose results the CPU needs.
 """
 
 # Warp's annotations name float where any type of number is meant
@@ -15,20 +14,24 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
+from dudmap.gpu import views
+from dudmap.gpu.block_loops import BlockLoops
 from dudmap.gpu.descent import DeviceDescent
 from dudmap.gpu.kernels import fusion, surface
 from dudmap.gpu.kernels.formulas import motion_of
-from dudmap.gpu.kernels.structs import Lattice, camera_of, struct
+from dudmap.gpu.kernels.structs import camera_of, struct
 from dudmap.gpu.labels import LabelOperations
 from dudmap.gpu.linearization import Linearization
-from dudmap.gpu.memory import Images, resident, users_of, wrote
-from dudmap.gpu.meshing import extract_surface
+from dudmap.gpu.memory import DeviceImage, Images, users_of, wrote
+from dudmap.gpu.meshing import Meshing
+from dudmap.gpu.numbering import BlockNumbering, IndexCopy
 from dudmap.gpu.preparation import Preparation
+from dudmap.gpu.refinement import RefinementOperations
 from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import main_queue
-from dudmap.kernels import meshing, raycasting, visibility
+from dudmap.kernels import visibility
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.parameters import (
     BLOCK,
     Damping,
@@ -39,8 +42,6 @@ from dudmap.kernels.parameters import (
     FusedBlocks,
     FusionParameters,
     MapSample,
-    MeshArrays,
-    MeshParameters,
     NormalEquations,
     RaycastParameters,
     RaycastResult,
@@ -67,15 +68,20 @@ class WarpBackend:
         self._host = CpuBackend()
         self.color_pixels = self._host.color_pixels
         labels = LabelOperations(self._images, self._queue, self._staging)
-        self.residual_counts, self.free_space, self.log_odds = (
-            labels.residual_counts,
-            labels.free_space,
-            labels.log_odds,
-        )
+        self.reading_noise, self.residual_counts = labels.reading_noise, labels.residual_counts
+        self.free_space, self.log_odds = labels.free_space, labels.log_odds
         self.label, self.moving_regions = labels.label, labels.moving_regions
         self.seen_marked, self.segment_counts = labels.seen_marked, labels.segment_counts
         self.compare_segments, self.compare_with_frame = labels.compare_segments, labels.compare_with_frame
-        self._marks = wp.zeros(0, dtype=wp.int32, device=device)
+        meshing = Meshing(device)
+        self.extract_mesh, self.extract_chunks = meshing.extract_mesh, meshing.extract_chunks
+        self._loops = BlockLoops(self._queue, self._up)
+        self._lattice, self._marked = self._loops.lattice, self._loops.marked
+        numbering = BlockNumbering(self._loops)
+        self.allocate_touched, self.fuse_near = numbering.allocate_touched, numbering.fuse_near
+        self.record_free, self.place_window = numbering.record_free, numbering.place_window
+        refinement = RefinementOperations(self._queue)
+        self.examine, self.prolong = refinement.examine, refinement.prolong
 
     # -- filter ------------------------------------------------------------------------------------------------------
 
@@ -130,13 +136,13 @@ class WarpBackend:
 
     def reading_weights(
         self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
-    ) -> NDArray[np.uint8]:
-        """See ``Backend.reading_weights``."""
+    ) -> Any:  # noqa: ANN401 - a DeviceImage stands for an array
+        """See ``Backend.reading_weights``; the image stays on the device."""
         out = self._empty(depth.shape, wp.uint8)
         self._launch(
             fusion.reading_weights, depth.shape, self._up(depth), camera_of(intrinsics), struct(noise), best, out
         )
-        return self._images.down(out)
+        return DeviceImage(out, self._queue)
 
     def touched_cells(
         self,
@@ -150,7 +156,7 @@ class WarpBackend:
     ) -> NDArray[np.int32]:
         """See ``Backend.touched_cells``; marks on the device take the place of ``stamps``, which stay as they are."""
         lattice, p = self._lattice(grid), parameters
-        marks = self._cleared_marks(lattice.cells.size)
+        marks = self._loops.cleared_marks(lattice.cells.size)
         shape = -(-view.depth.shape[0] // stride), -(-view.depth.shape[1] // stride)
         self._launch(
             fusion.mark_cells, shape, self._up(view.depth), camera_of(view.intrinsics),
@@ -172,26 +178,15 @@ class WarpBackend:
         parameters: FusionParameters,
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
-        p, (height, width) = struct(parameters), view.depth.shape
-        camera, t = camera_of(view.intrinsics), motion_of(view.T_camera_world)
-        coords, slots = wp.array(grid.slot_coords, device=self.device), wp.array(candidates, device=self.device)
-        marks, repeats = self._empty(len(candidates), wp.int32), self._empty(len(candidates))
-        self._launch(
-            fusion.visible_slots, len(candidates), slots, coords, self._bytes(fused), turn, t, camera, height, width,
-            BLOCK * parameters.voxel_size, view.tiles.farthest, p, marks, repeats,
-        )  # fmt: skip
-        visible = self._marked(marks)
-        pixels = self._empty((height * width, 2), wp.int32)
-        images_ = self._up(view.depth), self._up(color), self._up(weights)
-        self._launch(fusion.pack_pixels, (height, width), *images_, p, pixels)
+        slots, coords = wp.array(candidates, device=self.device), wp.array(grid.slot_coords, device=self.device)
+        shift = wp.vec3i(0, 0, 0)  # the coordinates are those of the view already
+        visible, repeats = self._loops.visible(view, slots, coords, shift, self._bytes(fused), turn, parameters)
         occupied = wp.zeros(len(visible), dtype=wp.int32, device=self.device)
         written = candidates[self._down(visible)]
         # Nothing may fail for lack of memory from here on: the CPU would fuse the frame a second time.
-        self._launch(
-            fusion.integrate, (len(visible), BLOCK**3), visible, slots, repeats, float(count), coords, t, camera,
-            height, width, pixels, resident(grid.geometry, self.device), resident(grid.colors, self.device), p,
-            occupied,
-        )  # fmt: skip
+        self._loops.average(
+            grid, view, color, weights, visible, slots, repeats, count, coords, shift, parameters, occupied
+        )
         wrote(grid.geometry, self.device, written)
         wrote(grid.colors, self.device, written)
         return FusedBlocks(written, self._down(occupied))
@@ -207,7 +202,7 @@ class WarpBackend:
     ) -> NDArray[np.int32]:
         """See ``Backend.observe_free``."""
         lattice, p, (height, width) = self._lattice(grid), parameters, view.depth.shape
-        marks, counts = self._cleared_marks(lattice.cells.size), self._bytes(grid.free_count)
+        marks, counts = self._loops.cleared_marks(lattice.cells.size), self._bytes(grid.free_count)
         self._launch(
             fusion.observe_free, (int(grid.shape[0]) // 2, int(grid.shape[1])), lattice,
             wp.vec3i(*(int(n) for n in grid.origin)), parity, motion_of(view.T_camera_world),
@@ -281,7 +276,7 @@ class WarpBackend:
         out = self._empty(depth.shape), self._empty(depth.shape), self._empty(depth.shape, wp.uint8)
         self._launch(
             surface.sample, depth.shape, self._up(depth), self._up(intensity), camera_of(intrinsics),
-            motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._bytes(grid.free_count),
+            motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._free_counts(grid),
             free_after, *out,
         )  # fmt: skip
         return MapSample(*self._images.down_all(out, self._staging))
@@ -295,49 +290,21 @@ class WarpBackend:
         parameters: RaycastParameters,
     ) -> RaycastResult:
         """See ``Backend.raycast``."""
-        lattice, camera, (height, width) = self._lattice(grid), camera_of(intrinsics), size
-        to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
-        tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
-        near = wp.full(tiles, float(raycasting.INFINITE), dtype=wp.float32, device=self.device)
-        far = wp.zeros(tiles, dtype=wp.float32, device=self.device)
-        limits = float(parameters.depth_min), float(parameters.depth_max)
-        self._launch(
-            surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height,
-            width, radius, *limits, near, far,
-        )  # fmt: skip
-        depth, color = self._empty(size), self._empty((*size, 3), wp.uint8)
-        normals = self._empty(size, wp.vec3)
-        self._launch(
-            surface.trace, size, lattice, resident(grid.colors, self.device), camera, motion_of(to_lattice), near, far,
-            *limits, grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1), depth, color, normals,
-        )  # fmt: skip
-        return RaycastResult(self._down(depth), self._down(color), self._down(normals))
+        arguments = T_world_camera, intrinsics, size, parameters
+        return views.raycast(self._queue, self._lattice(grid), grid, None, *arguments)
 
-    def extract_mesh(
+    def raycast_levels(
         self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
-        parameters: MeshParameters,
-    ) -> MeshArrays:
-        """See ``Backend.extract_mesh``."""
-        return MeshArrays(*self._surface(geometry, colors, slots, coords, neighbours, parameters, len(slots))[:4])
-
-    def extract_chunks(
-        self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
-        parameters: MeshParameters,
-        chunks: NDArray[np.integer],
-    ) -> list[MeshArrays]:
-        """See ``Backend.extract_chunks``."""
-        arguments = geometry, colors, slots, coords, neighbours, parameters, chunks
-        return meshing.extract_chunks(*arguments, surface=self._surface)
+        grid: VoxelGrid,
+        levels: FinerLevels,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: NDArray[np.float32],
+        size: tuple[int, int],
+        parameters: RaycastParameters,
+    ) -> RaycastResult:
+        """See ``LevelBackend.raycast_levels``."""
+        arguments = T_world_camera, intrinsics, size, parameters
+        return views.raycast(self._queue, self._lattice(grid), grid, levels, *arguments)
 
     # -- helpers -----------------------------------------------------------------------------------------------------
 
@@ -345,10 +312,6 @@ class WarpBackend:
     def _preparation(self) -> Preparation:
         """Made at its first use: only a preprocessor's back end has a queue of its own."""
         return Preparation(self.device, self._images)
-
-    def _surface(self, *arguments: Any) -> tuple[NDArray, ...]:  # noqa: ANN401
-        """Vertices, faces, colours, normals and first face of each block, as ``meshing.surface`` gives them."""
-        return extract_surface(self.device, *arguments)
 
     def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
         self._queue.launch(kernel, dim, *arguments)
@@ -366,24 +329,7 @@ class WarpBackend:
         """A copy on the device, also where host and device share their memory: kernels may write to it."""
         return wp.array(array, dtype=wp.uint8, device=self.device)
 
-    def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
-        lattice = Lattice()
-        lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
-        lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
-        return lattice
-
-    def _cleared_marks(self, size: int) -> Any:  # noqa: ANN401
-        """A mark per cell of the window, all 0; ``_marked`` clears them again."""
-        if self._marks.size != size:
-            self._marks = wp.zeros(size, dtype=wp.int32, device=self.device)
-        return self._marks
-
-    def _marked(self, marks: Any) -> Any:  # noqa: ANN401
-        """Numbers (n,) int32 of the marked elements, ascending; clears the marks."""
-        if marks.size == 0:
-            return wp.empty(0, dtype=wp.int32, device=self.device)
-        ends = self._empty(marks.size, wp.int32)
-        wp.utils.array_scan(marks, ends, inclusive=True)
-        out = self._empty(int(self._down(ends[-1:])[0]), wp.int32)
-        self._launch(fusion.compact, marks.size, marks, ends, out)
-        return out
+    def _free_counts(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
+        """Observations of emptiness by entry: those of the device where it numbers the blocks."""
+        index = None if grid.index is None else grid.index.copy
+        return index.arrays["free_count"] if isinstance(index, IndexCopy) else self._bytes(grid.free_count)

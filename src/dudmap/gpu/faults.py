@@ -90,6 +90,11 @@ def tell(sentence: str) -> None:
         listener(sentence)
 
 
+def tell_lack(device: str) -> None:
+    """Tell that a device is lost with a part of the map."""
+    tell(f"the map lacks what {device} had written since it was last read")
+
+
 def _warn(sentence: str) -> None:
     warnings.warn(sentence, DeviceWarning, stacklevel=5)
 

@@ -18,7 +18,7 @@ from dudmap.gpu.kernels.structs import camera_of, struct
 from dudmap.gpu.memory import DeviceImage, Images
 from dudmap.gpu.staging import Staging
 from dudmap.gpu.streams import Queue
-from dudmap.kernels.evidence import BINS, EvidenceParameters, ResidualCounts
+from dudmap.kernels.evidence import BINS, EvidenceParameters, NoiseParameters, ReadingNoise, ResidualCounts
 from dudmap.kernels.parameters import MapSample
 from dudmap.kernels.reprojection import ReprojectionTarget
 from dudmap.kernels.segmentation import SegmentImage, SegmentSums
@@ -41,6 +41,12 @@ class LabelOperations:
         self._images, self._queue, self._staging = images, queue, staging
         self._scratch: dict[tuple[Any, ...], Any] = {}
         self._components = Components(queue, self._buffer, staging.download)
+
+    def reading_noise(self, depth: NDArray[np.float32], parameters: NoiseParameters) -> Any:  # noqa: ANN401
+        """See ``Backend.reading_noise``; the images stay on the device."""
+        out = [self._empty(depth.shape) for _ in ReadingNoise._fields]
+        self._queue.launch(kernels.reading_noise, depth.shape, self._up(depth), struct(parameters), *out)
+        return ReadingNoise(*(DeviceImage(image, self._queue) for image in out))
 
     def residual_counts(
         self, sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]
@@ -83,10 +89,11 @@ class LabelOperations:
         seen_free: NDArray[np.bool_] | None,
     ) -> Any:  # noqa: ANN401 - a DeviceImage stands for an array
         """See ``Backend.log_odds``; the image stays on the device."""
-        occupancy, out = self._up(sample.occupancy), self._empty(sigma.shape)
+        shape = sample.occupancy.shape
+        occupancy, out = self._up(sample.occupancy), self._empty(shape)
         seen = occupancy if seen_free is None else self._up(seen_free)
         self._queue.launch(
-            kernels.log_odds, sigma.shape, self._up(sample.distance), occupancy, self._up(sigma), struct(parameters),
+            kernels.log_odds, shape, self._up(sample.distance), occupancy, self._up(sigma), struct(parameters),
             int(free_space), int(seen_free is not None), seen, out,
         )  # fmt: skip
         return DeviceImage(out, self._queue)

@@ -16,7 +16,7 @@ from dudmap.gpu.faults import DeviceFullError
 from dudmap.gpu.kernels import rows as kernels
 from dudmap.gpu.staging import WARP_TYPES, Staging
 from dudmap.gpu.streams import Queue, main_queue
-from dudmap.kernels.mirror import Mirror
+from dudmap.kernels.mirror import DeviceCopy, Mirror
 
 SPARE = 1.2
 """Memory that must be free, in units of what is asked for: kernels need space for images and sums besides."""
@@ -85,6 +85,8 @@ class RowCopy:
         self._stale: list[NDArray] = []  # rows that the host wrote
         self._all_stale = False
         self._written: list[NDArray] = []  # rows that the device wrote
+        self._marks: Any = None  # a byte on the device per row, 1 where the device wrote it
+        self._is_marked = False
         self._value = 0  # of rows that neither side has written
         self._checked_rows: tuple[int, ...] = ()  # on the device when its memory was asked for last
         self._upload()
@@ -101,13 +103,25 @@ class RowCopy:
         elif self._stale:
             rows = np.unique(np.concatenate(self._stale)).astype(np.int32)
             source = wp.array(self._wide(self._host)[rows], device=self.device)
-            self._move(kernels.scatter, wp.array(rows, device=self.device), source, self._rows(), len(rows))
+            self._move(
+                kernels.scatter, wp.array(rows, device=self.device), source, self._wide_rows(self.array), len(rows)
+            )
         self._stale, self._all_stale = [], False
         return self.array
 
     def device_wrote(self, rows: NDArray[np.int32]) -> None:
         """The device has written rows (n,)."""
         self._written.append(rows)
+
+    def marks(self) -> Any:  # noqa: ANN401
+        """A byte on the device per row, which whoever writes to a row there sets to 1."""
+        size = len(self.current)
+        if self._marks is None or len(self._marks) != size:
+            before, self._marks = self._marks, wp.zeros(size, dtype=wp.uint8, device=self.device)
+            if before is not None:
+                wp.copy(self._marks, before, count=min(size, len(before)))
+        self._is_marked = True
+        return self._marks
 
     def host_wrote(self, rows: NDArray[np.integer] | None) -> None:
         """See ``mirror.DeviceCopy``."""
@@ -119,22 +133,31 @@ class RowCopy:
     def pull(self, host: NDArray[np.int32]) -> None:
         """See ``mirror.DeviceCopy``."""
         written, self._written = self._written, []
-        if not written or self._all_stale:
+        is_marked, self._is_marked = self._is_marked, False
+        if not (written or is_marked) or self._all_stale:
             return
-        rows = np.unique(np.concatenate(written))
-        if self._stale:  # the host wrote them after the device
-            rows = np.setdiff1d(rows, np.concatenate(self._stale))
         try:
-            for begin in range(0, 0 if faults.is_lost(self.device) else len(rows), PIECE):
-                self._pull(rows[begin : begin + PIECE].astype(np.int32), self._wide(host))
+            if not faults.is_lost(self.device):
+                rows = np.unique(np.concatenate([*written, *(self._take_marks() if is_marked else ())]))
+                if self._stale:  # the host wrote them after the device
+                    rows = np.setdiff1d(rows, np.concatenate(self._stale))
+                for begin in range(0, len(rows), PIECE):
+                    self._pull(rows[begin : begin + PIECE].astype(np.int32), self._wide(host))
         except Exception as error:
             faults.lose(error, self.device)
         if faults.is_lost(self.device):
-            faults.tell(f"the map lacks what {self.device} had written since it was last read")
+            faults.tell_lack(self.device)
+
+    def _take_marks(self) -> list[NDArray]:
+        """Rows (n,) that are marked; clears the marks."""
+        rows = np.flatnonzero(main_queue(self.device).download(self._marks))
+        clear = np.zeros(len(self._marks), np.uint8)
+        wp.copy(self._marks, wp.array(clear, dtype=wp.uint8, device="cpu", copy=False))
+        return [rows]
 
     def _pull(self, rows: NDArray[np.int32], host: NDArray[np.int32]) -> None:
         wp.copy(self._numbers, wp.array(rows, dtype=wp.int32, device="cpu", copy=False), count=len(rows))
-        self._move(kernels.gather, self._numbers, self._rows(), self._buffer, len(rows))
+        self._move(kernels.gather, self._numbers, self._wide_rows(self.array), self._buffer, len(rows))
         host[rows] = main_queue(self.device).download(self._buffer[: len(rows)])
 
     def take(self, rows: NDArray[np.integer], columns: NDArray[np.integer]) -> NDArray[np.int32]:
@@ -143,26 +166,27 @@ class RowCopy:
             try:
                 places = wp.array(np.stack([rows, columns], axis=1).astype(np.int32), device=self.device)
                 out = wp.empty(len(rows), dtype=wp.int32, device=self.device)
-                wp.launch(kernels.take, dim=len(rows), inputs=[places, self.current], outputs=[out], device=self.device)
+                source = self._wide_rows(self.current)
+                wp.launch(kernels.take, dim=len(rows), inputs=[places, source], outputs=[out], device=self.device)
                 return main_queue(self.device).download(out)
             except Exception as error:
                 faults.handle(error, self.device, "reading the map")
         self.pull(self._host)
         return self._wide(self._host)[rows, columns]
 
-    def max_rows(self) -> int | None:
+    def max_rows(self, others: Sequence[DeviceCopy]) -> int | None:
         """See ``mirror.DeviceCopy``; it is told that the map has reached the bound.
 
         The device must finish all its work to answer, so that it is asked after the map has grown only.
         """
-        size = len(self.array)
+        size = len(self.array) + sum(len(other.array) for other in others if isinstance(other, RowCopy))
         if self._checked_rows == (size,) * CHECKS:
             return None
         free, own = free_memory(self.device), 2 * size * self._row_bytes()  # geometry and colours
         if free is None or faults.is_lost(self.device) or SPARE * GROWTH * own <= free + own:
             self._checked_rows = (*self._checked_rows[1 - CHECKS :], size)
             return None
-        rows = int(USED * len(self.array))
+        rows = int(USED * size)
         faults.tell(
             f"{self.device} has room for {rows} blocks of the map; those farthest from the camera wait on disk, "
             "as with --max-memory"
@@ -202,8 +226,9 @@ class RowCopy:
     def _row_bytes(self) -> int:
         return self._width * self._host.itemsize
 
-    def _rows(self) -> Any:  # noqa: ANN401
-        return self.array if self.array.ndim == 2 else self.array.reshape((-1, 1))
+    @staticmethod
+    def _wide_rows(array: Any) -> Any:  # noqa: ANN401
+        return array if array.ndim == 2 else array.reshape((-1, 1))
 
     @staticmethod
     def _wide(array: NDArray) -> NDArray:
@@ -237,6 +262,13 @@ def wrote(array: Mirror | NDArray[np.int32], device: str, rows: NDArray[np.int32
     _copy(array, device).device_wrote(rows)
 
 
+def changed_rows(array: Mirror | NDArray[np.int32], device: str) -> Any:  # noqa: ANN401 - an array of Warp
+    """See ``RowCopy.marks``: for kernels that write rows of the array that ``resident`` gives, and know which."""
+    if not isinstance(array, Mirror):
+        raise TypeError("the device writes to mirrors only; a plain array would not see the change")
+    return _copy(array, device).marks()
+
+
 def _copy(mirror: Mirror, device: str) -> RowCopy:
     if not (isinstance(mirror.copy, RowCopy) and mirror.copy.device == device):
         mirror.copy = RowCopy(mirror.host, mirror.used, device)
@@ -268,14 +300,9 @@ class Images:
             self.remember(array, twin, uploading=self.device != "cpu")
         return twin
 
-    def down(self, twin: Any) -> NDArray:  # noqa: ANN401
-        """A copy in the host's memory, read-only, so that the device's array stays its equal."""
-        array = main_queue(self.device).download(twin)
-        self._keep(array, twin)
-        return array
-
     def down_all(self, twins: Sequence[Any], staging: Staging) -> list[NDArray]:
-        """The same of several images at once, by the staging of the main queue: see ``Staging.download_all``."""
+        """Copies in the host's memory, read-only, so that the device's arrays stay their equals; all at once by the
+        staging of the main queue: see ``Staging.download_all``."""
         arrays = staging.download_all(twins)
         for array, twin in zip(arrays, twins, strict=True):
             self._keep(array, twin)

@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.finest import corners_at, finest_at, least_weight
+from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.kernels.pixel import ray
 from dudmap.kernels.raycasting import (
@@ -175,23 +176,15 @@ def _trace_rows(
 
 def raycast(
     grid: VoxelGrid,
-    tree: tuple[NDArray[np.int32], ...],
-    geometry: tuple[NDArray[np.int32], ...],
-    colors: tuple[NDArray[np.int32], ...],
+    levels: FinerLevels,
     T_world_camera: NDArray[np.float64],
     intrinsics: NDArray[np.float32],
     size: tuple[int, int],
     parameters: RaycastParameters,
 ) -> RaycastResult:
-    """Depth, colour and normals of the first surface that each pixel of a camera sees; see ``Backend.raycast``.
-
-    Args:
-        grid: The coarsest level.
-        tree: Two arrays (slots, 8) int32.
-        geometry, colors: Two arrays (slots, 512) int32 each, of the finer levels.
-        T_world_camera, intrinsics, size, parameters: As of ``Backend.raycast``.
-    """
-    grid = grid.on_host()
+    """See ``LevelBackend.raycast_levels``."""
+    grid, levels = grid.on_host(), levels.on_host()
+    tree = levels.children1, levels.children2
     low, high = f32(parameters.depth_min), f32(parameters.depth_max)
     near, far = tile_depths(grid, T_world_camera, intrinsics, size, low, high)
     _, to_lattice, _ = motions(grid, T_world_camera)
@@ -199,8 +192,8 @@ def raycast(
     color = np.empty((*size, 3), dtype=np.uint8)
     normals = np.empty((*size, 3), dtype=np.float32)
     unit, least = f32(grid.sdf_unit / grid.voxel_size), max(int(parameters.min_weight), 1)
-    voxels = (np.asarray(grid.geometry).reshape(-1), *geometry)
-    paint = (np.asarray(grid.colors).reshape(-1), *colors)
+    voxels = (np.asarray(grid.geometry).reshape(-1), levels.geometry1, levels.geometry2)
+    paint = (np.asarray(grid.colors).reshape(-1), levels.colors1, levels.colors2)
     run_bands(
         lambda start, stop: _trace_rows(
             start, stop, grid.window, grid.shape, tree, voxels, paint, intrinsics, to_lattice, near, far,

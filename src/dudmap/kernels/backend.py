@@ -5,7 +5,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.block_index import IndexBackend
 from dudmap.kernels.label_backend import LabelBackend
+from dudmap.kernels.level_backend import LevelBackend
+from dudmap.kernels.links import Neighbours
 from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
@@ -27,8 +30,9 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(LabelBackend, Protocol):
-    """Operations of a compute device, with those on the label image.
+class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
+    """Operations of a compute device, with those on the label image, on maps with several voxel sizes, and those that
+    number blocks.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -105,7 +109,10 @@ class Backend(LabelBackend, Protocol):
     def reading_weights(
         self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
     ) -> NDArray[np.uint8]:
-        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m."""
+        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m.
+
+        It may be anything that ``np.asarray`` takes, so that a device keeps what nobody reads.
+        """
         ...
 
     def touched_cells(
@@ -267,7 +274,7 @@ class Backend(LabelBackend, Protocol):
         colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
+        neighbours: Neighbours,
         parameters: MeshParameters,
     ) -> MeshArrays:
         """Triangles of the zero level of the given blocks by marching cubes.
@@ -277,6 +284,7 @@ class Backend(LabelBackend, Protocol):
             slots: (n,) int32, blocks to mesh; each once.
             coords: (num_slots, 3) int, block coordinates by slot.
             neighbours: (n, 8) int32; column 4 dx + 2 dy + dz holds the slot of the block at +(dx, dy, dz), -1 = none.
+                It follows from the coordinates: a device does not read it.
             parameters: Of the extraction.
 
         Returns:
@@ -290,7 +298,7 @@ class Backend(LabelBackend, Protocol):
         colors: Mirror | NDArray[np.int32],
         slots: NDArray[np.int32],
         coords: NDArray[np.integer],
-        neighbours: NDArray[np.int32],
+        neighbours: Neighbours,
         parameters: MeshParameters,
         chunks: NDArray[np.integer],
     ) -> list[MeshArrays]:
@@ -304,5 +312,6 @@ class Backend(LabelBackend, Protocol):
         ...
 
 
-OPERATIONS = tuple(name for protocol in (Backend, LabelBackend) for name in vars(protocol) if not name.startswith("_"))
+_PROTOCOLS = Backend, LabelBackend, IndexBackend, LevelBackend
+OPERATIONS = tuple(name for protocol in _PROTOCOLS for name in vars(protocol) if not name.startswith("_"))
 """Names of all operations."""

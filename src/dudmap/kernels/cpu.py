@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import (
+    adaptive_raycasting,
     antialiasing,
     color_registration,
     evidence,
@@ -17,6 +18,7 @@ from dudmap.kernels import (
     labeling,
     meshing,
     raycasting,
+    refinement,
     registration,
     sampling,
     segmentation,
@@ -63,7 +65,10 @@ class CpuBackend:
     extract_mesh = staticmethod(meshing.extract)
     extract_chunks = staticmethod(meshing.extract_chunks)
     raycast = staticmethod(raycasting.raycast)
+    raycast_levels = staticmethod(adaptive_raycasting.raycast)
+    examine, prolong = staticmethod(refinement.examine), staticmethod(refinement.prolong)
     segment_surface = staticmethod(segmentation.segment_surface)
+    reading_noise = staticmethod(evidence.reading_noise)
     residual_counts = staticmethod(evidence.residual_counts)
     free_space = staticmethod(evidence.free_space)
     log_odds = staticmethod(evidence.log_odds)
@@ -309,6 +314,12 @@ class CpuBackend:
             ranges, found,
         )  # fmt: skip
         return _concatenated(found, counts)
+
+    def allocate_touched(self, *_: Any, **__: Any) -> bool:
+        """See ``IndexBackend``: the host numbers the blocks, by the operations above."""
+        return False
+
+    fuse_near = record_free = place_window = allocate_touched
 
     # -- read the map ------------------------------------------------------------------------------------------------
 

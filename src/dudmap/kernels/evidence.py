@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import labeling
-from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample
+from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample, single
 from dudmap.kernels.reprojection import ReprojectionTarget, reproject
 from dudmap.kernels.segmentation import SegmentImage, SegmentSums, segment_sums
 
@@ -57,6 +57,57 @@ class EvidenceParameters(NamedTuple):
     noise_sigmas: float
 
 
+class NoiseParameters(NamedTuple):
+    """What the noise of a reading follows from.
+
+    Attributes:
+        base, scale: Of the sensor, sigma(z) = base + scale z^2 (thesis eq. 3.91), metres and 1/m.
+        map_variance: Of the surface of the map, m^2.
+        edge_sigmas, edge_slope: Largest depth step to a neighbour of the same surface: standard deviations, and a share
+            of the depth.
+        floor, sigmas: As of ``noise_limit``.
+        gap: Largest depth difference of two readings of one point, as a multiple of ``noise_limit``.
+        least_sigma: Least standard deviation in comparisons by segment, metres.
+    """
+
+    base: float
+    scale: float
+    map_variance: float
+    edge_sigmas: float
+    edge_slope: float
+    floor: float
+    sigmas: float
+    gap: float
+    least_sigma: float
+
+
+class ReadingNoise(NamedTuple):
+    """Noise of the readings of an image, metres.
+
+    Attributes:
+        sigma: (h, w) float32, standard deviation of the distance of a static point.
+        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface.
+        gap: (h, w) float32, largest depth difference of two readings of one point.
+        bounded_sigma: (h, w) float32, ``sigma`` where it is at least ``least_sigma``, else that.
+    """
+
+    sigma: NDArray[np.float32]
+    tolerance: NDArray[np.float32]
+    gap: NDArray[np.float32]
+    bounded_sigma: NDArray[np.float32]
+
+
+def static_sigma(z: Any, base: Any, scale: Any, map_variance: Any) -> Any:
+    """Standard deviation of the distance of a static point at depth z, metres: of the reading and of the map."""
+    sigma = base + scale * (z * z)
+    return np.sqrt(sigma * sigma + map_variance)
+
+
+def edge_tolerance(sigma: Any, z: Any, edge_sigmas: Any, edge_slope: Any) -> Any:
+    """Largest depth step to a neighbour of the same surface, metres."""
+    return edge_sigmas * sigma + edge_slope * z
+
+
 def residual_bin(distance: Any, sigma: Any) -> Any:
     """Bin of the histogram for a distance to the map with this standard deviation, both in metres."""
     return np.int64(np.minimum(abs(distance) / sigma, LARGEST) * BINS_PER_SIGMA)
@@ -91,6 +142,15 @@ def surface_log_odds(
     odds = mixture_log_odds(residual * residual, offset, slope)
     odds = np.minimum(np.maximum(odds, -limit), limit)
     return np.where(abs(distance) < noise, np.maximum(odds, np.float32(1)), odds)
+
+
+def reading_noise(depth: NDArray[np.float32], parameters: NoiseParameters) -> ReadingNoise:
+    """See ``LabelBackend.reading_noise``."""
+    p = single(parameters)
+    sigma = static_sigma(depth, p.base, p.scale, p.map_variance)
+    gap = p.gap * noise_limit(sigma, p.floor, p.sigmas)
+    tolerance = edge_tolerance(sigma, depth, p.edge_sigmas, p.edge_slope)
+    return ReadingNoise(sigma, tolerance, gap, np.maximum(p.least_sigma, sigma))
 
 
 def residual_counts(sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> ResidualCounts:

@@ -21,7 +21,7 @@ def _slot_at(window, shape, bx, by, bz):
 
 
 @kernel
-def _half_word(window, shape, children1, voxels1, i, j, k):
+def half_word(window, shape, children1, voxels1, i, j, k):
     """Word of the voxel (i, j, k) of the lattice with half the spacing; 0 = none."""
     slot = _slot_at(window, shape, i >> 4, j >> 4, k >> 4)
     if slot < 0 or slot >= len(children1):
@@ -31,7 +31,7 @@ def _half_word(window, shape, children1, voxels1, i, j, k):
 
 
 @kernel
-def _quarter_word(window, shape, children1, children2, voxels2, i, j, k):
+def quarter_word(window, shape, children1, children2, voxels2, i, j, k):
     """Word of the voxel (i, j, k) of the lattice with a quarter of the spacing; 0 = none."""
     slot = _slot_at(window, shape, i >> 5, j >> 5, k >> 5)
     if slot < 0 or slot >= len(children1):
@@ -84,9 +84,9 @@ def corners_at(level, window, shape, children1, children2, voxels0, voxels1, vox
         for m in range(8):
             a, b, c = i + (m >> 2), j + ((m >> 1) & 1), k + (m & 1)
             if level == 1:
-                corners[m, 0] = _half_word(window, shape, children1, voxels1, a, b, c)
+                corners[m, 0] = half_word(window, shape, children1, voxels1, a, b, c)
             else:
-                corners[m, 0] = _quarter_word(window, shape, children1, children2, voxels2, a, b, c)
+                corners[m, 0] = quarter_word(window, shape, children1, children2, voxels2, a, b, c)
     return x - lx, y - ly, z - lz
 
 

@@ -6,7 +6,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.evidence import EvidenceParameters, ResidualCounts
+from dudmap.kernels.evidence import EvidenceParameters, NoiseParameters, ReadingNoise, ResidualCounts
 from dudmap.kernels.parameters import MapSample
 from dudmap.kernels.reprojection import ReprojectionTarget
 from dudmap.kernels.segmentation import SegmentImage, SegmentSums
@@ -17,6 +17,10 @@ class LabelBackend(Protocol):
 
     Images that these give may be anything that ``np.asarray`` takes, so that a device keeps what nobody reads.
     """
+
+    def reading_noise(self, depth: NDArray[np.float32], parameters: NoiseParameters) -> ReadingNoise:
+        """Noise of the readings of an image (h, w), metres, 0 = none."""
+        ...
 
     def residual_counts(
         self, sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]

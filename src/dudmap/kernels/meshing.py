@@ -6,12 +6,10 @@ owns, and, once the offset of each block is known, vertices and triangles. The t
 global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
 """
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.links import links
+from dudmap.kernels.links import Neighbours, links
 from dudmap.kernels.mirror import Mirror, on_host
 from dudmap.kernels.parameters import MeshArrays, MeshParameters
 from dudmap.kernels.surface import crossing, mixed_channel, slope
@@ -301,7 +299,7 @@ def extract(
     colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
+    neighbours: Neighbours,
     parameters: MeshParameters,
 ) -> MeshArrays:
     """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
@@ -316,20 +314,16 @@ def extract_chunks(
     colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
+    neighbours: Neighbours,
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
-    surface: Callable[..., tuple[NDArray, ...]] | None = None,
 ) -> list[MeshArrays]:
-    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``.
-
-    ``surface`` does the work of ``extract_surface``, which None takes.
-    """
+    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
     num_chunks = int(chunks.max(initial=-1)) + 1
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
-    vertices, faces, vertex_colors, normals, first_face = (surface or extract_surface)(
-        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
+    vertices, faces, vertex_colors, normals, first_face = extract_surface(
+        geometry, colors, slots[order], coords, np.asarray(neighbours)[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
@@ -350,7 +344,7 @@ def extract_surface(
     colors: Mirror | NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: NDArray[np.int32],
+    neighbours: Neighbours,
     parameters: MeshParameters,
     num_meshed: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:

@@ -1,5 +1,6 @@
 """An array in the host's memory of which a compute device may keep a copy."""
 
+from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
@@ -25,8 +26,9 @@ class DeviceCopy(Protocol):
         """So many rows are in use from now on; the device needs no others."""
         ...
 
-    def max_rows(self) -> int | None:
-        """Largest number of rows to use, where the device has no room for many more; None = no bound."""
+    def max_rows(self, others: "Sequence[DeviceCopy]") -> int | None:
+        """Largest number of rows to use, of this array and of others of the map, where the device has no room for many
+        more; None = no bound."""
         ...
 
     def grow(self, host: NDArray, value: int) -> None:
@@ -73,10 +75,10 @@ class Mirror:
         if self.copy is not None:
             self.copy.use(num_rows)
 
-    @property
-    def max_rows(self) -> int | None:
-        """Largest number of rows to use, where a device has no room for many more; None = no bound."""
-        return None if self.copy is None else self.copy.max_rows()
+    def max_rows(self, others: "Sequence[Mirror]" = ()) -> int | None:
+        """Largest number of rows to use, of this array and of ``others`` with rows of the same size that share its
+        device, where that has no room for many more; None = no bound."""
+        return None if self.copy is None else self.copy.max_rows([one.copy for one in others if one.copy is not None])
 
     def wrote(self, rows: NDArray[np.integer] | None = None) -> None:
         """Rows (n,), or all of them, have been written in the host's memory."""

@@ -10,6 +10,7 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.block_index import BlockIndex
 from dudmap.kernels.mirror import Mirror, on_host
 
 BLOCK = 8
@@ -206,11 +207,13 @@ class VoxelGrid(NamedTuple):
     free_count: NDArray[np.uint8]
     voxel_size: float
     sdf_unit: float
+    index: BlockIndex | None = None
 
     def on_host(self) -> "VoxelGrid":
         """The grid with plain arrays, up to date."""
-        window, geometry, colors = on_host(self.window), on_host(self.geometry), on_host(self.colors)
-        return self._replace(window=window, geometry=geometry, colors=colors)
+        grid = self if self.index is None else self.index.refreshed(self)
+        window, geometry, colors = on_host(grid.window), on_host(grid.geometry), on_host(grid.colors)
+        return grid._replace(window=window, geometry=geometry, colors=colors)
 
 
 def to_lattice(

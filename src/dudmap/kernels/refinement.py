@@ -4,9 +4,11 @@ A block is read with two voxels around it, from its 27 neighbours (``mapping/fin
 """
 
 import numpy as np
+from numpy.typing import NDArray
 
-from dudmap.kernels.threads import kernel
-from dudmap.kernels.voxel import pack_color, pack_voxel
+from dudmap.kernels.mirror import Mirror, on_host
+from dudmap.kernels.threads import bands, kernel, run_bands, scalar
+from dudmap.kernels.voxel import intensity_of, pack_color, pack_voxel, sdf_steps
 
 PAD = 2
 """Voxels around a block that are read."""
@@ -19,6 +21,47 @@ SATURATED = np.float32(0.85)
 PRIOR = 8
 """Largest weight that a voxel inherits: two frontal readings at one metre. What is inherited is the coarse surface,
 which the next readings should replace."""
+BAND = 64
+"""Blocks of one band."""
+
+
+@scalar
+def distance_bend(word, a, b, by_voxel, saturated):
+    """Second derivative of the distance at a voxel, per voxel, by those two voxels before and behind it, and whether it
+    is known; arguments as of ``examine_range``."""
+    f, fa, fb = sdf_steps(word) * by_voxel, sdf_steps(a) * by_voxel, sdf_steps(b) * by_voxel
+    known = ((a & 0xFF00) != 0) & ((b & 0xFF00) != 0) & (fa < saturated) & (fb < saturated)
+    return (fa - f - f + fb) * np.float32(0.25), known
+
+
+@scalar
+def intensity_bend(word, a, b):
+    """Second derivative of the intensity (0..1) at a voxel by its neighbours, and whether it is known."""
+    known = ((a & 0xFF) != 0) & ((b & 0xFF) != 0) & ((word & 0xFF) != 0)
+    return (intensity_of(a) + intensity_of(b) - np.float32(2) * intensity_of(word)) / np.float32(255), known
+
+
+@scalar
+def root_mean(total, count):
+    """Root mean square of ``count`` numbers by the sum of their squares."""
+    return np.sqrt(total / np.float32(max(count, 1)))
+
+
+@scalar
+def mean_voxel(steps, count, weight, shade, shades):
+    """Word of the mean of ``count`` voxels by the sums of their distances and of ``shades`` intensities; 0 = unknown,
+    where the least of their weights is 0."""
+    by = np.float32(1) / np.float32(max(shades, 1))
+    word = pack_voxel(steps / np.float32(count), np.float32(weight), shade * by)
+    return np.int32(word) if weight > 0 else np.int32(0)
+
+
+@scalar
+def mean_color(red, green, blue, count):
+    """Word of the mean of ``count`` colours by their sums; 0 = none."""
+    by = np.float32(1) / np.float32(max(count, 1))
+    word = pack_color(red * by, green * by, blue * by)
+    return np.int32(word) if count > 0 else np.int32(0)
 
 
 @kernel
@@ -41,7 +84,7 @@ def padded(voxels, near, words):
 
 
 @kernel
-def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
+def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
     """How much the distance and the intensity bend near the surface in each octant of blocks.
 
     With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
@@ -76,7 +119,7 @@ def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, sur
                         word = flat[n]
                         if word & 0xFF00 == 0:
                             continue
-                        f = np.float32(word >> 16) * by_voxel
+                        f = sdf_steps(word) * by_voxel
                         inside |= f < np.float32(0.25)
                         outside |= f > np.float32(-0.25)
                         if abs(f) > NEAR or i == 4 or j == 4 or k == 4:
@@ -85,15 +128,12 @@ def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, sur
                         shade, seen = zero, False
                         for axis in range(3):
                             step = SIZE * SIZE if axis == 0 else (SIZE if axis == 1 else 1)
-                            a, b = flat[n + 2 * step], flat[n - 2 * step]
-                            fa, fb = np.float32(a >> 16) * by_voxel, np.float32(b >> 16) * by_voxel
-                            if (a & 0xFF00 != 0) and (b & 0xFF00 != 0) and fa < saturated and fb < saturated:
-                                d = (fa - f - f + fb) * np.float32(0.25)
+                            d, known = distance_bend(word, flat[n + 2 * step], flat[n - 2 * step], by_voxel, saturated)
+                            if known:
                                 square += d * d
                                 axes += 1
-                            a, b = flat[n + step] & 0xFF, flat[n - step] & 0xFF
-                            if a != 0 and b != 0 and word & 0xFF != 0:
-                                d = np.float32(a + b - 2 * (word & 0xFF)) / np.float32(255)
+                            d, known = intensity_bend(word, flat[n + step], flat[n - step])
+                            if known:
                                 shade += d * d
                                 seen = True
                         if axes > 0:  # beside the end of a finer level not all axes are known
@@ -102,8 +142,8 @@ def examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, sur
                         if seen:
                             shades += shade
                             shaded += 1
-            bend[row, octant] = np.sqrt(total / np.float32(max(count, 1)))
-            texture[row, octant] = np.sqrt(shades / np.float32(max(shaded, 1)))
+            bend[row, octant] = root_mean(total, count)
+            texture[row, octant] = root_mean(shades, shaded)
             surface[row, octant] = inside and outside
 
 
@@ -113,7 +153,7 @@ def _channel(value):
 
 
 @kernel
-def prolong(start, stop, geometry, colors, near, octants, slots, fine_geometry, fine_colors):
+def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geometry, fine_colors):
     """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
 
     A voxel is known where all the coarse voxels around it are, and has the least of their weights, at most PRIOR.
@@ -157,10 +197,36 @@ def prolong(start, stop, geometry, colors, near, octants, slots, fine_geometry, 
                             green += _channel(color >> 10)
                             blue += _channel(color)
                             painted += 1
-            if weight > 0:
-                by = np.float32(1) / np.float32(max(shades, 1))
-                fine_geometry[slot, n] = pack_voxel(steps / np.float32(count), np.float32(weight), shade * by)
-            else:
-                fine_geometry[slot, n] = 0
-            by = np.float32(1) / np.float32(max(painted, 1))
-            fine_colors[slot, n] = pack_color(red * by, green * by, blue * by) if painted > 0 else 0
+            fine_geometry[slot, n] = mean_voxel(steps, count, weight, shade, shades)
+            fine_colors[slot, n] = mean_color(red, green, blue, painted)
+
+
+def examine(
+    geometry: Mirror | NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """See ``LevelBackend.examine``."""
+    bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
+    surface = np.empty((len(near), 8), dtype=np.uint8)
+    words, by, limit = on_host(geometry), np.float32(by_voxel), np.float32(saturated)
+    run_bands(
+        lambda start, stop: examine_range(start, stop, words, near, by, limit, bend, texture, surface),
+        bands(len(near), BAND),
+    )
+    return bend, texture, surface
+
+
+def prolong(
+    geometry: Mirror | NDArray[np.int32],
+    colors: Mirror | NDArray[np.int32],
+    near: NDArray[np.int32],
+    octants: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    fine_geometry: Mirror | NDArray[np.int32],
+    fine_colors: Mirror | NDArray[np.int32],
+) -> None:
+    """See ``LevelBackend.prolong``."""
+    coarse, fine = (on_host(geometry), on_host(colors)), (on_host(fine_geometry), on_host(fine_colors))
+    prolong_range(0, len(slots), *coarse, near, octants, slots, *fine)
+    for array in (fine_geometry, fine_colors):
+        if isinstance(array, Mirror):
+            array.wrote(slots)

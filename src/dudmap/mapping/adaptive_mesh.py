@@ -65,14 +65,14 @@ def _contours(
     row_of = np.full(len(blocks.entry_of) + 1, -1, dtype=np.int32)
     row_of[slots] = np.arange(len(slots), dtype=np.int32)
     rows = row_of[near]  # -1 is the last element
-    (children1, children2), (geometry1, geometry2), (colors1, colors2) = two_levels(levels)
-    coords = np.ascontiguousarray(blocks.slot_coords[slots])
+    finer = two_levels(levels).on_host()
+    coords, geometry, colors = np.ascontiguousarray(blocks.slot_coords[slots]), blocks.geometry, blocks.colors
     least = max(int(parameters.min_weight), 1)
     parts = run_bands(
         lambda start, stop: contour_blocks(
-            start, stop, slots, near, rows, meshed, coords, blocks.geometry, geometry1, geometry2, children1, children2,
-            blocks.colors, colors1, colors2, least, np.float32(parameters.sdf_unit), float(parameters.voxel_size),
-            np.float32(parameters.max_jump),
+            start, stop, slots, near, rows, meshed, coords, geometry, finer.geometry1, finer.geometry2,
+            finer.children1, finer.children2, colors, finer.colors1, finer.colors2, least,
+            np.float32(parameters.sdf_unit), float(parameters.voxel_size), np.float32(parameters.max_jump),
         ),
         bands(len(slots), BAND),
     )  # fmt: skip

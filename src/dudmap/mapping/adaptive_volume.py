@@ -11,12 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.errors import ConfigError, MapError
+from dudmap.errors import MapError
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh, joined
-from dudmap.kernels.adaptive_raycasting import raycast
 from dudmap.kernels.backend import Backend
-from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
 from dudmap.mapping.adaptive_mesh import extract_groups
 from dudmap.mapping.block_tree import BlockTree
@@ -71,11 +69,11 @@ class AdaptiveVolume(TsdfVolume):
         levels: The finer levels, that with the larger voxels first.
 
     Raises:
-        ConfigError: The device is not the CPU.
         MapError: As of ``TsdfVolume``.
     """
 
     levels: Sequence[FineBlocks]
+    _numbered_on_host = True  # the finer levels refer to the slots of the coarser ones
 
     def __init__(
         self,
@@ -87,8 +85,6 @@ class AdaptiveVolume(TsdfVolume):
         max_blocks: int | MemoryLimit | None = None,
         extent: float | None = None,
     ) -> None:
-        if not isinstance(backend or CpuBackend(), CpuBackend):
-            raise ConfigError("a map with volume.adaptive is computed on the CPU; take --device cpu")
         super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
         self._integrators, self._refinements = [], []
         for number in range(self.config.adaptive_levels):
@@ -99,7 +95,7 @@ class AdaptiveVolume(TsdfVolume):
             integrator.parameters = integrator.parameters._replace(band=band, sdf_unit=self.sdf_unit)
             self._integrators.append(integrator)
             parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
-            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
+            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit, self.backend))
 
     def _halved(self, voxel_size: float) -> VolumeConfig:
         return self.config.model_copy(update={"voxel_size": voxel_size})
@@ -151,6 +147,7 @@ class AdaptiveVolume(TsdfVolume):
     ) -> NDArray[np.int32]:
         weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
         fused = super()._fuse(depth, color, weights, T_world_camera, count)
+        assert fused is not None
         number = self._frame_number
         view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
         slots, updated = self.window.near, fused
@@ -247,8 +244,9 @@ class AdaptiveVolume(TsdfVolume):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        tree, geometry, colors = two_levels(self.levels)
-        return raycast(self.grid, tree, geometry, colors, T_world_camera, camera.intrinsics, camera.shape, parameters)
+        return self.backend.raycast_levels(
+            self.grid, two_levels(self.levels), T_world_camera, camera.intrinsics, camera.shape, parameters
+        )
 
     def extract_mesh(self, min_weight: int | None = None) -> Mesh:
         """Triangles of the zero level by dual contouring, where every cell corner has at least ``min_weight``

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.mirror import grown
 from dudmap.kernels.parameters import VoxelGrid
 from dudmap.mapping.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
@@ -155,10 +156,9 @@ def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.i
     return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
 
 
-def two_levels(levels: Sequence[FineBlocks]) -> tuple[tuple[NDArray[np.int32], NDArray[np.int32]], ...]:
-    """Children (slots, 8), voxels (slots, 512) and colours (slots, 512) of two levels each, as the kernels take them;
-    those of a level that does not exist have no children."""
+def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
+    """The finer levels of a map, at most two, as back ends take them."""
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
-    arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels] + missing
-    first, second = arrays
-    return tuple(zip(first, second, strict=True))
+    arrays = [(level.children, level.blocks.geometry_mirror, level.blocks.colors_mirror) for level in levels]
+    (children1, geometry1, colors1), (children2, geometry2, colors2) = arrays + missing
+    return FinerLevels(children1, children2, geometry1, geometry2, colors1, colors2)

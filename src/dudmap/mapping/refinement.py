@@ -4,9 +4,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.kernels.backend import Backend
 from dudmap.kernels.parameters import TruncationBand
-from dudmap.kernels.refinement import SATURATED, examine, prolong
-from dudmap.kernels.threads import bands, run_bands
+from dudmap.kernels.refinement import SATURATED, prolong
 from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
@@ -25,8 +25,6 @@ BEND_NOISE = np.sqrt(6) / 4
 """Standard deviation of the bend along one axis for distances with the standard deviation 1."""
 SIGNIFICANT = 2.0
 """Standard deviations of the bend of noise that a bend must exceed in addition to the threshold."""
-BAND = 64
-"""Blocks of one band."""
 
 
 class Refinement:
@@ -38,13 +36,21 @@ class Refinement:
         band: Truncation band of the coarser level.
         voxel_size: Of the coarser level, metres.
         sdf_unit: Metres per step of a stored distance.
+        backend: Compute device of the map.
     """
 
     def __init__(
-        self, config: VolumeConfig, sensor: SensorConfig, band: TruncationBand, voxel_size: float, sdf_unit: float
+        self,
+        config: VolumeConfig,
+        sensor: SensorConfig,
+        band: TruncationBand,
+        voxel_size: float,
+        sdf_unit: float,
+        backend: Backend,
     ) -> None:
-        self.config, self.sensor, self.band = config, sensor, band
-        self.voxel_size, self.sdf_unit = voxel_size, sdf_unit
+        self.config, self.sensor, self.backend = config, sensor, backend
+        self.voxel_size = voxel_size
+        self._by_voxel, self._saturated = sdf_unit / voxel_size, float(SATURATED * band.front / voxel_size)
 
     def update(
         self,
@@ -74,7 +80,8 @@ class Refinement:
         if len(slots) == 0:
             return slots
         near = neighbourhood(parents, slots)
-        bend, texture, surface = self._examine(parents, near)
+        bend, texture, found = self.backend.examine(parents.geometry_mirror, near, self._by_voxel, self._saturated)
+        surface = found.astype(bool)
         noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (self.voxel_size * np.sqrt(np.minimum(fused, 64)))
         needed = np.maximum(
             bend / np.hypot(self.config.adaptive_bend, noise)[:, None], texture / self.config.adaptive_texture
@@ -83,7 +90,10 @@ class Refinement:
         rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
         if len(rows):
             opened = level.open(parents, slots[rows], octants, number)
-            level.blocks.write(opened, *prolonged(parents, slots[rows], octants))
+            self.backend.prolong(
+                parents.geometry_mirror, parents.colors_mirror, near[rows], octants, opened,
+                level.blocks.geometry_mirror, level.blocks.colors_mirror,
+            )  # fmt: skip
         dropped = self._drop_calm(level, children, surface, needed)
         changed = np.zeros(len(slots), dtype=bool)
         changed[rows] = True
@@ -103,20 +113,6 @@ class Refinement:
         out[rows[unneeded]] = True
         return out
 
-    def _examine(
-        self, parents: VoxelBlocks, near: NDArray[np.int32]
-    ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_]]:
-        bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
-        surface = np.empty((len(near), 8), dtype=np.uint8)
-        by_voxel = np.float32(self.sdf_unit / self.voxel_size)
-        saturated = np.float32(SATURATED * self.band.front / self.voxel_size)
-        geometry = parents.geometry
-        run_bands(
-            lambda start, stop: examine(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface),
-            bands(len(near), BAND),
-        )
-        return bend, texture, surface.astype(bool)
-
 
 def prolonged(
     parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64]
@@ -124,9 +120,7 @@ def prolonged(
     """Interpolation of the coarser level in octants (n,) of blocks in slots (n,): voxels and colours (n, 512)."""
     voxels, colors = np.empty((2, len(slots), BLOCK**3), dtype=np.int32)
     rows = np.arange(len(slots), dtype=np.int32)
-    prolong(
-        0, len(slots), parents.geometry, parents.colors, neighbourhood(parents, slots), octants, rows, voxels, colors
-    )
+    prolong(parents.geometry, parents.colors, neighbourhood(parents, slots), octants, rows, voxels, colors)
     return voxels, colors
 
 

@@ -15,6 +15,7 @@ from dudmap.geometry.mesh import Mesh, joined
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.integration import used_readings
+from dudmap.kernels.links import Lazy
 from dudmap.kernels.parameters import (
     FREE,
     SURFACE,
@@ -124,7 +125,7 @@ class TsdfVolume(PagedMap):
     @property
     def num_free_blocks(self) -> int:
         """Blocks in memory known to be free space; they own no voxels."""
-        return self.blocks.num_free(self.config.free_after)
+        return self._index.to_read.num_free(self.config.free_after)
 
     @property
     def num_bytes(self) -> int:
@@ -134,17 +135,17 @@ class TsdfVolume(PagedMap):
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
         is the window, whose size depends on the view and the voxels, not on the map.
         """
-        return self.blocks.num_bytes
+        return self._index.to_read.num_bytes
 
     @property
     def entry_bytes(self) -> float:
         """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self.blocks.entry_bytes
+        return self._index.to_read.entry_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return self.blocks.active_slots
+        return self._index.to_read.active_slots
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -188,16 +189,16 @@ class TsdfVolume(PagedMap):
         weights: NDArray[np.uint8] | None,
         T_world_camera: NDArray[np.float64],
         count: int,
-    ) -> NDArray[np.int32]:
+    ) -> NDArray[np.int32] | None:
         """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
         return self._integrator.integrate(
-            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+            self._index, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
         )
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
-        self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
+        self._index, self.pager = other._index, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
 
     def for_camera(
@@ -206,13 +207,14 @@ class TsdfVolume(PagedMap):
         """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
         volume must not be used afterwards."""
         other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
-        other.blocks, other.pager, other._frame_number = self.blocks, self.pager or other.pager, self._frame_number
+        other.pager, other._frame_number = self.pager or other.pager, self._frame_number
+        other.blocks = self.blocks
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
-        origin = self.window.moved(middle, self._left)
+        origin = self._index.place.moved(middle, self._left)
         if origin is not None:
             self._left = None
             self._place_window(origin)
@@ -222,7 +224,11 @@ class TsdfVolume(PagedMap):
     @property
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
-        return self._integrator.grid(self.blocks, self.window)
+        return self._integrator.grid(self._index)
+
+    def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
+        return self._index.place.T_grid_camera(T_world_camera)
 
     def sample(
         self,
@@ -233,7 +239,7 @@ class TsdfVolume(PagedMap):
     ) -> MapSample:
         """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
         at a pose inside the window."""
-        T = self.window.T_grid_camera(T_world_camera)
+        T = self.T_grid_camera(T_world_camera)
         return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
 
     def known_share(
@@ -253,12 +259,13 @@ class TsdfVolume(PagedMap):
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
-        slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
+        slots, local = self._index.slots_at(voxels // BLOCK), voxels % BLOCK
         numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
-        words = self.blocks.geometry_mirror.take(np.maximum(slots, 0), numbers)
+        words = self._index.held.geometry_mirror.take(np.maximum(slots, 0), numbers)
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        out[rows, columns] = weights / (weights + self._integrator.reading_weights(depth, camera)[rows, columns])
+        gains = np.asarray(self._integrator.reading_weights(depth, camera))
+        out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 
     def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
@@ -278,11 +285,11 @@ class TsdfVolume(PagedMap):
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
             return joined(list(self.extract_pieces(min_weight)))
-        slots, blocks = self.active_slots, self.blocks
+        slots, blocks = self.active_slots, self._index.to_read
         return Mesh(
             *self.backend.extract_mesh(
-                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-                self._mesh_parameters(min_weight),
+                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
+                Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight),
             )
         )  # fmt: skip
 
@@ -314,10 +321,10 @@ class TsdfVolume(PagedMap):
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
             min_weight: As of ``extract_mesh``.
         """
-        blocks = self.blocks
+        blocks = self._index.to_read
         meshes = self.backend.extract_chunks(
-            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords, blocks.neighbours(slots),
-            self._mesh_parameters(min_weight), chunks,
+            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
+            Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]
 
@@ -331,12 +338,13 @@ class TsdfVolume(PagedMap):
 
         A slot that was released is among them, with the coordinates of the block that had it or of the next one.
         """
-        slots = np.flatnonzero(self.blocks.written[: self.blocks.num_slots] > num_integrated).astype(np.int32)
-        return slots, self.blocks.slot_coords[slots].astype(np.int32)
+        blocks = self._index.to_read
+        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
+        return slots, blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        return self.blocks.slots_at(coords)
+        return self._index.to_read.slots_at(coords)
 
     # -- files -------------------------------------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import hashing
+from dudmap.kernels.block_index import IndexArrays
 from dudmap.kernels.mirror import Mirror, grown
 from dudmap.kernels.parameters import BLOCK
 
@@ -156,7 +157,12 @@ class VoxelBlocks:
 
     def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
         """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
-        needed = self.num_entries + unknown
+        self.reserve_entries(self.num_entries + unknown)
+        entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
+        return entries
+
+    def reserve_entries(self, needed: int) -> None:
+        """Have room for so many entries."""
         if needed > len(self.coords):
             capacity = max(needed, 2 * len(self.coords))
             self.coords = grown(self.coords, capacity, 0)
@@ -166,14 +172,9 @@ class VoxelBlocks:
             size = max(int(needed / MAX_LOAD), len(self.table)) * 3 // 2  # a search in a full table would not end
             self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
             hashing.rebuild(self.table, self.coords, self.num_entries)
-        entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
-        return entries
 
-    def allocate(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
-        """New slots (n,) int32 for entries that have none."""
-        kept = max(len(self._released) - len(entries), 0)
-        reused, self._released = self._released[kept:][::-1], self._released[:kept]
-        needed = self.num_slots + len(entries) - len(reused)
+    def reserve_slots(self, needed: int) -> None:
+        """Have room for so many slots."""
         if needed > len(self.entry_of):
             capacity = max(needed, len(self.entry_of) * 3 // 2)
             self.geometry_mirror.grow(capacity, 0)
@@ -182,6 +183,13 @@ class VoxelBlocks:
             self.slot_coords = grown(self.slot_coords, capacity, 0)
             self.written = grown(self.written, capacity, 0)
             self.fused = grown(self.fused, capacity, 0)
+
+    def allocate(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
+        """New slots (n,) int32 for entries that have none."""
+        kept = max(len(self._released) - len(entries), 0)
+        reused, self._released = self._released[kept:][::-1], self._released[:kept]
+        needed = self.num_slots + len(entries) - len(reused)
+        self.reserve_slots(needed)
         slots = np.concatenate([reused, np.arange(self.num_slots, needed, dtype=np.int32)])
         self.use_slots(needed)
         self.entry_of[slots] = entries
@@ -190,6 +198,31 @@ class VoxelBlocks:
         self.fused[slots] = 0
         self.slot_of[entries] = slots
         return slots
+
+    def arrays(self, near: NDArray[np.int32]) -> IndexArrays:
+        """All but the voxels, as a device takes it over; with the slots (n,) of a window."""
+        n, m = self.num_entries, self.num_slots
+        return IndexArrays(
+            self.coords[:n], self.slot_of[:n], self.free_count[:n], self.entry_of[:m], self.slot_coords[:m],
+            self.written[:m], self.fused[:m], self._released, near,
+        )  # fmt: skip
+
+    def follow(self, index: IndexArrays) -> None:
+        """Take over what a device has made of ``arrays``; entries that it did not have are new ones.
+
+        Voxels of a slot that another block had are removed until those of the device come down.
+        """
+        n, m, known = len(index.coords), len(index.entry_of), self.num_entries
+        self.reserve_entries(n)
+        self.reserve_slots(m)
+        _, self.num_entries = hashing.insert_all(self.table, self.coords, known, index.coords[known:])
+        moved = (index.entry_of < 0) | np.any(index.slot_coords != self.slot_coords[:m], axis=1)
+        moved &= self.entry_of[:m] >= 0
+        self.geometry_mirror.stale[:m][moved], self.colors_mirror.stale[:m][moved] = 0, 0
+        self.slot_of[:n], self.free_count[:n] = index.slot_of, index.free_count
+        self.entry_of[:m], self.slot_coords[:m] = index.entry_of, index.slot_coords
+        self.written[:m], self.fused[:m], self._released = index.written, index.fused, index.released
+        self.use_slots(m)
 
     def use_slots(self, num_slots: int) -> None:
         """Take the slots below a number for used, on a device, too."""

@@ -163,7 +163,7 @@ def write_run_folder(
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
-        metrics["device"] = resolve(config.compute_device)
+        metrics["device"] = resolve(config.device)
         metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 

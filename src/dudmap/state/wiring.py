@@ -35,9 +35,8 @@ REBUILT = {
     "StageTimer": ("_clock", "_marks", "_inner"),  # of a device, and only until the frame is done
     "Slam": ("device",),  # a run may be continued on another one
     "TsdfVolume": (
-        "blocks",
+        "_index",
         "levels",
-        "window",
         "map_id",
     ),  # the blocks have a table; the number is one of this process
 }

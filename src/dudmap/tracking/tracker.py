@@ -290,7 +290,7 @@ class Tracker:
         """
         return volume.backend.linearize(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
-            volume.window.T_grid_camera(T_world_camera), self._parameters(volume, color_weight),
+            volume.T_grid_camera(T_world_camera), self._parameters(volume, color_weight),
         )  # fmt: skip
 
     def _parameters(self, volume: TsdfVolume, color_weight: float | None) -> RegistrationParameters:

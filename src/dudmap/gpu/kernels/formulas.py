@@ -14,7 +14,19 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.kernels import evidence, filtering, labeling, pixel, raycasting, residual, sampling, segmentation, voxel
+from dudmap.kernels import (
+    evidence,
+    filtering,
+    finest,
+    labeling,
+    pixel,
+    raycasting,
+    refinement,
+    residual,
+    sampling,
+    segmentation,
+    voxel,
+)
 from dudmap.kernels import surface as vertex
 
 wp.set_module_options({"enable_backward": False})
@@ -71,8 +83,8 @@ _NUMPY = types.SimpleNamespace(
 )  # fmt: skip
 """What the formulas use of NumPy, and of ``math``. Indices of 64 bits fit into 32 there."""
 _OF_NUMPY = {
-    np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.floor: wp.floor, np.sqrt: wp.sqrt,
-    np.exp: wp.exp,
+    np.float32: wp.float32, np.float64: wp.float64, np.int32: wp.int32, np.int64: wp.int32, np.floor: wp.floor,
+    np.sqrt: wp.sqrt, np.exp: wp.exp,
 }  # fmt: skip
 _OWN = {"bits": bits, "upper_half": upper_half}
 _compiled: dict[Dispatcher | types.FunctionType, wp.Function] = {}
@@ -121,6 +133,7 @@ mean_spin, same_surface = warp_function(labeling.mean_spin), warp_function(label
 dynamic_responsibility = warp_function(labeling.dynamic_responsibility)
 bounded_sigma = warp_function(labeling.bounded_sigma)
 residual_bin, noise_limit = warp_function(evidence.residual_bin), warp_function(evidence.noise_limit)
+static_sigma, edge_tolerance = warp_function(evidence.static_sigma), warp_function(evidence.edge_tolerance)
 surface_log_odds = warp_function(evidence.surface_log_odds)
 normal_of_gradient, is_concave = warp_function(segmentation.normal_of_gradient), warp_function(segmentation.is_concave)
 plane_distance = warp_function(segmentation.plane_distance)
@@ -130,3 +143,8 @@ step_length, corner_gradient = warp_function(raycasting.step_length), warp_funct
 to_block_boundary = warp_function(raycasting.to_block_boundary)
 crossing, mixed_channel = warp_function(vertex.crossing), warp_function(vertex.mixed_channel)
 slope = warp_function(vertex.slope)
+half_word, quarter_word = warp_function(finest.half_word), warp_function(finest.quarter_word)
+finest_at = warp_function(finest.finest_at)
+distance_bend, intensity_bend = warp_function(refinement.distance_bend), warp_function(refinement.intensity_bend)
+root_mean = warp_function(refinement.root_mean)
+mean_voxel, mean_color = warp_function(refinement.mean_voxel), warp_function(refinement.mean_color)

@@ -144,18 +144,21 @@ def pack_pixels(
 
 @wp.kernel
 def visible_slots(
-    slots: Indices, coords: wp.array2d(dtype=wp.int32), fused: wp.array(dtype=wp.uint8), turn: int, t: Motion,
-    camera: Camera, height: int, width: int, block_size: wp.float32, farthest: Image, p: FusionParameters,
+    slots: Indices, coords: wp.array2d(dtype=wp.int32), shift: wp.vec3i, fused: wp.array(dtype=wp.uint8), turn: int,
+    t: Motion, camera: Camera, height: int, width: int, block_size: wp.float32, farthest: Image, p: FusionParameters,
     marks: Indices, repeats: wp.array(dtype=wp.float32),
 ):  # fmt: skip
-    """Mark the candidates that the image can change and that are updated now: see ``visibility.visible_slots``."""
+    """Mark the candidates that the image can change and that are updated now: see ``visibility.visible_slots``.
+
+    Coordinates less ``shift`` are those from which ``t`` leads to the camera.
+    """
     n = wp.tid()
     slot = slots[n]
     marks[n] = 0
     half = wp.float32(0.5)
     one = wp.float32(1.0)
     radius = REACH * block_size
-    i, j, k = wp.int32(coords[slot, 0]), wp.int32(coords[slot, 1]), wp.int32(coords[slot, 2])
+    i, j, k = coords[slot, 0] - shift[0], coords[slot, 1] - shift[1], coords[slot, 2] - shift[2]
     x = (wp.float32(i) + half) * block_size
     y = (wp.float32(j) + half) * block_size
     z = (wp.float32(k) + half) * block_size
@@ -191,7 +194,7 @@ def visible_slots(
 @wp.kernel
 def integrate(
     slots: Indices, candidates: Indices, repeats: wp.array(dtype=wp.float32), count: wp.float32,
-    coords: wp.array2d(dtype=wp.int32), t: Motion, camera: Camera, height: int, width: int,
+    coords: wp.array2d(dtype=wp.int32), shift: wp.vec3i, t: Motion, camera: Camera, height: int, width: int,
     pixels: wp.array2d(dtype=wp.int32), geometry: wp.array2d(dtype=wp.int32), colors: wp.array2d(dtype=wp.int32),
     p: FusionParameters, occupied: Indices,
 ):  # fmt: skip
@@ -203,9 +206,9 @@ def integrate(
     number = slots[block]
     slot = candidates[number]
     half, one = wp.float32(0.5), wp.float32(1.0)
-    ox = wp.float32(wp.int32(coords[slot, 0]) * 8) * p.voxel_size
-    oy = wp.float32(wp.int32(coords[slot, 1]) * 8) * p.voxel_size
-    oz = wp.float32(wp.int32(coords[slot, 2]) * 8) * p.voxel_size
+    ox = wp.float32((coords[slot, 0] - shift[0]) * 8) * p.voxel_size
+    oy = wp.float32((coords[slot, 1] - shift[1]) * 8) * p.voxel_size
+    oz = wp.float32((coords[slot, 2] - shift[2]) * 8) * p.voxel_size
     x = wp.float32(n / 64) * p.voxel_size
     y = wp.float32((n / 8) % 8) * p.voxel_size
     z = wp.float32(n % 8) * p.voxel_size

@@ -7,14 +7,16 @@ import warp as wp
 
 from dudmap.gpu.kernels.formulas import (
     Motion,
+    edge_tolerance,
     noise_limit,
     project,
     ray,
     residual_bin,
+    static_sigma,
     surface_log_odds,
     transform,
 )
-from dudmap.gpu.kernels.structs import Camera, EvidenceParameters
+from dudmap.gpu.kernels.structs import Camera, EvidenceParameters, NoiseParameters
 from dudmap.kernels import evidence, parameters, reprojection
 
 wp.set_module_options({"enable_backward": False})
@@ -35,6 +37,18 @@ PER_SIGMA, PER_UNIT = wp.constant(wp.float32(2.0**20)), wp.constant(wp.float32(2
 """Steps of the sums over segments, per standard deviation of a distance and per unit of the intensity: the sums over
 any image are exact in 64 bits."""
 LEAST_SHARE = wp.constant(wp.float32(float(evidence.LEAST_SHARE)))
+
+
+@wp.kernel
+def reading_noise(depth: Image, p: NoiseParameters, sigma: Image, tolerance: Image, gap: Image, bounded: Image):
+    """Noise of each reading: see ``evidence.reading_noise``."""
+    v, u = wp.tid()
+    z = depth[v, u]
+    s = static_sigma(z, p.base, p.scale, p.map_variance)
+    sigma[v, u] = s
+    tolerance[v, u] = edge_tolerance(s, z, p.edge_sigmas, p.edge_slope)
+    gap[v, u] = p.gap * noise_limit(s, p.floor, p.sigmas)
+    bounded[v, u] = max(p.least_sigma, s)
 
 
 @wp.kernel

@@ -23,6 +23,7 @@ TruncationBand = _struct_of(parameters.TruncationBand)
 FusionParameters = _struct_of(parameters.FusionParameters)
 RegistrationParameters = _struct_of(parameters.RegistrationParameters)
 EvidenceParameters = _struct_of(evidence.EvidenceParameters)
+NoiseParameters = _struct_of(evidence.NoiseParameters)
 
 
 @wp.struct
@@ -50,6 +51,21 @@ class Lattice:
     nx: wp.int32
     ny: wp.int32
     nz: wp.int32
+
+
+@wp.struct
+class Index:
+    """Entries and slots of a map: see ``block_index.IndexArrays``."""
+
+    coords: wp.array2d(dtype=wp.int32)
+    slot_of: wp.array(dtype=wp.int32)
+    free_count: wp.array(dtype=wp.uint8)
+    entry_of: wp.array(dtype=wp.int32)
+    slot_coords: wp.array2d(dtype=wp.int32)
+    written: wp.array(dtype=wp.int32)
+    fused: wp.array(dtype=wp.uint8)
+    released: wp.array(dtype=wp.int32)
+    near: wp.array(dtype=wp.int32)
 
 
 def struct(values: tuple) -> Any:
