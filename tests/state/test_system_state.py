@@ -84,7 +84,8 @@ def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch
         monkeypatch.setattr(f"dudmap.places.{module}.AT_ONCE", 4)
     monkeypatch.setattr("dudmap.places.loop_correction._is_worse", lambda after, before: False)  # there was no loop
     sequence, frames = scene(movers=(), frames=48)
-    slam = Slam(sequence.camera, Config().override(["loops.keep_gap=1", "loops.min_age=100"]))
+    settings = ["loops.keep_gap=1", "loops.min_age=100", "volume.voxel_size=0.02"]
+    slam = Slam(sequence.camera, Config().override(settings))
     for frame in frames[:24]:
         slam.process(frame)
     Ts = slam.atlas.history.Ts_world_camera
