@@ -12,20 +12,26 @@ SELF := $(PIP) install --quiet --no-index --no-build-isolation --editable
 COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --fork-strategy fewest --upgrade \
 	--generate-hashes --custom-compile-command "make lock" --group build pyproject.toml
 
-# tests of one file share fixtures, so they stay in one process; the longest file takes a sixth of the time, so more
-# than a few processes gain nothing
+# tests of one file share fixtures, so they stay in one process; the longest file takes a sixteenth of the time
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all check docs package processors soak fuzz fuzz-guided audit licences lock clean
+.PHONY: demo test test-all ready check docs package processors soak fuzz fuzz-guided audit licences lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
 
-test: .venv/developed check
+test: ready
 	$(PYTEST)
 
-test-all: .venv/developed check
+test-all: ready
 	$(PYTEST) -m "slow or not slow"
+
+# a new checkout: most kernels are compiled once for all test processes, while another core does the checks
+ready: .venv/developed
+	$(MAKE) --jobs 2 check .numba_cache/common
+
+.numba_cache/common: | .venv/developed
+	NUMBA_CACHE_DIR=$(CURDIR)/$@ $(BIN)/dudmap warmup --quiet
 
 check: .venv/developed
 	$(BIN)/ruff check

@@ -1,6 +1,7 @@
 """Settings of the test processes (pytest-xdist's workers; OpenCV's for benchmarks/processors.py), shared fixtures."""
 
 import os
+import shutil
 import sys
 import types
 from pathlib import Path
@@ -15,8 +16,11 @@ if worker is not None:
     # One Numba cache per worker. Numba's index of a function is read, changed and written without a lock: two
     # processes that compile one function for different argument types can give both results the same file name,
     # and a changed function's old machine code stays readable between the writes of the index and of the new file.
-    caches = os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".numba_cache"
-    os.environ["NUMBA_CACHE_DIR"] = str(Path(caches) / worker)
+    # A new worker begins with a copy of what "make test" has compiled while it checked the sources.
+    caches = Path(os.environ.get("NUMBA_CACHE_DIR") or Path(__file__).parents[1] / ".numba_cache")
+    if not (caches / worker).exists() and (caches / "common").exists():
+        shutil.copytree(caches / "common", caches / worker)
+    os.environ["NUMBA_CACHE_DIR"] = str(caches / worker)
     # The cores are shared by the workers; at least two threads, so that the code for several threads is tested.
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     os.environ.setdefault("DUDMAP_THREADS", str(max(2, cores // int(os.environ["PYTEST_XDIST_WORKER_COUNT"]))))

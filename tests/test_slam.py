@@ -1,11 +1,13 @@
 """The whole algorithm on small synthetic recordings: accuracy, loss, redundancy, switches, determinism."""
 
+import hashlib
 import os
 import subprocess
 import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -185,35 +187,34 @@ def test_frames_that_do_not_fit_the_camera_are_refused():
         Slam(SMALL).process(Frame(0.0, np.ones((10, 10), np.float32), np.zeros((10, 10, 3), np.uint8)))
 
 
-SCRIPT = """
-import hashlib
-from dudmap import Slam, synthetic
-from dudmap.geometry.camera import Camera
-camera = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
-sequence = synthetic.sequence("room", movers=("person",), frames=10, camera=camera, start_dynamic=True)
-slam = Slam(camera)
-digest = hashlib.sha256()
-for index in range(10):
-    digest.update(slam.process(sequence[index]).dynamic_mask.tobytes())
-digest.update(slam.trajectory.Ts_world_camera.tobytes())
-for part in vars(slam.volume.extract_mesh()).values():
-    digest.update(part.tobytes())
-print(digest.hexdigest())
-"""
+def digest():
+    """Checksum of the poses, masks and mesh of a small run."""
+    sequence = synthetic.sequence("room", movers=("person",), frames=10, camera=SMALL, start_dynamic=True)
+    slam = Slam(SMALL)
+    found = hashlib.sha256()
+    for index in range(10):
+        found.update(slam.process(sequence[index]).dynamic_mask.tobytes())
+    found.update(slam.trajectory.Ts_world_camera.tobytes())
+    for part in vars(slam.volume.extract_mesh()).values():
+        found.update(part.tobytes())
+    return found.hexdigest()
 
 
 def test_the_result_does_not_depend_on_the_number_of_threads_or_the_run():
+    """This process has at least two threads where pytest-xdist started it."""
+    command = [sys.executable, "-c", "import test_slam; print(test_slam.digest())"]
     digests = {
         subprocess.run(
-            [sys.executable, "-c", SCRIPT],
+            command,
+            cwd=Path(__file__).parent,
             env={**os.environ, "DUDMAP_THREADS": threads},
             capture_output=True,
             text=True,
             check=True,
-        ).stdout
-        for threads in ("1", "2", "3")
+        ).stdout.strip()
+        for threads in ("1", "3")
     }
-    assert len(digests) == 1
+    assert digests == {digest()}
 
 
 def test_importing_dudmap_is_light():

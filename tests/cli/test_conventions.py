@@ -77,7 +77,6 @@ CALLS = {
     "evaluate masks": ["evaluate", "masks", "run", "recording"],
     "doctor": ["doctor"],
     "config": ["config", "--preset", "thesis"],
-    "study thesis": ["study", "thesis", "--published", "--out", "published"],
 }
 """Quick calls; the answers of the other commands have their own test below, or go through the same function."""
 
@@ -165,6 +164,10 @@ FAKED = {
     "study tune": (
         ["study", "tune", "design.toml"],
         {"dudmap.study.plan.load_plan": lambda _: None, "dudmap.study.tune.run_tune": lambda *_, **__: "an outcome"},
+    ),
+    "study thesis": (
+        ["study", "thesis", "--published", "--out", "published"],
+        {"dudmap.study.thesis.published_report": lambda _: "an outcome"},
     ),
 }
 """Long commands, with their measurements replaced."""

@@ -251,7 +251,8 @@ def test_maps_are_joined_when_a_place_is_recognised():
 
 def test_a_map_that_is_never_joined_is_written_beside_the_main_one(tmp_path):
     sequence = turned(np.concatenate([np.zeros(30), np.full(24, 150.0)]))
-    report = run(sequence, Config(), tmp_path, progress=False)
+    config = Config().override(["volume.voxel_size=0.02"])
+    report = run(sequence, config, tmp_path, progress=False)
     assert report.metrics["maps"] == 2
     assert report.metrics["lost"] >= 12
     assert len(report.trajectory) == 30
@@ -259,14 +260,16 @@ def test_a_map_that_is_never_joined_is_written_beside_the_main_one(tmp_path):
     assert len(second) == report.metrics["tracked"] - 30
     np.testing.assert_allclose(second.Ts_world_camera[0], np.eye(4), atol=1e-9)
     assert (tmp_path / "mesh-2.ply").stat().st_size > 1000
-    run(sequence, Config(), tmp_path, progress=False, max_frames=5)
+    run(sequence, config, tmp_path, progress=False, max_frames=5)
     assert not (tmp_path / "trajectory-2.txt").exists()
     assert not (tmp_path / "mesh-2.ply").exists()
 
 
 def test_without_a_loop_nothing_changes():
     sequence = turned(np.linspace(0, 40, 40))
-    on, off = Slam(SMALL), Slam(SMALL, Config().override(["loops.enabled=false", "submaps.enabled=false"]))
+    settings = ["volume.voxel_size=0.02"]
+    without = [*settings, "loops.enabled=false", "submaps.enabled=false"]
+    on, off = (Slam(SMALL, Config().override(changes)) for changes in (settings, without))
     for i in range(len(sequence)):
         a, b = on.process(sequence[i]), off.process(sequence[i])
         np.testing.assert_array_equal(a.T_world_camera, b.T_world_camera)

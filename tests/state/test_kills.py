@@ -1,5 +1,6 @@
-"""A run that is killed at any moment and continued gives what a run that was not interrupted gives."""
+"""A run that is killed at any moment, or whose disk is full, and continued gives what an undisturbed run gives."""
 
+import json
 import shutil
 import sys
 import time
@@ -8,6 +9,8 @@ import cv2
 import numpy as np
 import pytest
 from killing import begin, in_child, killed, lost_and_found, proceed, results
+
+from dudmap.errors import DudmapError
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
 
@@ -60,3 +63,40 @@ def test_fifty_killed_runs_are_continued(whole, tmp_path):
         print(f"{seed + 1} of {len(kinds)}: {moment}, {count} killed", flush=True)
     print(f"{count} of {len(kinds)} runs were killed; all were continued with equal results")
     assert count >= 45
+
+
+LIMIT = 3_000_000
+"""Bytes of the largest file that may be written: the database grows beyond it, the stored frames do not."""
+
+
+def on_a_full_disk(sequence, out, report):
+    """A run whose files cannot grow beyond ``LIMIT``; what it says is written to ``report``."""
+    import resource  # POSIX only
+
+    from dudmap.pipeline.progress import RunProgress
+
+    said = []
+    RunProgress.note = lambda self, sentence: said.append(sentence)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (LIMIT, resource.RLIM_INFINITY))
+    error = ""
+    try:
+        begin(sequence, out)
+    except DudmapError as raised:
+        error = str(raised)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    report.write_text(json.dumps({"said": said, "error": error}))
+
+
+def test_a_run_goes_on_in_memory_while_the_disk_is_full(whole, tmp_path):
+    """It says so once, and what is stored is not damaged."""
+    (sequence, expected, _), out = whole, tmp_path / "out"
+    assert in_child(on_a_full_disk, sequence, out, tmp_path / "report") == 0
+    told = json.loads((tmp_path / "report").read_text())
+    warnings = [sentence for sentence in told["said"] if "cannot be stored" in sentence]
+    assert len(warnings) == 1
+    assert "goes on in memory and tries again" in warnings[0]
+    assert told["error"].startswith(f"the run folder {out} is incomplete: ")
+    assert json.loads((out / "metrics.json").read_text())["frames"] == len(sequence)
+    assert not [path for path in out.iterdir() if ".part" in path.name]
+    assert in_child(proceed, sequence, out) == 0  # there is room again
+    assert results(out) == expected

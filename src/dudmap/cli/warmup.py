@@ -64,6 +64,12 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         for variant in ("preset=thesis", "dynamics.method=threshold", "tracker.robust=tukey"):
             process(Slam(camera, Config().override([variant, *small])))
 
+    def several_voxel_sizes() -> None:
+        adaptive = Slam(camera, Config().override(["volume.adaptive=true", "volume.adaptive_bend=0.05", *small]))
+        process(adaptive)
+        adaptive.volume.extract_mesh()
+        adaptive.volume.raycast(adaptive.trajectory.Ts_world_camera[-1], camera)
+
     def save_and_load() -> None:
         with tempfile.TemporaryDirectory() as folder:
             slam.volume.save(Path(folder) / "map.npz")
@@ -75,5 +81,6 @@ def steps() -> list[tuple[str, Callable[[], object]]]:
         ("variants of the method", process_variants),
         ("mesh", lambda: slam.volume.extract_mesh()),
         ("view", lambda: slam.volume.raycast(slam.trajectory.Ts_world_camera[-1], camera)),
+        ("several voxel sizes", several_voxel_sizes),
         ("map file", save_and_load),
     ]

@@ -33,6 +33,7 @@ REBUILT = {
     "LoopCloser": ("_executor",),
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
     "StageTimer": ("_clock", "_marks", "_inner"),  # of a device, and only until the frame is done
+    "SimilarityTest": ("_sift",),
     "Slam": ("device",),  # a run may be continued on another one
     "TsdfVolume": (
         "_index",

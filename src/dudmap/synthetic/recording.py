@@ -178,14 +178,7 @@ class SyntheticSequence:
                 a grazing angle) in at least ``views`` of up to 120 evenly spread frames.
             views: See ``observed``.
         """
-        end = float(self.timestamps[-1])
-        resting = [
-            primitive.moved(T)
-            for mover in self._movers
-            if mover.settles and mover.present(end) and mover.top_speed(end - 0.5, 1.0) < MOVING_SPEED
-            for primitive, T in zip(mover.primitives, mover.parts(end), strict=True)
-        ]
-        mesh = tessellate(self.scene.primitives + resting, self.scene.detail, self.scene.extent, self._renderer.atlas)
+        mesh = self._surface
         if not observed:
             return mesh
         model = self._sensor.model
@@ -195,6 +188,18 @@ class SyntheticSequence:
         counts = count_views(mesh, self.camera, shots, reach, model.grazing if model else 0.1)
         enough = counts >= min(views, len(frames))
         return with_faces(mesh, np.all(enough[mesh.faces], axis=1))
+
+    @cached_property
+    def _surface(self) -> Mesh:
+        """The whole of ``surface``."""
+        end = float(self.timestamps[-1])
+        resting = [
+            primitive.moved(T)
+            for mover in self._movers
+            if mover.settles and mover.present(end) and mover.top_speed(end - 0.5, 1.0) < MOVING_SPEED
+            for primitive, T in zip(mover.primitives, mover.parts(end), strict=True)
+        ]
+        return tessellate(self.scene.primitives + resting, self.scene.detail, self.scene.extent, self._renderer.atlas)
 
     def _number(self, index: int) -> int:
         number = index + len(self) if index < 0 else index

@@ -149,17 +149,17 @@ def tessellate(
             local, normals, faces = _revolved(primitive, detail)
         T = primitive.T_body_primitive
         vertices, directions = local @ T[:3, :3].T + T[:3, 3], normals @ T[:3, :3].T
-        corners = vertices[faces]
-        cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area = np.linalg.norm(cross, axis=1)
+        a, b, c = np.ascontiguousarray(vertices.T)[:, faces.T].transpose(1, 0, 2)
+        cross = _cross(b - a, c - a)
+        area = np.sqrt(cross[0] ** 2 + cross[1] ** 2 + cross[2] ** 2)
         keep = area > 1e-12
-        front = corners.mean(axis=1) + 1e-3 * cross / np.maximum(area, 1e-12)[:, None]
-        keep &= np.all((front > low) & (front < high), axis=1)
+        front = (a + b + c) / 3 + 1e-3 * cross / np.maximum(area, 1e-12)
+        keep &= _within(front, low, high)
         for other, (other_low, other_high) in enumerate(boxes):
             if other == number or np.any(other_low > boxes[number][1]) or np.any(other_high < boxes[number][0]):
                 continue
-            near = np.flatnonzero(keep & np.all((front > other_low) & (front < other_high), axis=1))
-            keep[near[primitives[other].distance(front[near]) < 0]] = False
+            near = np.flatnonzero(keep & _within(front, other_low, other_high))
+            keep[near[primitives[other].distance(np.ascontiguousarray(front[:, near].T)) < 0]] = False
         if keep.any():
             pieces.append((vertices, directions, _colors(primitive, local, normals, detail, atlas), faces[keep]))
     starts = np.cumsum([0, *(len(piece[0]) for piece in pieces)])
@@ -170,6 +170,19 @@ def tessellate(
         np.concatenate([piece[1] for piece in pieces]).astype(np.float32),
     )
     return with_faces(mesh, np.ones(len(mesh.faces), dtype=bool))
+
+
+def _cross(a: Points, b: Points) -> Points:
+    """Cross products (3, N) of vectors (3, N), several times faster by axis than row by row."""
+    return np.stack([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
+
+
+def _within(points: Points, low: Points, high: Points) -> NDArray[np.bool_]:
+    """Whether points (3, N) lie between two corners (3,) of a box."""
+    inside = np.ones(points.shape[1], dtype=bool)
+    for values, least, most in zip(points, low, high, strict=True):
+        inside &= (values > least) & (values < most)
+    return inside
 
 
 def _world_bounds(primitive: Primitive) -> tuple[Points, Points]:

@@ -1,6 +1,7 @@
 """Procedural textures: band-limited, with gradients at every scale, and reproducible from a seed."""
 
 from collections.abc import Callable
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 Image = NDArray[np.float64]
 
 SIZE = 512  # must equal kernels.raytracing.TEXTURE_SIZE
+HALF = SIZE // 2
 LEVELS = 10
 
 
@@ -114,7 +116,8 @@ def _poster(rng: np.random.Generator) -> Image:
     x, y = _grid()
     image = np.empty((SIZE, SIZE, 3))
     for quarter in range(4):
-        rows, columns = slice(256 * (quarter // 2), None), slice(256 * (quarter % 2), None)
+        top, left = HALF * (quarter // 2), HALF * (quarter % 2)
+        rows, columns = slice(top, top + HALF), slice(left, left + HALF)
         u, v = np.mod(x * 2, 1)[rows, columns], np.mod(y * 2, 1)[rows, columns]
         ground = rng.uniform(0.2, 0.95, 3)
         part = np.broadcast_to(ground, (*u.shape, 3)) * (0.7 + 0.5 * v[..., None])
@@ -127,8 +130,8 @@ def _poster(rng: np.random.Generator) -> Image:
             inside = np.hypot(a, b) < size if rng.random() < 0.5 else (np.abs(a) < size) & (np.abs(b) < size * 0.35)
             part = np.where(inside[..., None], color, part)
         for line in range(5):
-            top = 0.74 + 0.045 * line
-            ink = (v > top) & (v < top + 0.022) & (u > 0.1) & (u < rng.uniform(0.6, 0.92))
+            upper = 0.74 + 0.045 * line
+            ink = (v > upper) & (v < upper + 0.022) & (u > 0.1) & (u < rng.uniform(0.6, 0.92))
             letters = rng.random(64)[np.clip((u * 64).astype(int), 0, 63)] > 0.3
             part = np.where((ink & letters)[..., None], 0.05, part)
         frame = (np.minimum(np.minimum(u, 1 - u), np.minimum(v, 1 - v)) < 0.03)[..., None]
@@ -140,18 +143,19 @@ def _books(rng: np.random.Generator) -> Image:
     """Four shelves of book spines with labels."""
     x, y = _grid()
     image = np.full((SIZE, SIZE, 3), 0.12)
-    for shelf in range(4):
+    for part, v in zip(np.split(image, 4), np.split(np.mod(y * 4, 1), 4), strict=True):
         left = 0.0
-        inside_shelf = np.floor(y * 4).astype(int) == shelf
-        v = np.mod(y * 4, 1)
         while left < 1.0:
             width, height = rng.uniform(0.018, 0.05), rng.uniform(0.62, 0.94)
-            spine = inside_shelf & (x >= left) & (x < min(left + width, 1.0)) & (v > 1 - height)
-            image[spine] = rng.uniform(0.1, 0.9, 3)
+            book = slice(*np.searchsorted(x[0], (left, left + width)))  # columns, beginning with the first at or after
+            pixels, across, up = part[:, book], x[: len(part), book], v[:, book]
+            spine = up > 1 - height
+            pixels[spine] = rng.uniform(0.1, 0.9, 3)
             label = rng.uniform(0.35, 0.6)
-            band = spine & (np.abs(v - 1 + height * label) < 0.07) & (x > left + 0.2 * width) & (x < left + 0.8 * width)
-            image[band] = rng.uniform(0.5, 1.0, 3)
-            image[spine & (x < left + 0.0035)] *= 0.4
+            band = np.abs(up - 1 + height * label) < 0.07
+            band &= spine & (across > left + 0.2 * width) & (across < left + 0.8 * width)
+            pixels[band] = rng.uniform(0.5, 1.0, 3)
+            pixels[spine & (across < left + 0.0035)] *= 0.4
             left += width
     return image * (1 + 0.04 * fractal(rng, 0.5, 4, 100)[..., None])
 
@@ -257,18 +261,24 @@ def build_atlas(names: set[str], seed: int = 0) -> NDArray[np.int32]:
 
     A texel is red | green << 8 | blue << 16, each 0..255.
     """
-    texels = sum((SIZE >> level) ** 2 for level in range(LEVELS))
-    atlas = np.zeros((len(TEXTURES), texels), dtype=np.int32)
+    atlas = np.zeros((len(TEXTURES), sum((SIZE >> level) ** 2 for level in range(LEVELS))), dtype=np.int32)
     for number, name in enumerate(TEXTURES):
-        if name not in names and number != 0:
-            continue
-        image = np.clip(_MAKERS[name](np.random.default_rng([seed, number])), 0.0, 1.0)
-        start = 0
-        for level in range(LEVELS):
-            size = SIZE >> level
-            bytes_ = np.rint(image.reshape(-1, 3) * 255).astype(np.int32)
-            atlas[number, start : start + size * size] = bytes_ @ np.array([1, 1 << 8, 1 << 16], dtype=np.int32)
-            start += size * size
-            if size > 1:
-                image = image.reshape(size // 2, 2, size // 2, 2, 3).mean(axis=(1, 3))
+        if name in names or number == 0:
+            atlas[number] = _mip_maps(name, seed)
     return atlas
+
+
+@cache
+def _mip_maps(name: str, seed: int) -> NDArray[np.int32]:
+    """Texels of all levels of a texture, from the finest on; scenes share textures, which take long to compute."""
+    image = np.clip(_MAKERS[name](np.random.default_rng([seed, TEXTURES.index(name)])), 0.0, 1.0)
+    levels = []
+    for level in range(LEVELS):
+        size = SIZE >> level
+        bytes_ = np.rint(image.reshape(-1, 3) * 255).astype(np.int32)
+        levels.append(bytes_ @ np.array([1, 1 << 8, 1 << 16], dtype=np.int32))
+        if size > 1:
+            image = image.reshape(size // 2, 2, size // 2, 2, 3).mean(axis=(1, 3))
+    texels = np.concatenate(levels)
+    texels.flags.writeable = False
+    return texels
