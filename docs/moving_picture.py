@@ -37,8 +37,8 @@ def main() -> None:
         cleaner = Cleaner(RunContent.load(folder), sequence)
         pairs = []
         for index in cleaner.indices[::EVERY]:
-            frame, _, background = cleaner.clean(index)
-            pairs.append(side_by_side(frame.color, background.color))
+            cleaned = cleaner.clean(index)
+            pairs.append(side_by_side(cleaned.frame.color, cleaned.background.color))
     first, *others = [Image.fromarray(pair) for pair in pairs]
     first.save(target, save_all=True, append_images=others, duration=EVERY * 1000 // 30, loop=0, quality=60, method=6)
     print(f"{target}: {len(pairs)} images, {target.stat().st_size / 1e6:.2f} MB")

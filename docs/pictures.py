@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from dudmap import Camera, Slam, synthetic
-from dudmap.dynamics.mixture import BINS, MAX_RESIDUAL
 from dudmap.geometry import se3
+from dudmap.kernels.evidence import BINS, MAX_RESIDUAL
 from dudmap.mapping.volume import FREE, TsdfVolume
 from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
 from dudmap.places.pose_graph import Edge, optimize

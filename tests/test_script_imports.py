@@ -1,4 +1,5 @@
-"""Benchmarks and examples, which no other test runs, import only names that exist."""
+"""Benchmarks, examples and the scripts of the documentation, which no other quick test runs, import only names that
+exist."""
 
 import ast
 from pathlib import Path
@@ -6,7 +7,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SCRIPTS = sorted([*(ROOT / "benchmarks").glob("*.py"), *(ROOT / "examples").rglob("*.py")])
+SCRIPTS = sorted(path for folder in ("benchmarks", "docs", "examples") for path in (ROOT / folder).glob("*.py"))
 
 
 def module_names(module):
