@@ -22,7 +22,7 @@ from dudmap.views.cleaning import Cleaner
 
 TARGET = Path(__file__).parent / "images" / "people.webp"
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
-FRAMES, EVERY = 120, 3
+FRAMES, EVERY = 120, 4
 """Frames of the recording (30 a second), and which of them are shown."""
 GAP = 8
 """Width of the line between the two images, pixels."""
@@ -40,7 +40,7 @@ def main() -> None:
             cleaned = cleaner.clean(index)
             pairs.append(side_by_side(cleaned.frame.color, cleaned.background.color))
     first, *others = [Image.fromarray(pair) for pair in pairs]
-    first.save(target, save_all=True, append_images=others, duration=EVERY * 1000 // 30, loop=0, quality=60, method=6)
+    first.save(target, save_all=True, append_images=others, duration=EVERY * 1000 // 30, loop=0, quality=40, method=6)
     print(f"{target}: {len(pairs)} images, {target.stat().st_size / 1e6:.2f} MB")
 
 
