@@ -12,6 +12,7 @@ MODULES = tuple(
         "fusion",
         "blocks",
         "surface",
+        "raycasting",
         "labels",
         "components",
         "descent",

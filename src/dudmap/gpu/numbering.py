@@ -228,12 +228,9 @@ class BlockNumbering:
         )  # fmt: skip
         cells, was = self._loops.marked(marks), index.counts
         new = was._replace(entries=was.entries + cells.size)
-        index.arrays["free_count"] = counts
-        try:
-            lattice = self._with_room(grid, index, new)
-        except Exception:
-            index.arrays["free_count"] = before
-            raise
+        lattice = self._with_room(grid, index, new)
+        if counts.size:  # only now that nothing can fail any more: the CPU would count the frame a second time
+            self._queue.copy(index.arrays["free_count"][: counts.size], counts)
         self._queue.launch(
             kernels.enter_free, cells.size, cells, lattice, _vector(grid.origin), was.entries, min(count, 255),
             index.struct,

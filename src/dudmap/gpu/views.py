@@ -9,8 +9,8 @@ import numpy as np
 import warp as wp  # pyright: ignore[reportMissingImports]
 from numpy.typing import NDArray
 
-from dudmap.gpu.kernels import levels as kernels
-from dudmap.gpu.kernels import surface
+from dudmap.gpu.kernels import levels
+from dudmap.gpu.kernels import raycasting as kernels
 from dudmap.gpu.kernels.formulas import motion_of
 from dudmap.gpu.kernels.structs import Lattice, camera_of
 from dudmap.gpu.memory import resident
@@ -38,7 +38,7 @@ def raycast(
     far = wp.zeros(tiles, dtype=wp.float32, device=device)
     limits = float(parameters.depth_min), float(parameters.depth_max)
     queue.launch(
-        surface.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height, width,
+        kernels.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height, width,
         radius, *limits, near, far,
     )  # fmt: skip
     depth = wp.empty(size, dtype=wp.float32, device=device)
@@ -47,13 +47,13 @@ def raycast(
     colors, unit = resident(grid.colors, device), grid.sdf_unit / grid.voxel_size
     view = camera, motion_of(to_lattice), near, far, *limits, unit, max(int(parameters.min_weight), 1)
     if finer is None:
-        queue.launch(surface.trace, size, lattice, colors, *view, depth, color, normals)
+        queue.launch(kernels.trace, size, lattice, colors, *view, depth, color, normals)
     else:
         voxels, paints = levels_of(finer, device)
         paint = Lattice()
         paint.cells, paint.geometry = lattice.cells, colors
         paint.nx, paint.ny, paint.nz = lattice.nx, lattice.ny, lattice.nz
-        queue.launch(kernels.trace_levels, size, lattice, voxels, paint, paints, *view, depth, color, normals)
+        queue.launch(levels.trace_levels, size, lattice, voxels, paint, paints, *view, depth, color, normals)
     return RaycastResult(queue.download(depth), queue.download(color), queue.download(normals))
 
 
@@ -68,6 +68,6 @@ def levels_of(finer: FinerLevels, device: str) -> tuple[Any, Any]:
 
 
 def _levels(children1: Any, children2: Any, voxels1: Any, voxels2: Any) -> Any:  # noqa: ANN401
-    out = kernels.Levels()
+    out = levels.Levels()
     out.children1, out.children2, out.voxels1, out.voxels2 = children1, children2, voxels1, voxels2
     return out

@@ -7,7 +7,6 @@ import warp as wp
 
 from dudmap.gpu.kernels.formulas import (
     Motion,
-    corner_gradient,
     distance_bend,
     finest_at,
     half_word,
@@ -24,8 +23,9 @@ from dudmap.gpu.kernels.formulas import (
     trilinear,
 )
 from dudmap.gpu.kernels.images import Image
+from dudmap.gpu.kernels.raycasting import FAR, INFINITE, TILE, mixed_channel_at, normal_at, range_inside
 from dudmap.gpu.kernels.structs import Camera, Lattice
-from dudmap.gpu.kernels.surface import FAR, INFINITE, TILE, Corners, Values, clipped, corners_at
+from dudmap.gpu.kernels.surface import Corners, corners_at
 from dudmap.kernels import refinement
 
 wp.set_module_options({"enable_backward": False})
@@ -142,9 +142,7 @@ def trace_ray(
     zero, half, one = wp.float32(0.0), wp.float32(0.5), wp.float32(1.0)
     per_voxel = one / wp.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
     nudge = wp.float32(1.0e-2) * per_voxel
-    start, stop = clipped(o[0], d[0], wp.float32(8 * lattice.nx - 1), nudge, first, last)
-    start, stop = clipped(o[1], d[1], wp.float32(8 * lattice.ny - 1), nudge, start, stop)
-    start, stop = clipped(o[2], d[2], wp.float32(8 * lattice.nz - 1), nudge, start, stop)
+    start, stop = range_inside(lattice, o, d, nudge, first, last)
     rx = wp.where(d[0] != zero, one / d[0], INFINITE)
     ry = wp.where(d[1] != zero, one / d[1], INFINITE)
     rz = wp.where(d[2] != zero, one / d[2], INFINITE)
@@ -214,20 +212,10 @@ def trace_levels(
     x, y, z = x * scale, y * scale, z * scale
     fx, fy, fz = x - wp.floor(x), y - wp.floor(y), z - wp.floor(z)
     c = corners_of(lattice, levels, level, x, y, z)
-    gx, gy, gz = corner_gradient(
-        sdf_steps(c[0]), sdf_steps(c[1]), sdf_steps(c[2]), sdf_steps(c[3]),
-        sdf_steps(c[4]), sdf_steps(c[5]), sdf_steps(c[6]), sdf_steps(c[7]), fx, fy, fz,
-    )  # fmt: skip
-    length = wp.sqrt(gx * gx + gy * gy + gz * gz)
-    if length > zero:
-        normals[v, u] = wp.vec3(gx / length, gy / length, gz / length)
+    normals[v, u] = normal_at(c, fx, fy, fz)
     c = corners_of(paint, paints, level, x, y, z)
     for channel in range(3):
-        s = Values()
-        for n in range(8):
-            s[n] = wp.float32((c[n] >> (20 - 10 * channel)) & 1023)
-        value, _kx, _ky, _kz = trilinear(s[0], s[1], s[2], s[3], s[4], s[5], s[6], s[7], fx, fy, fz)
-        color[v, u, channel] = wp.uint8(wp.int32(min(value * wp.float32(0.25) + wp.float32(0.5), wp.float32(255.0))))
+        color[v, u, channel] = mixed_channel_at(c, channel, fx, fy, fz)
 
 
 @wp.func
