@@ -9,7 +9,7 @@ from dudmap.study.analysis import predict_optimum
 from dudmap.study.designs import DESIGNS, DesignOptions, count_of, points_of
 from dudmap.study.factors import make_factors
 from dudmap.study.indices import emulated_indices, morris_indices, sobol_indices
-from dudmap.study.judgement import confirm
+from dudmap.study.judgement import confirm, influence
 from dudmap.study.pareto import pareto_front
 from dudmap.study.response_surface import fit_surface, lack_of_fit
 
@@ -121,6 +121,17 @@ def test_a_response_that_is_not_quadratic_lacks_fit():
     table = runs_of(factors, DesignOptions("central-composite"), step, repeats=2, noise=1e-3)
     surface = fit_surface(table, factors, "ate")
     assert lack_of_fit(surface).p < 0.01
+
+
+def test_a_single_run_that_differs_carries_the_model():
+    """Such as the only one that lost frames: without it there is no variance left to explain."""
+    factors = factors_of()
+    table = runs_of(factors, DesignOptions("central-composite"), lambda *_: 7.0, repeats=2)
+    table.loc[3, "ate"] = 9.0
+    surface = fit_surface(table, factors, "ate")
+    single = influence(surface)
+    assert (single.value, single.r2_without) == (9, 0)
+    assert single.optimum_without.predicted == pytest.approx(7)
 
 
 def test_two_levels_give_no_quadratic_model():

@@ -44,8 +44,8 @@ class Surface:
 
     @property
     def r2(self) -> float:
-        """Share of the variance that the model explains."""
-        return float(self.model.rsquared)
+        """Share of the variance that the model explains; 0 of values that are all equal."""
+        return float(self.model.rsquared) if np.ptp(self.observed) > 0 else 0.0
 
     @property
     def r2_predicted(self) -> float:
