@@ -45,11 +45,6 @@ class SensorConfig(ConfigSection):
     """Calibrate the colour camera against the depth camera while it moves, unless a calibration that was estimated
     before is given; what is found repaints the map. It needs the stored frames of loop closing or submaps."""
 
-    repeats: bool = False
-    """Accept images that repeat bit for bit, as a simulated camera at rest without noise gives them; otherwise a
-    repeated depth image is taken for a sensor that hangs and not used, and a repeated colour image for one without
-    information."""
-
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
         return self.sigma_base + self.sigma_scale * z**2

@@ -1,5 +1,6 @@
 """Result of processing one frame."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -7,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.dynamics.masks import Labels
+from dudmap.frames.stream_check import Repeats
 from dudmap.objects.object_tracker import Mover
 from dudmap.tracking.term_balance import TermBalance
 from dudmap.tracking.tracker import TrackingResult
@@ -18,11 +20,13 @@ class FrameResult:
 
     Attributes:
         timestamp: Time of the depth image, seconds; on the clock of the first frames, if it was set back since.
-        state: "tracked" or "lost".
+        state: "tracked", "lost", or "repeated" for a frame whose images, or whose depth image, are those of the frame
+            before.
         lost_reason: Sentence on the check that failed; empty for a tracked frame.
         rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
             else empty.
-        T_world_camera: Camera pose (4, 4); None if lost.
+        T_world_camera: Camera pose (4, 4); None if lost. That of a frame that repeats the one before is the same; where
+            only depth repeats it is predicted, and in the trajectory interpolated once the next frame is tracked.
         fused: Whether the frame changed the map.
         skipped_similar: Whether the frame was not fused because it is a redundant view.
         dynamic_mask: (H, W) bool, dynamic pixels in the image as it was recorded.
@@ -41,12 +45,16 @@ class FrameResult:
         uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
         unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
             predicted one; see ``tracking/observability.py``. The frame is ``uncertain`` then.
+        repeats: What is bit for bit that of the frame before: the whole ``frame``, its ``depth`` or its ``color``. A
+            frame whose colour repeats is tracked by its distances alone (``blind``).
+        checks: Figures of all checks of the frame (``tracking/checks.py``), NaN where one is not known; empty for a
+            frame that was not registered.
         balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
             frame, else None.
     """
 
     timestamp: float
-    state: Literal["tracked", "lost"]
+    state: Literal["tracked", "lost", "repeated"]
     lost_reason: str
     T_world_camera: NDArray[np.float64] | None
     fused: bool
@@ -66,4 +74,6 @@ class FrameResult:
     balance: TermBalance | None = None
     calibrated: bool = False
     rejected: str = ""
+    repeats: Repeats = ""
+    checks: Mapping[str, float] = field(default_factory=dict)
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))

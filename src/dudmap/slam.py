@@ -1,6 +1,7 @@
 """The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
 
 import time
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Unpack
 
@@ -39,6 +40,7 @@ from dudmap.places.saved_map import SavedMap
 from dudmap.result import FrameResult
 from dudmap.slam_results import SlamResults
 from dudmap.stage_timer import StageTimer
+from dudmap.tracking.checks import MAX_DRIFT
 from dudmap.tracking.color_motion import ColorMotion
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.estimate import PoseEstimate
@@ -96,7 +98,7 @@ class Slam(SlamResults):
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
-        self.stream = StreamCheck(config.tracker.max_speed, repeats_are_valid=config.sensor.repeats)
+        self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor)
         self.motion = MotionModel(config.tracker)
         self.color_motion = ColorMotion(self.motion, given)
@@ -117,6 +119,7 @@ class Slam(SlamResults):
         self.bootstrap = Bootstrap()
         self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
         self.redundancy = RedundantViews(config)
+        self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.balance = BalanceEstimator(config.sensor, config.preprocess)
@@ -188,7 +191,10 @@ class Slam(SlamResults):
             rejection = self.stream.rejection(view.observation)
         if rejection:
             return self._reject(view, rejection)
-        view = self.color_motion.predicted(self._resumed(view))
+        view = self._resumed(view)
+        if self.stream.repeats in ("frame", "depth") and self._last is not None:
+            return self._repeat(view, self._last)
+        view = self.color_motion.predicted(view)
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=self._is_blind(view))
@@ -196,11 +202,12 @@ class Slam(SlamResults):
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
-        reason = self.relocalizer.reason or self.monitor.rejection_reason(view, estimate, prediction.image_pose)
+        verdict = self.monitor.judge(view, estimate, prediction.image_pose)
+        reason = self.relocalizer.reason or verdict.reason
         relocalized = self._relocalize(view, prediction) if reason else None
         estimate = relocalized or estimate
         if reason and not relocalized:
-            return self._lose(view, estimate, reason)
+            return replace(self._lose(view, estimate, reason), checks=verdict.figures)
         view = self.color_motion.registered(view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
@@ -217,6 +224,7 @@ class Slam(SlamResults):
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
             corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
+            checks=verdict.figures,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -231,6 +239,26 @@ class Slam(SlamResults):
         """Report a frame that the stream has spoilt."""
         mask = np.zeros(view.observation.depth.shape, dtype=bool)
         return replace(self._result(view, None, mask, reason=rejection.reason), rejected=rejection.kind)
+
+    def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
+        """Result of a frame that repeats the one before, or its depth.
+
+        It has the pose of the frame it repeats. With new colours the camera may have moved: the pose is the predicted
+        one, as long as that can be trusted, and in the trajectory interpolated once the next frame is tracked.
+        """
+        result = replace(last, timestamp=view.timestamp, repeats=self.stream.repeats, timings=view.timer.times())
+        if last.T_world_camera is None:
+            return result
+        predicted = self.stream.repeats == "depth" or last.repeats == "depth"
+        T_world_camera = last.T_world_camera
+        if self.stream.repeats == "depth":
+            if self.motion.drift(view.timestamp) > MAX_DRIFT:
+                reason = f"the depth image has repeated for {view.timestamp - self.motion.timestamp:.2f} s"
+                return replace(result, state="lost", lost_reason=reason, T_world_camera=None)
+            T_world_camera = self.motion.predict(view.timestamp)
+        self.atlas.add_pose(view.timestamp, T_world_camera, repeats="depth" if predicted else "frame")
+        self._last = replace(result, state="repeated", T_world_camera=T_world_camera)
+        return self._last
 
     def _resumed(self, view: FrameView) -> FrameView:
         """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
@@ -248,7 +276,7 @@ class Slam(SlamResults):
 
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
-        return (view.textureless or self.stream.color_is_frozen) and not self.bootstrap.textureless
+        return (view.textureless or self.stream.repeats == "color") and not self.bootstrap.textureless
 
     def _start_map(self, view: FrameView) -> FrameResult:
         """Make a map of a single frame, whose camera frame becomes the world frame."""
@@ -278,7 +306,7 @@ class Slam(SlamResults):
         found = self.relocalizer.recover(
             view,
             lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
-            lambda tracking: not self.monitor.deviation(tracking, recognized=True),
+            lambda tracking: not self.monitor.reason_to_doubt(tracking),
         )
         if found is None:
             return None
@@ -367,11 +395,12 @@ class Slam(SlamResults):
         uncertain: str = "",
         balance: TermBalance | None = None,
         calibrated: bool = False,
+        checks: Mapping[str, float] | None = None,
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
         readings = view.observation.depth > 0
-        return FrameResult(
+        result = FrameResult(
             timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
             T_world_camera=T_world_camera, fused=fused,
             skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
@@ -381,8 +410,14 @@ class Slam(SlamResults):
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.times(),
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
-            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable,
+            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
+            repeats=self.stream.repeats,
         )  # fmt: skip
+        self._last = replace(
+            result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, movers=(),
+            corrected=False, blind=False, balance=None, calibrated=False, uncertain="", checks={},
+        )  # fmt: skip
+        return result
 
     def _make_volume(self) -> TsdfVolume:
         config, backend = self.config, make_backend(self.device)

@@ -18,6 +18,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.kernels import consensus, labeling
 from dudmap.mapper import Mapper
 from dudmap.slam import Slam
+from dudmap.tracking.checks import RELATIVE, first_failure
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.quality_monitor import QualityMonitor
@@ -265,8 +266,8 @@ def test_a_view_that_hardly_shows_the_known_world_is_not_decided(crowd):
     hidden = replace(labels, dynamic=np.broadcast_to(rows, labels.dynamic.shape))
     monitor = QualityMonitor(slam.config, slam.motion)
     well_known, unknown = (PoseEstimate(replace(tracked, inlier_share=share), hidden) for share in (0.9, 0.2))
-    assert monitor.rejection_reason(view, well_known, lambda: None) == ""
-    assert "rest where the map" in monitor.rejection_reason(view, unknown, lambda: None)
+    assert monitor.judge(view, well_known, lambda *_: None).reason == ""
+    assert "rest where the map" in monitor.judge(view, unknown, lambda *_: None).reason
 
 
 def test_a_crowd_from_the_first_frame_does_not_drag_the_camera_along(crowd):
@@ -304,10 +305,10 @@ def test_what_drags_the_pose_before_a_crowd_is_doubted_sooner():
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
     for _ in range(6):
         monitor.accept(good)
-    dragged = replace(good, residual=0.0045)
-    assert not monitor.deviation(dragged)
-    assert "4.5 mm" in monitor.deviation(dragged, crowded=True)
-    assert not monitor.deviation(replace(good, residual=0.0035), crowded=True)
+    dragged = replace(good, residual=0.0045).figures
+    assert not first_failure(RELATIVE, dragged, monitor.limits("tracking"))
+    assert "4.5 mm" in first_failure(RELATIVE, dragged, monitor.limits("crowded"))
+    assert not first_failure(RELATIVE, replace(good, residual=0.0035).figures, monitor.limits("crowded"))
 
 
 def test_a_box_that_creeps_from_the_first_frame_on_does_not_drag_the_camera_along():

@@ -14,6 +14,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.se3 import retract
 from dudmap.kernels.parameters import NormalEquations
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.checks import RELATIVE, first_failure
 from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.quality_monitor import QualityMonitor
 from dudmap.tracking.tracker import Tracker, TrackingResult
@@ -194,7 +195,11 @@ def test_constant_velocity_goes_on_and_stops_some_time_after_a_loss():
     assert np.allclose(model.predict(0.2), motion @ motion, atol=1e-9)  # a single frame without a pose
     model.lost(0.3)
     assert np.allclose(model.predict(0.3), motion)
-    assert "jumped" in model.rejection_reason(0.2, se3.exp(np.array([3.0, 0, 0, 0, 0, 0])))
+    view = Level(CAMERA, np.full((2, 2), 2.0, np.float32), np.zeros((2, 2), np.float32))
+    leap = motion @ se3.exp(np.array([0.4, 0, 0, 0, 0, 0]))
+    assert model.figures(0.2, leap, view)["speed_m_s"] == pytest.approx(4.0)
+    model.timed = False  # 0.4 m at a depth of 2 m
+    assert model.figures(0.2, leap, view)["step"] == pytest.approx(0.2 * CAMERA.fx / CAMERA.width)
 
 
 def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
@@ -202,16 +207,22 @@ def test_a_much_worse_registration_is_doubted_most_of_all_after_a_loss():
         return TrackingResult(np.eye(4), (1.0, 0.0), True, "", share, residual, 0.1, 3)
 
     monitor = QualityMonitor(Config(), MotionModel(TrackerConfig()))
+
+    def doubt(tracking: TrackingResult) -> str:
+        mode = "recovering" if monitor.recovering else "tracking"
+        return first_failure(RELATIVE, tracking.figures, monitor.limits(mode))
+
     for _ in range(10):
-        assert monitor.deviation(result(0.001, 0.9)) == ""
+        assert doubt(result(0.001, 0.9)) == ""
         monitor.accept(result(0.001, 0.9))
-    assert monitor.deviation(result(0.0025, 0.9)) == ""
-    assert "off the map" in monitor.deviation(result(0.006, 0.9))
+    assert doubt(result(0.0035, 0.9)) == ""
+    assert "off the map" in doubt(result(0.006, 0.9))
     monitor.lose()
-    assert "off the map" in monitor.deviation(result(0.0025, 0.9))
-    assert "fall on the map" in monitor.deviation(result(0.001, 0.3))
+    assert "off the map" in doubt(result(0.0035, 0.9))
+    assert doubt(result(0.0025, 0.9)) == ""  # within the noise of the sensor
+    assert "fall on the map" in doubt(result(0.001, 0.3))
     monitor.accept(result(0.001, 0.9))
-    assert monitor.deviation(result(0.0025, 0.3)) == ""
+    assert doubt(result(0.0035, 0.3)) == ""
 
 
 AS_IT_IS: dict[str, Any] = {"widths": (80,), "iterations": (1,), "stop": 1e3, "damping": 1e9, "min_condition": 0.0}

@@ -34,7 +34,7 @@ class FaultRun:
         lost: Frames whose registration was rejected.
         maps: Submaps in the end.
         errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a pose.
-        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind`` or ``uncertain``.
+        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or repeated.
     """
 
     fault: str
@@ -148,7 +148,7 @@ def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
         elif result.T_world_camera is None:
             lost += 1
         else:
-            flagged[-1] = result.blind or bool(result.uncertain)
+            flagged[-1] = result.blind or bool(result.uncertain) or result.state == "repeated"
             T_true = truth[delivery.number]
             anchor = anchors.setdefault(result.submap, T_true @ se3.inverse(result.T_world_camera))
             errors[-1] = float(np.linalg.norm((anchor @ result.T_world_camera - T_true)[:3, 3]))

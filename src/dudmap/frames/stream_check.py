@@ -1,9 +1,9 @@
-"""Recognition of frames that a sensor or a driver has spoilt: wrong stamps, repeated images, a changed unit."""
+"""Recognition of frames that a sensor or a driver has spoilt or repeated: wrong stamps, old images, a changed unit."""
 
 import statistics
 from collections import deque
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,12 +30,15 @@ SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
 LONGEST_MEMORY = 1.0
 """Longest time between two images whose depths are compared, seconds; the camera may look elsewhere then."""
 
+Repeats = Literal["", "frame", "depth", "color"]
+"""What a frame repeats of the one before, bit for bit."""
+
 
 class Rejection(NamedTuple):
     """Why a frame is not used.
 
     Attributes:
-        kind: Key under which it is counted: ``duplicate``, ``order``, ``burst``, ``clock``, ``frozen`` or ``unit``.
+        kind: Key under which it is counted: ``duplicate``, ``order``, ``burst``, ``clock`` or ``unit``.
         reason: Sentence.
     """
 
@@ -49,24 +52,24 @@ class StreamCheck:
     Stamps must increase. If AGREEING frames in a row increase among themselves but not after the last one used, the
     clock has been set: the stamps from there on are continued from the last one used, by the usual interval.
 
-    A frame whose depth is bit for bit that of the frame before shows a frozen sensor, since its noise never repeats. A
+    An image that is bit for bit that of the frame before is the same one, since the noise of a sensor never repeats: a
+    stream is slower than the other, or a driver hands out the last image again where it has lost one. A
     unit that changes multiplies all depths by one factor from one image to the next, faster than the fastest camera
     explains; frames are then rejected until the factor is taken back.
 
     Args:
         max_speed: Largest speed of the camera, m/s.
-        repeats_are_valid: Accept images that repeat bit for bit, as those of simulations without noise do.
 
     Attributes:
         clock_offset: What is added to the stamps of the stream since its clock was set back, seconds.
-        color_is_frozen: Whether the colour image of the last frame judged, but not its depth, repeats.
+        repeats: What the last frame judged repeats of the frame before: the whole ``frame``, its ``depth`` or its
+            ``color`` alone; empty for nothing.
     """
 
-    def __init__(self, max_speed: float, *, repeats_are_valid: bool = False) -> None:
+    def __init__(self, max_speed: float) -> None:
         self.max_speed = max_speed
-        self.repeats_are_valid = repeats_are_valid
         self.clock_offset = 0.0
-        self.color_is_frozen = False
+        self.repeats: Repeats = ""
         self._last_stamp: float | None = None  # of the last frame with a valid stamp
         self._contradicting: list[float] = []  # stamps of the frames since then
         self._intervals: deque[float] = deque(maxlen=INTERVALS)
@@ -86,7 +89,8 @@ class StreamCheck:
 
         A frame that is used because the clock was found to be set changes ``clock_offset``: it is to be restamped.
         """
-        return self._wrong_stamp(observation.timestamp) or self._frozen(observation) or self._changed_unit(observation)
+        self.repeats = self._compare_with_last(observation)
+        return self._wrong_stamp(observation.timestamp) or self._changed_unit(observation)
 
     # -- stamps --------------------------------------------------------------------------------------------------------
 
@@ -121,7 +125,7 @@ class StreamCheck:
             return Rejection("duplicate", f"a frame with the stamp {stamp:.6f} s has arrived before")
         if step < 0:
             return Rejection("order", f"the frame was taken {-step:.3f} s before the last one that was used")
-        if step < BURST_SHARE * self._usual_interval:
+        if len(self._intervals) >= AGREEING and step < BURST_SHARE * self._usual_interval:
             usual = 1000 * self._usual_interval
             return Rejection("burst", f"the frame is {1000 * step:.1f} ms after the last, {usual:.0f} are usual")
         if step > FURTHEST_STEP:
@@ -134,15 +138,14 @@ class StreamCheck:
 
     # -- images --------------------------------------------------------------------------------------------------------
 
-    def _frozen(self, observation: Observation) -> Rejection | None:
+    def _compare_with_last(self, observation: Observation) -> Repeats:
+        """What a frame repeats of the last one that arrived."""
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
-        self.color_is_frozen = False
-        if before is None or self.repeats_are_valid:
-            return None
-        if _equal(before[0], observation.depth) and observation.depth.any():
-            return Rejection("frozen", "the depth image is bit for bit that of the frame before: the sensor hangs")
-        self.color_is_frozen = _equal(before[1], observation.as_recorded.color)
-        return None
+        if before is None:
+            return ""
+        depth = _equal(before[0], observation.depth) and bool(observation.depth.any())
+        color = _equal(before[1], observation.as_recorded.color)
+        return "frame" if depth and color else "depth" if depth else "color" if color else ""
 
     def _changed_unit(self, observation: Observation) -> Rejection | None:
         depth, stamp = observation.depth[::STRIDE, ::STRIDE].copy(), observation.timestamp

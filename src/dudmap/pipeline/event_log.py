@@ -61,7 +61,7 @@ class EventLog(RunObserver):
         else:
             assert result.T_world_camera is not None
             position = [round(float(x), 4) for x in result.T_world_camera[:3, 3]]
-            self.event("tracked", **place, **figures, fused=result.fused, position=position)
+            self.event(result.state, **place, **figures, fused=result.fused, position=position)
         if result.relocalized:
             self.event("relocalized", **place, submap=result.submap)
         if result.corrected:

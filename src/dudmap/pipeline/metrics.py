@@ -30,6 +30,8 @@ class RunRecord:
         rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
         lost: Timestamp and reason of every lost frame.
         unreadable: One sentence per frame that could not be read or had another size.
+        checks: Per registered frame, its figures (``tracking/checks.py``).
+        repeated: Number of frames that repeat the frame before, its depth or its colour, by what repeats.
         rejected: Number of frames that were not used for a fault of the stream, by kind; those with a readable image
             of the right size are lost as well.
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
@@ -45,6 +47,8 @@ class RunRecord:
     rows: list[dict[str, Any]] = field(default_factory=list)
     lost: list[dict[str, Any]] = field(default_factory=list)
     unreadable: list[str] = field(default_factory=list)
+    checks: list[dict[str, Any]] = field(default_factory=list)
+    repeated: dict[str, int] = field(default_factory=dict)
     rejected: dict[str, int] = field(default_factory=dict)
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
@@ -109,6 +113,11 @@ class RunRecord:
         self.degenerate += len(result.unobservable) > 0
         if result.rejected:
             self._reject(result.rejected)
+        if result.repeats:
+            self.repeated[result.repeats] = self.repeated.get(result.repeats, 0) + 1
+        if result.checks:
+            known = {name: float(f"{figure:.4g}") for name, figure in result.checks.items() if np.isfinite(figure)}
+            self.checks.append({"timestamp": f"{result.timestamp:.6f}", "state": result.state} | known)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         if result.movers:
@@ -131,12 +140,11 @@ class RunRecord:
 
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
-        columns = list(dict.fromkeys(key for row in self.rows for key in row))
-        text = io.StringIO(newline="")
-        writer = csv.DictWriter(text, columns, restval=0)
-        writer.writeheader()
-        writer.writerows(self.rows)
-        write_text(path, text.getvalue())
+        _write_table(path, self.rows, "0")
+
+    def save_checks(self, path: Path) -> None:
+        """Write a CSV file with one row per registered frame and one column per figure; empty where it is not known."""
+        _write_table(path, self.checks, "")
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
@@ -163,7 +171,8 @@ class RunRecord:
         readings = np.array([row["reading"] for row in self.rows] or [np.nan])
         return {
             "frames": len(self.rows) + len(self.unreadable),
-            "tracked": len(self.rows) - len(self.lost),
+            "tracked": sum(row["state"] == "tracked" for row in self.rows),
+            "repeated": sum(row["state"] == "repeated" for row in self.rows),
             "fused": self.fused,
             "skipped_similar": self.skipped_similar,
             "lost": len(self.lost),
@@ -174,6 +183,7 @@ class RunRecord:
             "degenerate": self.degenerate,
             "unreadable": len(self.unreadable),
             "frames_rejected": dict(sorted(self.rejected.items())),
+            "images_repeated": dict(sorted(self.repeated.items())),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),
             "ms_reading_median": _number(np.median(readings)),
@@ -202,6 +212,15 @@ class RunRecord:
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }
         return out
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
+    """Write a CSV file of rows with different columns."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval=missing)
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
 
 
 def _row(mover: "Mover") -> dict[str, Any]:

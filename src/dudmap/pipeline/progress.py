@@ -61,7 +61,7 @@ class RunProgress:
             self._lost = 0
         self._times.append(time.perf_counter())
         seconds = self._times[-1] - self._times[0]
-        state = "[red]lost[/]" if result.state == "lost" else "[green]tracked[/]"
+        state = f"[{'red' if result.state == 'lost' else 'green'}]{result.state}[/]"
         if dropped:
             state += f", {dropped} dropped"
         self._bar.update(
@@ -92,7 +92,7 @@ def summary(metrics: dict[str, Any]) -> Table:
     table = Table(title=str(metrics["sequence"]), show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column(justify="right")
-    counts = "tracked", "fused", "skipped_similar", "lost", "unreadable"
+    counts = "tracked", "repeated", "fused", "skipped_similar", "lost", "unreadable"
     table.add_row("frames", str(metrics["frames"]))
     for key in counts:
         value = metrics[key]

@@ -188,6 +188,8 @@ class Job:
                     state, store = files.enter_context(self._from_checkpoint(state, store))
                 if len(state.slam.maps) > 1:
                     display.note(_unmerged_submaps(state.slam))
+                if state.record.repeated:
+                    display.note(_repeats(state.record))
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
             except KeyboardInterrupt:
@@ -300,6 +302,17 @@ def _unmerged_submaps(slam: "Slam") -> str:
     main, *others = (len(trajectory) for trajectory, _ in slam.maps)
     names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
     return f"{len(others)} submap(s) could not be merged: the main map has {main} frames; the others are {names}"
+
+
+def _repeats(record: RunRecord) -> str:
+    """Sentence on the frames that repeat images of the frame before."""
+    what = {
+        "frame": "{} both images (they have the pose of the frame before)",
+        "depth": "{} the depth image (their poses are interpolated)",
+        "color": "{} the colour image (tracked by distances alone, not fused)",
+    }
+    counts = ", ".join(text.format(record.repeated[kind]) for kind, text in what.items() if kind in record.repeated)
+    return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
 def _of_second(finished: object) -> str:

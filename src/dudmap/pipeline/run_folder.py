@@ -32,8 +32,8 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz", "merge.json",
-    "report.html",
+    "checks.csv", "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz",
+    "merge.json", "report.html",
 )  # fmt: skip
 PARTS = (
     "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt", "thumbnails/*.jpg",
@@ -172,6 +172,7 @@ def write_run_folder(
         lambda: config.save(out / "config.toml"),
         lambda: calibration.save(out / "calibration.toml"),
         lambda: record.save_timings(out / "timings.csv"),
+        lambda: record.save_checks(out / "checks.csv"),
         lambda: record.save_residuals(out / "residuals.npz"),
         lambda: record.save_movers(out / "movers.jsonl"),
     ]

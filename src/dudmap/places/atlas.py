@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dudmap.frames.exposure import exposed_color
 from dudmap.frames.frame import Frame
+from dudmap.frames.stream_check import Repeats
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
@@ -26,11 +27,16 @@ from dudmap.tracking.motion_model import VELOCITY_LIFETIME
 
 @dataclass(eq=False)
 class TimedPose:
-    """Pose (4, 4) of a tracked frame in the world of a submap; timestamp in seconds."""
+    """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
+
+    ``repeats`` is empty for a tracked frame, ``depth`` for one whose pose is predicted, since its depth image repeats,
+    and ``frame`` for one with the pose of the frame that it repeats, or interpolated between tracked frames.
+    """
 
     timestamp: float
     T_world_camera: NDArray[np.float64]
     submap: int
+    repeats: Repeats = ""
 
 
 class Atlas:
@@ -127,7 +133,9 @@ class Atlas:
         near = [
             pose
             for pose in self.poses[max(number - 1, 0) : number + 2]
-            if abs(pose.timestamp - timestamp) <= VELOCITY_LIFETIME and pose.submap == self.poses[number].submap
+            if abs(pose.timestamp - timestamp) <= VELOCITY_LIFETIME
+            and pose.submap == self.poses[number].submap
+            and (not pose.repeats or pose.timestamp == timestamp)
         ]
         if len(near) < 2:
             return np.zeros(6)
@@ -146,9 +154,20 @@ class Atlas:
         while self.history is not None and self.history.submaps and self.history.submaps[-1] == self.current:
             self.history.drop_last()
 
-    def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
-        """Append the pose (4, 4) of a frame tracked in the current submap."""
-        self.poses.append(TimedPose(timestamp, T_world_camera, self.current))
+    def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
+        """Append the pose (4, 4) of a frame in the current submap; poses that were predicted since the last tracked
+        frame are interpolated between that and this one."""
+        new = TimedPose(timestamp, T_world_camera, self.current, repeats)
+        first = len(self.poses)
+        while repeats != "depth" and first and self.poses[first - 1].repeats == "depth":
+            first -= 1
+        if 0 < first < len(self.poses) and self.poses[first - 1].submap == self.current:
+            ends = self.poses[first - 1], new
+            stamps, Ts = (np.array([getattr(end, name) for end in ends]) for name in ("timestamp", "T_world_camera"))
+            for pose in self.poses[first:]:
+                pose.T_world_camera = se3.interpolate_in_time(stamps, Ts, pose.timestamp)
+                pose.repeats = "frame"
+        self.poses.append(new)
 
     def start_submap(self) -> None:
         """Make a new, empty submap the current one."""

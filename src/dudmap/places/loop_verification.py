@@ -91,7 +91,7 @@ class LoopVerifier:
         if (
             found.converged
             and len(found.unobservable) == 0
-            and not monitor.deviation(found, recognized=True)
+            and not monitor.reason_to_doubt(found)
             and found.inlier_share >= limits.min_on_map
             and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
         ):

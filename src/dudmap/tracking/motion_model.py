@@ -4,6 +4,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import TrackerConfig
+from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 
 VELOCITY_LIFETIME = 0.15
@@ -15,24 +16,32 @@ PAUSE = 1.0
 
 ACCELERATION = 1.0
 """Standard deviation of the acceleration of a camera in the hand, m/s^2, by which a prediction goes wrong."""
-MAX_DRIFT = 0.03
-"""Largest standard deviation of a pose that follows the prediction where the view shows no motion, metres."""
 
 
 class MotionModel:
     """Predicts the next pose from the last two.
 
+    Args:
+        config: Whether velocity is constant.
+        timed: Whether the stamps are the times of the frames; else they only tell their order.
+
     Attributes:
         T_world_camera: (4, 4), the last accepted pose.
     """
 
-    def __init__(self, config: TrackerConfig) -> None:
+    def __init__(self, config: TrackerConfig, *, timed: bool = True) -> None:
         self.config = config
+        self.timed = timed
         self.T_world_camera = np.eye(4)
         self._timestamp = 0.0
         self._velocity = np.zeros(6)  # twist per second, camera axes
         self._initialized = False
         self._observed = 0.0  # time of the last pose whose motion was seen in all directions
+
+    @property
+    def timestamp(self) -> float:
+        """Time of the last accepted pose, seconds."""
+        return self._timestamp
 
     @property
     def velocity(self) -> NDArray[np.float64]:
@@ -74,16 +83,12 @@ class MotionModel:
         """Whether no pose has been accepted for longer than PAUSE."""
         return self._initialized and timestamp - self._timestamp > PAUSE
 
-    def drift_reason(self, timestamp: float) -> str:
-        """Sentence if a pose that is partly predicted would be too uncertain, empty if not.
+    def drift(self, timestamp: float) -> float:
+        """Standard deviation of a pose that is partly predicted, metres.
 
         An unknown acceleration of standard deviation a moves the camera by a t^2 / 2 off its prediction in a time t.
         """
-        elapsed = timestamp - self._observed
-        drift = ACCELERATION * elapsed**2 / 2
-        if drift <= MAX_DRIFT:
-            return ""
-        return f"the view has not shown all directions of motion for {elapsed:.2f} s, in which the pose may drift"
+        return ACCELERATION * (timestamp - self._observed) ** 2 / 2
 
     def restart(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> None:
         """Continue from the pose of a relocalised frame with unknown velocity."""
@@ -94,15 +99,24 @@ class MotionModel:
         """Follow a correction of the world frame; the velocity is in camera axes and stays."""
         self.T_world_camera = T_new_old @ self.T_world_camera
 
-    def rejection_reason(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> str:
-        """Sentence on a velocity beyond ``max_speed`` or ``max_turn_deg``; empty if there is none."""
+    def figures(self, timestamp: float, T_world_camera: NDArray[np.float64], image: Level) -> dict[str, float]:
+        """Motion since the last accepted pose: ``speed_m_s`` and ``turn_deg_s``, or, where the times of the frames are
+        not known, ``step``, by which it moves the median reading, as a share of the width of the image.
+
+        Args:
+            timestamp: Seconds.
+            T_world_camera: (4, 4) pose at that time.
+            image: The image there, of any size.
+        """
         motion = se3.inverse(self.T_world_camera) @ T_world_camera
-        elapsed = self.elapsed(timestamp)
-        speed = float(np.linalg.norm(motion[:3, 3])) / elapsed
-        turn = float(np.degrees(se3.rotation_angle(motion))) / elapsed
-        if speed > self.config.max_speed or turn > self.config.max_turn_deg:
-            return f"the camera would have jumped at {speed:.1f} m/s and {turn:.0f} deg/s"
-        return ""
+        distance, angle = float(np.linalg.norm(motion[:3, 3])), se3.rotation_angle(motion)
+        if self.timed:
+            elapsed = self.elapsed(timestamp)
+            return {"speed_m_s": distance / elapsed, "turn_deg_s": float(np.degrees(angle)) / elapsed, "step": np.nan}
+        readings = image.depth[image.depth > 0]
+        depth = float(np.median(readings)) if len(readings) else np.inf
+        step = (distance / depth + angle) * image.camera.fx / image.camera.width
+        return {"speed_m_s": np.nan, "turn_deg_s": np.nan, "step": step}
 
     def elapsed(self, timestamp: float) -> float:
         """Seconds since the last accepted pose, at most 1."""

@@ -1,13 +1,14 @@
-"""Acceptance of a registration: absolute checks, and comparison with the registrations before it."""
+"""Acceptance of registered frames: the figures of ``checks.py``, and what was usual in the frames before."""
 
 import statistics
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.frames.pyramid import is_majority_dynamic
+from dudmap.tracking.checks import CHECKS, RELATIVE, Limits, first_failure
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.image_consistency import ImageConsistency, ImagePose
@@ -18,14 +19,10 @@ HISTORY = 30
 """Accepted registrations that are remembered."""
 MIN_HISTORY = 5
 """Accepted registrations before new ones are compared with them."""
-SMALL_RESIDUAL_SIGMAS = 0.5
-"""Root mean square residual, in standard deviations of the sensor, that is good."""
 SMALL_COLOR_RESIDUAL = 0.005
 """Intensity difference (0..1) that is good with any sensor."""
 UNUSUAL_RESIDUAL, UNUSUAL_COLOR_RESIDUAL = 1.5, 1.8
 """Multiples of the median residuals from which on a registration is repeated from another initial pose."""
-MIN_VERIFIED_SHARE = 0.09
-"""Share of the readings that must be static and lie on the map where most of the view is dynamic."""
 
 
 @dataclass(frozen=True)
@@ -43,15 +40,24 @@ class RegistrationHistory:
     colors: tuple[float, ...] = ()
 
 
+@dataclass(frozen=True)
+class Verdict:
+    """Outcome of the checks of a frame.
+
+    Attributes:
+        reason: Of the rejection; empty for a frame that is accepted.
+        figures: All figures by name, NaN where one is not known.
+    """
+
+    reason: str
+    figures: dict[str, float] = field(default_factory=dict)
+
+
 class QualityMonitor:
     """Decides whether the registration of a frame can be trusted.
 
-    A registration that converged to a wrong minimum explains the frame much worse than its predecessors were explained,
-    though often well enough for any fixed threshold. After a loss the initial pose is poor and wrong minima are common,
-    so the comparison is stricter until a frame has been accepted again.
-
     Args:
-        config: ``dynamics.max_share`` and the sensor's noise.
+        config: ``tracker``, ``dynamics.max_share`` and the sensor's noise.
         motion: Velocity of the camera.
     """
 
@@ -80,49 +86,50 @@ class QualityMonitor:
         self._shares.extend(history.shares)
         self._colors.extend(history.colors)
 
-    def rejection_reason(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> str:
-        """Sentence on the first check that a registered frame fails, empty if it passes all.
+    def judge(self, view: FrameView, estimate: PoseEstimate, image_pose: ImagePose) -> Verdict:
+        """Figures of a registered frame, and the reason of the first check of ``CHECKS`` that it fails.
 
-        The checks are those of the registration itself (overlap, residual, conditioning), of the camera's velocity, of
-        the residuals against those of the previous frames, of the share of the view that is static and known, and of
-        the last image, seen from the new pose. ``image_pose`` computes the pose that two images alone predict.
+        Args:
+            view: The frame.
+            estimate: Its pose and labels.
+            image_pose: Computes the pose (4, 4) that the last image and this one alone give; None if their corners
+                follow no common motion.
         """
         tracking, labels = estimate.tracking, estimate.labels
         with view.timer("check"):
-            crowded = labels is not None and is_majority_dynamic(labels.dynamic, view.labelled)
-            return (
-                tracking.reason
-                or self.motion.rejection_reason(view.timestamp, tracking.T_world_camera)
-                or (self.motion.drift_reason(view.timestamp) if len(tracking.unobservable) else "")
-                or self.deviation(tracking, crowded=crowded)
-                or self._undetermined(view, estimate)
-                or self.images.contradicts(view, estimate, image_pose)
-            )
+            readings = view.labelled.depth > 0
+            dynamic = np.zeros_like(readings) if labels is None else labels.dynamic & readings
+            share = float(np.count_nonzero(dynamic) / max(np.count_nonzero(readings), 1))
+            seen = self.images.compare(view, estimate)
+            figures = {
+                **tracking.figures,
+                **self.motion.figures(view.timestamp, tracking.T_world_camera, view.labelled),
+                "drift_mm": 1000 * self.motion.drift(view.timestamp) if len(tracking.unobservable) else 0.0,
+                "dynamic_share": share,
+                "verified_share": (1 - share) * tracking.inlier_share,
+                "image_shift_px": seen.shift,
+                "confirmed_share": seen.share,
+            }
+            crowded = share > 0.5
+            supported = partial(self.images.supported, view, estimate, seen, image_pose)
+            evidence = {
+                "last frame": lambda: not crowded and seen.confirms and supported(),
+                "corners": supported,
+            }
+            mode = "recovering" if self.recovering else "crowded" if crowded else "tracking"
+            return Verdict(first_failure(CHECKS, figures, self.limits(mode, crowded=crowded), evidence), figures)
 
-    def deviation(self, tracking: TrackingResult, *, recognized: bool = False, crowded: bool = False) -> str:
-        """Sentence on what is much worse than in the previous frames, empty if nothing is.
+    def reason_to_doubt(self, tracking: TrackingResult) -> str:
+        """Reason why the registration of a frame at a recognised place is much worse than usual, empty if it is not."""
+        return first_failure(RELATIVE, tracking.figures, self.limits("recognized"))
 
-        Args:
-            tracking: The registration.
-            recognized: Place recognition found the same pose: larger distances and a smaller overlap are accepted.
-            crowded: Most of the view is dynamic: a dynamic object registered as static shows in the distances first,
-                which are therefore judged more strictly.
-        """
-        if len(self._residuals) < MIN_HISTORY:
-            return ""
-        strict = self.recovering or recognized
-        residual, share, color = (_median(q) for q in (self._residuals, self._shares, self._colors))
-        worst = 2.5 if recognized else 1.6 if self.recovering else 4.0
-        if crowded and not strict:
-            worst, residual = 2.0, max(residual, SMALL_RESIDUAL_SIGMAS * self.config.sensor.sigma(1.0))
-        if tracking.residual > worst * residual:
-            return f"readings lie {1000 * tracking.residual:.1f} mm off the map, {1000 * residual:.1f} mm were usual"
-        if self.recovering and not recognized and tracking.inlier_share < 0.6 * share:
-            return f"only {tracking.inlier_share:.0%} of the static readings fall on the map, {share:.0%} were usual"
-        # two walls of one room have the same shape, but not the same texture
-        if tracking.color_residual > (max(0.02, 2.5 * color) if strict else max(0.03, 4.0 * color)):
-            return f"the image differs by {tracking.color_residual:.1%} from the map, {color:.1%} were usual"
-        return ""
+    def limits(self, mode: str, *, crowded: bool = False) -> Limits:
+        """What limits follow from: configuration, and medians of the registrations before, if they are enough."""
+        usual = (np.nan, np.nan, np.nan)
+        if len(self._residuals) >= MIN_HISTORY:
+            usual = 1000 * _median(self._residuals), _median(self._shares), _median(self._colors)
+        config = self.config
+        return Limits(config.tracker, config.sensor, config.dynamics.max_share, mode, crowded, *usual)
 
     def relative_misfit(self, tracking: TrackingResult) -> tuple[float, float]:
         """Distance and intensity residual over their medians in the previous frames; (1, 1) before there are any."""
@@ -147,19 +154,6 @@ class QualityMonitor:
     def lose(self) -> None:
         """Judge strictly until a frame is accepted again."""
         self.recovering = True
-
-    def _undetermined(self, view: FrameView, estimate: PoseEstimate) -> str:
-        """Sentence if too much of the view is dynamic, or too little of the rest is known, to determine the pose."""
-        if estimate.labels is None:
-            return ""
-        readings = view.labelled.depth > 0
-        share = np.count_nonzero(estimate.labels.dynamic & readings) / max(np.count_nonzero(readings), 1)
-        if share > self.config.dynamics.max_share:
-            return f"{share:.0%} of the readings seem to move: the static world cannot be told"
-        verified = (1 - share) * estimate.tracking.inlier_share
-        if share > 0.5 and verified < MIN_VERIFIED_SHARE:
-            return f"{share:.0%} of the readings seem to move, and only {verified:.0%} rest where the map has a surface"
-        return ""
 
 
 def _median(values: deque[float]) -> float:

@@ -13,6 +13,7 @@ from dudmap.kernels.damping import SHORT_STEP, added, is_accepted, is_settled, r
 from dudmap.kernels.median import median
 from dudmap.kernels.parameters import Damping, NormalEquations, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.tracking.checks import REGISTRATION, Limits, first_failure
 from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
 from dudmap.tracking.observability import COMPLETE, Observability, gradient_noise
 
@@ -21,8 +22,6 @@ FINEST_DAMPING = 1e-4
 directions, along which more damping shortens the steps until they are taken for convergence."""
 EXPOSURE_NOISE = 0.01
 """A change of gain and offset below this in total is noise of the fit and is not applied."""
-MIN_READINGS = 100
-"""Static readings on the map that a registration needs: well above its six unknowns."""
 MEDIAN_STRIDE = 4
 """Every so many pixels, across and down, enter the median intensity difference."""
 
@@ -46,6 +45,7 @@ class TrackingResult:
         settled: Whether the last level ended by a stop criterion and not at the iteration limit.
         unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the initial pose was
             kept (``tracking/observability.py``).
+        readings: Number of static readings on the map, weighted.
     """
 
     T_world_camera: NDArray[np.float64]
@@ -59,6 +59,20 @@ class TrackingResult:
     color_residual: float = 0.0
     settled: bool = True
     unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
+    readings: float = np.inf
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures of ``checks.REGISTRATION`` and ``checks.RELATIVE``; directions that are known not to be determined do
+        not count as badly conditioned, as long as others remain."""
+        missing = len(self.unobservable)
+        return {
+            "readings": self.readings,
+            "overlap": self.inlier_share,
+            "residual_mm": 1000 * self.residual,
+            "condition": self.condition if missing == 0 else np.nan if missing < 6 else 0.0,
+            "color_residual": self.color_residual,
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -307,9 +321,7 @@ class Tracker:
         )
 
     def _judge(self, found: Minimum) -> TrackingResult:
-        """Result of a registration with the first check it fails: overlap, residual, conditioning of H.
-
-        Directions that are known not to be determined do not count as badly conditioned, as long as others remain.
+        """Result of a registration with the first check it fails.
 
         The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
         the registration does not weigh by it, and intensities after the best gain and offset even if the registration
@@ -322,16 +334,6 @@ class Tracker:
         scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
         eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
         condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
-        if system.weight < MIN_READINGS:
-            reason = f"only {system.weight:.0f} static readings fall on the map"
-        elif share < config.min_inliers:
-            reason = f"only {share:.0%} of the static readings fall on the map"
-        elif residual > config.max_residual * self.sensor.sigma(1.0):
-            reason = f"readings lie {1000 * residual:.1f} mm off the map"
-        elif found.seen.observable.shape[1] == 0 or (found.seen.is_complete and condition < config.min_condition):
-            reason = "the view does not constrain all directions of motion"
-        else:
-            reason = ""
         differences = system.residuals[1]
         if not config.exposure:
             gain, offset = fit_exposure(level.intensity, differences, weights)
@@ -339,10 +341,12 @@ class Tracker:
         difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
         difference = np.abs(difference[np.isfinite(difference)])
         color_residual = float(median(difference)) if len(difference) else 0.0
-        return TrackingResult(
-            found.T_world_camera, found.exposure, not reason, reason, share, residual, condition, found.iterations,
-            color_residual, found.settled, found.seen.unobservable,
+        result = TrackingResult(
+            found.T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
+            color_residual, found.settled, found.seen.unobservable, system.weight,
         )  # fmt: skip
+        reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor))
+        return replace(result, converged=not reason, reason=reason)
 
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
