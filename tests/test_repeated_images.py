@@ -1,0 +1,84 @@
+"""Frames that repeat the one before, or its depth: they have poses, and are told from lost ones."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dudmap import Config, Slam, synthetic
+from dudmap.geometry import se3
+from dudmap.geometry.camera import Camera
+
+CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+CONFIG = Config().override(["volume.voxel_size=0.02", "sensor.self_calibration=false"])
+
+
+@pytest.fixture(scope="module")
+def recording():
+    room = synthetic.sequence("room", movers=(), frames=16, fps=15, camera=CAMERA, noise="kinect", seed=3)
+    return [room[index] for index in range(len(room))], room.ground_truth.Ts_world_camera
+
+
+def off(trajectory, timestamps, truth):
+    """Distance (n,) of the poses at these times from the true ones."""
+    rows = np.searchsorted(trajectory.timestamps, timestamps)
+    assert np.allclose(trajectory.timestamps[rows], timestamps)
+    expected = se3.inverse(truth[0]) @ truth
+    return np.linalg.norm((trajectory.Ts_world_camera[rows] - expected)[:, :3, 3], axis=1)
+
+
+def test_a_repeated_frame_has_the_pose_of_the_one_it_repeats(recording):
+    frames, _ = recording
+    slam, results = Slam(CAMERA, CONFIG), []
+    for frame in frames[:8]:
+        results.append(slam.process(frame))
+        results.append(slam.process(replace(frame, timestamp=frame.timestamp + 1 / 30)))
+    assert [result.state for result in results] == ["tracked", "repeated"] * 8
+    assert not any(result.fused or result.skipped_similar for result in results[1::2])
+    for first, again in zip(results[::2], results[1::2], strict=True):
+        assert again.repeats == "frame"
+        assert np.array_equal(first.T_world_camera, again.T_world_camera)
+        assert np.array_equal(first.dynamic_mask, again.dynamic_mask)
+    assert len(slam.trajectory) == 16
+    plain = Slam(CAMERA, CONFIG)
+    expected = [plain.process(frame).T_world_camera for frame in frames[:8]]
+    assert np.array_equal(slam.trajectory.Ts_world_camera[::2], np.stack(expected))  # repeats change no result
+
+
+def test_where_depth_alone_repeats_the_pose_is_interpolated(recording):
+    frames, truth = recording
+    late = [replace(frames[k], depth=frames[k - k % 2].depth) for k in range(len(frames))]
+    slam = Slam(CAMERA, CONFIG)
+    results = [slam.process(frame) for frame in late]
+    assert [result.repeats for result in results] == ["", "depth"] * 8
+    assert all(result.state == ("repeated" if result.repeats else "tracked") for result in results)
+    errors = off(slam.trajectory, [frame.timestamp for frame in frames], truth)
+    step = np.median(np.linalg.norm(np.diff(truth[::2, :3, 3], axis=0), axis=1))
+    assert errors[2:-1].max() < 0.15 * np.linalg.norm(truth[-1, :3, 3] - truth[0, :3, 3]), errors
+    assert np.median(errors[3:-1:2]) < np.median(errors[2:-1:2]) + 0.25 * step  # as good as the tracked ones beside
+
+
+def test_depth_that_stands_still_is_not_believed_for_long(recording):
+    frames, _ = recording
+    slam = Slam(CAMERA, CONFIG)
+    for frame in frames[:4]:
+        assert slam.process(frame).state == "tracked"
+    frozen = [slam.process(replace(frame, depth=frames[3].depth)) for frame in frames[4:12]]
+    states = [result.state for result in frozen]
+    assert states == sorted(states, reverse=True)  # repeated first, lost then
+    assert set(states) == {"repeated", "lost"}
+    assert "has repeated for" in frozen[-1].lost_reason
+    assert slam.process(frames[12]).state == "tracked"
+
+
+def test_a_frame_that_repeats_a_lost_one_is_lost(recording):
+    frames, _ = recording
+    slam = Slam(CAMERA, CONFIG)
+    slam.process(frames[0])
+    dark = replace(frames[1], depth=np.where(frames[1].depth > 0, np.float32(0.25), 0).astype(np.float32))
+    first = slam.process(dark)
+    again = slam.process(replace(dark, timestamp=dark.timestamp + 1 / 30))
+    assert first.state == again.state == "lost"
+    assert again.lost_reason == first.lost_reason
+    assert again.repeats == "frame"
+    assert len(slam.trajectory) == 1

@@ -1,0 +1,96 @@
+"""The table of checks: every check fails beyond its limit alone, and what overrules those against the frames before."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from dudmap import Config, Slam, synthetic
+from dudmap.geometry.camera import Camera
+from dudmap.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
+from dudmap.tracking.estimate import PoseEstimate
+from dudmap.tracking.image_consistency import ImageComparison
+from dudmap.tracking.quality_monitor import MIN_HISTORY
+
+CONFIG = Config()
+LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, 0.9, "recovering", True, 2.0, 0.9, 0.02)
+GOOD = {
+    "readings": 5000.0, "overlap": 0.9, "residual_mm": 2.0, "condition": 0.1, "color_residual": 0.02,
+    "speed_m_s": 0.3, "turn_deg_s": 20.0, "step": np.nan, "drift_mm": 0.0, "dynamic_share": 0.3,
+    "verified_share": 0.6, "image_shift_px": 0.4, "confirmed_share": 0.9,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("number", range(len(CHECKS)))
+def test_each_check_fails_just_beyond_its_limit_and_names_its_figure(number):
+    check = CHECKS[number]
+    limit = check.limit(LIMITS)
+    inside, outside = (limit * (1 + side * (-1 if check.at_least else 1)) for side in (-1e-6, 1e-6))
+    if limit == 0:
+        pytest.skip("no limit in this situation")
+    assert check.failure(GOOD | {check.figure: inside}, LIMITS) == ""
+    sentence = check.failure(GOOD | {check.figure: outside}, LIMITS)
+    assert sentence
+    assert "{" not in sentence
+    assert check.failure(GOOD | {check.figure: np.nan}, LIMITS) == ""  # what is not known does not reject
+    assert first_failure(CHECKS, GOOD, LIMITS) == ""
+
+
+def test_before_there_is_a_history_nothing_is_compared_with_it():
+    bad = GOOD | {"residual_mm": 9.0, "overlap": 0.2, "color_residual": 0.5}
+    assert first_failure(RELATIVE, bad, Limits(CONFIG.tracker, CONFIG.sensor)) == ""
+    assert first_failure(RELATIVE, bad, LIMITS) != ""
+
+
+def test_a_residual_within_the_noise_of_the_sensor_is_never_unusual():
+    still = replace(LIMITS, residual_mm=0.1)  # what a camera at rest leaves after averaging
+    sigma_mm = 1000 * CONFIG.sensor.sigma(1.0)
+    assert first_failure(RELATIVE, GOOD | {"residual_mm": 0.99 * sigma_mm}, still) == ""
+    assert first_failure(RELATIVE, GOOD | {"residual_mm": 1.01 * sigma_mm}, still) != ""
+
+
+@pytest.fixture(scope="module")
+def tracked():
+    """A system that has tracked a few frames, the next frame and its right estimate."""
+    camera = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
+    room = synthetic.sequence("room", movers=(), frames=10, camera=camera, noise="kinect", seed=2)
+    slam = Slam(camera, Config().override(["volume.voxel_size=0.02", "sensor.self_calibration=false"]))
+    results = [slam.process(room[index]) for index in range(8)]
+    assert len(results) > MIN_HISTORY
+    view = slam.prepare(room[8])
+    estimate = slam.front_end.register(
+        slam.volume, view, slam.predictor.predict(slam.volume, view, slam.front_end.last_dynamic)
+    )
+    return slam, results, view, estimate
+
+
+def test_the_figures_of_every_check_are_reported_for_every_registered_frame(tracked):
+    _, results, _, _ = tracked
+    for result in results[1:]:
+        assert set(result.checks) == set(GOOD)
+        assert all(np.isfinite(result.checks[name]) for name in GOOD if name != "step")
+
+
+@pytest.mark.parametrize(
+    ("comparison", "accepted"),
+    [
+        (ImageComparison(0.4, 0.9, 0.95), True),
+        (ImageComparison(0.4, 0.9, 0.6), False),  # the last frame shows another surface
+        (ImageComparison(0.4, 0.2, 0.95), False),  # too little of it is in view
+        (ImageComparison(2 * MAX_IMAGE_SHIFT, 0.9, 0.95), False),  # another image
+        (ImageComparison(), False),  # nothing to compare with
+    ],
+)
+def test_only_the_last_frame_overrules_an_unusual_residual(tracked, monkeypatch, comparison, accepted):
+    slam, _, view, estimate = tracked
+    worse = 1.1 * max(4 * np.median(slam.monitor.history.residuals), CONFIG.sensor.sigma(1.0))
+    unusual = PoseEstimate(replace(estimate.tracking, residual=worse), estimate.labels)
+    monkeypatch.setattr(slam.monitor.images, "compare", lambda *_: comparison)
+    reason = slam.monitor.judge(view, unusual, lambda *_: None).reason
+    assert (reason == "") == accepted, reason
+    if not accepted:
+        assert "were to be expected" in reason
+    for lost in (False, True):  # whatever happened before
+        slam.monitor.recovering = lost
+        assert (slam.monitor.judge(view, unusual, lambda *_: None).reason == "") == accepted
+    slam.monitor.recovering = False
