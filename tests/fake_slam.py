@@ -81,6 +81,7 @@ class FakeSlam:
         saved_map=None,
         localize=False,
         max_blocks=None,
+        timed=True,
     ):
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)

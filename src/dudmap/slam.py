@@ -73,6 +73,7 @@ class Slam(SlamResults):
         localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
         max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
             disk. It changes no result. None keeps all in memory.
+        timed: Whether the times of the frames are those of a clock; False where they are invented.
     """
 
     def __init__(
@@ -86,7 +87,10 @@ class Slam(SlamResults):
         saved_map: SavedMap | None = None,
         localize: bool = False,
         max_blocks: int | MemoryLimit | None = None,
+        *,
+        timed: bool = True,
     ) -> None:
+        self.timed = timed
         self.max_blocks = max_blocks
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration

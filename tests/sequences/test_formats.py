@@ -20,6 +20,7 @@ from layouts import (
     millimetres,
     nerfstudio,
     pose,
+    replica,
     scannet,
     seven_scenes,
     tum,
@@ -267,3 +268,34 @@ def test_a_spoilt_text_file_is_one_sentence(layout, tmp_path):
         path.write_bytes(whole)
     assert all(len(sentence) < 700 and "\n" not in sentence for sentence in said)
     assert open_sequence(folder)[0].depth.any()
+
+
+def test_rate_and_depth_unit_are_given(tmp_path):
+    folder, _ = write(replica, tmp_path)
+    assumed = open_sequence(folder)
+    assert not assumed.timed
+    known = open_sequence(folder, fps=5, depth_unit=0.002)
+    assert known.timed
+    np.testing.assert_allclose(known.timestamps, [0, 0.2, 0.4])
+    np.testing.assert_allclose(known.ground_truth.timestamps, [0, 0.2, 0.4])
+    assert known[2].timestamp == known[2].color_timestamp == pytest.approx(0.4)
+    np.testing.assert_allclose(known[1].depth, assumed[1].depth * 0.002 * 6553.5, rtol=1e-6)
+
+
+def test_rate_is_that_of_the_images_that_lie_there(tmp_path):
+    folder, _ = write(scannet, tmp_path)  # every tenth frame of a recording
+    assert open_sequence(folder, fps=4).timestamps == pytest.approx([0, 0.25, 0.5])
+
+
+def test_rate_of_timed_recordings_is_theirs(tmp_path):
+    folder, _ = write(tum, tmp_path)
+    assert open_sequence(folder).timed
+    with pytest.raises(DatasetError, match="has times of its own.* leave --fps out"):
+        open_sequence(folder, fps=5)
+
+
+@pytest.mark.parametrize("numbers", [{"fps": 0}, {"depth_unit": -1.0}, {"fps": float("nan")}])
+def test_rate_and_depth_unit_are_positive(tmp_path, numbers):
+    folder, _ = write(replica, tmp_path)
+    with pytest.raises(DatasetError, match="expected a positive number"):
+        open_sequence(folder, **numbers)

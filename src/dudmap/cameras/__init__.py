@@ -48,6 +48,7 @@ class LiveCamera(ABC):
         calibration: Of the colour camera; None for colour that is registered to depth.
         ground_truth: None; a camera knows no true poses.
         length: Number of frames in the stream, None where it has no end.
+        timed: Whether the times of the frames are those of a clock.
     """
 
     name: str
@@ -55,6 +56,7 @@ class LiveCamera(ABC):
     calibration: "Calibration | None" = None
     ground_truth: None = None
     length: int | None = None
+    timed: bool = True
 
     @abstractmethod
     def read(self) -> CameraFrame | None:

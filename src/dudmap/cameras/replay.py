@@ -28,12 +28,13 @@ class ReplayCamera(LiveCamera):
     """
 
     def __init__(self, recording: "str | Sequence") -> None:
-        from dudmap.sequences import open_sequence
+        from dudmap.sequences import is_timed, open_sequence
 
         self._sequence = open_sequence(recording) if isinstance(recording, str) else recording
         self.name = self._sequence.name
         self.camera, self.calibration = self._sequence.camera, self._sequence.calibration
         self.length = len(self._sequence)
+        self.timed = is_timed(self._sequence)
         self._times = self._sequence.timestamps - self._sequence.timestamps[0]
         self._start: float | None = None
         self._next = 0

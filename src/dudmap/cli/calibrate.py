@@ -6,7 +6,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, SetOption, TopicsOption, read_config
+from dudmap.cli.run import (
+    CameraOption,
+    ConfigOption,
+    DepthUnitOption,
+    FpsOption,
+    PresetOption,
+    SetOption,
+    TopicsOption,
+    read_config,
+)
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -25,6 +34,8 @@ def calibrate(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    fps: FpsOption = None,
+    depth_unit: DepthUnitOption = None,
     topics: TopicsOption = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
@@ -43,7 +54,7 @@ def calibrate(
     from dudmap.pipeline.calibration import calibrate_sequence
     from dudmap.sequences import open_sequence
 
-    recording = open_sequence(sequence, camera, topics=topics)
+    recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
     estimate = calibrate_sequence(recording, read_config(config, preset, assignments or []), given, max_frames)

@@ -6,7 +6,16 @@ from typing import Annotated
 import typer
 
 from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, ConfigOption, PresetOption, QuietOption, SetOption, read_config
+from dudmap.cli.run import (
+    CameraOption,
+    ConfigOption,
+    DepthUnitOption,
+    FpsOption,
+    PresetOption,
+    QuietOption,
+    SetOption,
+    read_config,
+)
 from dudmap.errors import DatasetError
 
 app = typer.Typer(add_completion=False)
@@ -24,6 +33,8 @@ def clean(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    fps: FpsOption = None,
+    depth_unit: DepthUnitOption = None,
     passes: Annotated[
         int, typer.Option("--passes", min=1, max=2, help="Passes of the run that is made; 2 finds more.")
     ] = 2,
@@ -40,7 +51,7 @@ def clean(
     from dudmap.sequences import open_sequence
     from dudmap.views.cleaning import clean_recording
 
-    recording = open_sequence(sequence, camera)
+    recording = open_sequence(sequence, camera, fps, depth_unit)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:

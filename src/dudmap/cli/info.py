@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, TopicsOption
+from dudmap.cli.run import CameraOption, DepthUnitOption, FpsOption, TopicsOption
 
 if TYPE_CHECKING:
     from dudmap.pipeline.inspection import Inspection
@@ -21,6 +21,8 @@ SHOWN_GAPS = 5
 def info(
     path: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="PATH")],
     camera: CameraOption = None,
+    fps: FpsOption = None,
+    depth_unit: DepthUnitOption = None,
     topics: TopicsOption = None,
     sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
     as_json: JsonOption = False,
@@ -37,7 +39,7 @@ def info(
     from dudmap.pipeline.inspection import inspect, sample
     from dudmap.sequences import open_sequence
 
-    recording = open_sequence(path, camera, topics=topics)
+    recording = open_sequence(path, camera, fps, depth_unit, topics=topics)
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     if sheet is not None:

@@ -24,6 +24,14 @@ TopicsOption = Annotated[
         "--topics", help="Of a bag: color=/a,depth=/b,color_info=/c,depth_info=/d,world=frame.", metavar="KEY=TOPIC,..."
     ),
 ]
+FpsOption = Annotated[
+    float | None,
+    typer.Option("--fps", help="Frames per second, where they are only numbered; 30 are assumed.", metavar="HZ"),
+]
+DepthUnitOption = Annotated[
+    float | None,
+    typer.Option("--depth-unit", help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES"),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[
     str | None,
@@ -81,6 +89,8 @@ def run(
     assignments: SetOption = None,
     preset: PresetOption = None,
     camera: CameraOption = None,
+    fps: FpsOption = None,
+    depth_unit: DepthUnitOption = None,
     topics: TopicsOption = None,
     calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
@@ -167,7 +177,7 @@ def run(
     parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
     resolve(parameters.device)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
-    recording = open_sequence(sequence, camera, topics=topics)
+    recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
     for warning in inspect(recording).warnings:
         _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
@@ -179,7 +189,9 @@ def run(
         given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
-    opened = {"path": str(sequence.resolve()), "camera": camera, "topics": topics}
+    opened = {
+        "path": str(sequence.resolve()), "camera": camera, "fps": fps, "depth_unit": depth_unit, "topics": topics,
+    }  # fmt: skip
     storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
     with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(

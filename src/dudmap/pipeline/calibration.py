@@ -7,6 +7,7 @@ from dudmap.calibration.estimator import CalibrationEstimator, Estimate
 from dudmap.config import Config
 from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.calibration import Calibration
+from dudmap.sequences import is_timed
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -64,7 +65,8 @@ def calibrate_sequence(
     """
     from dudmap.slam import Slam
 
-    slam = Slam(sequence.camera, config.override(["sensor.self_calibration=false"]), calibration=given)
+    tracking = config.override(["sensor.self_calibration=false"])
+    slam = Slam(sequence.camera, tracking, calibration=given, timed=is_timed(sequence))
     collector, submap = KeyframeCollector(given.camera), 0
     for index in range(len(sequence) if max_frames is None else min(max_frames, len(sequence))):
         try:

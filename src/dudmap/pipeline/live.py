@@ -64,14 +64,14 @@ def run_live(
 
     out, calibration = Path(out), calibration or camera.calibration
     metrics = RunRecord(dropped=0)
-    slam = Slam(camera.camera, config, calibration=calibration)
+    slam = Slam(camera.camera, config, calibration=calibration, timed=camera.timed)
     stopped, defect = "", False
     with locked(out), RunProgress(max_frames or camera.length, bar=progress) as display:
         prepare_run_folder(out, None, save_masks=save_masks)
         recorder = None if record is None else Recorder(Path(record), camera.camera, camera.calibration)
         try:
             display.working("loading kernels")
-            first = Slam(camera.camera, config, calibration=calibration)
+            first = Slam(camera.camera, config, calibration=calibration, timed=camera.timed)
             for frame in camera.preview(PREVIEW):
                 first.process(frame)
             for observer in observers:

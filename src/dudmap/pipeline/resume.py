@@ -11,6 +11,7 @@ from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run import Job
 from dudmap.pipeline.run_folder import RunReport, locked
 from dudmap.pipeline.storing import RunStore, check_recording, restored, stored_options
+from dudmap.sequences import is_timed
 from dudmap.state.system import on_device
 
 if TYPE_CHECKING:
@@ -62,7 +63,9 @@ def resume(
             try:
                 store = RunStore(out, options["every"], display.note)
                 limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
-                state = restored(reader, store, *(Slam(sequence.camera, config, max_blocks=limit) for _ in range(2)))
+                timed = is_timed(sequence)
+                systems = (Slam(sequence.camera, config, max_blocks=limit, timed=timed) for _ in range(2))
+                state = restored(reader, store, *systems)
             except sqlite3.Error as error:
                 raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
             job = Job(

@@ -15,6 +15,7 @@ from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
 from dudmap.pipeline.storing import RunState, RunStore, Storing, restored
+from dudmap.sequences import is_timed
 from dudmap.state.database import StateReader
 
 if TYPE_CHECKING:
@@ -124,6 +125,7 @@ def run(
     slam = Slam(
         sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
         localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
+        timed=is_timed(sequence),
     )  # fmt: skip
     record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
     state = RunState(slam, record, calibration, model)
@@ -263,7 +265,8 @@ class Job:
         store.close(finished=False)
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
-            systems = (Slam(self.sequence.camera, self.config, max_blocks=state.slam.max_blocks) for _ in range(2))
+            limit, timed = state.slam.max_blocks, state.slam.timed
+            systems = (Slam(self.sequence.camera, self.config, max_blocks=limit, timed=timed) for _ in range(2))
             old, state = state, restored(reader, store, *systems)
             self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")
             yield state, store
@@ -274,7 +277,7 @@ class Job:
 
         return Slam(
             self.sequence.camera, self.config, first_pass=first_pass, depth_model=state.model,
-            calibration=state.calibration,
+            calibration=state.calibration, timed=is_timed(self.sequence),
         )  # fmt: skip
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:

@@ -1,7 +1,9 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
+from dataclasses import replace
 from functools import cache
 from importlib import import_module
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
@@ -17,7 +19,7 @@ if TYPE_CHECKING:
     from dudmap.geometry.camera import Camera
     from dudmap.geometry.trajectory import Trajectory
 
-__all__ = ["Reader", "Recording", "Sequence", "is_recording", "open_sequence", "reader_of", "readers"]
+__all__ = ["Reader", "Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
 
 
 @runtime_checkable
@@ -67,12 +69,15 @@ class Recording(Sequence, Protocol):
     Attributes:
         format: Name of its format, for people.
         intrinsics_source: Where the intrinsics come from, e.g. ``intrinsics.txt`` or ``the --camera option``.
+        timed: Whether the times were read or their rate was given; False where they are invented.
     """
 
     @property
     def format(self) -> str: ...  # noqa: D102
     @property
     def intrinsics_source(self) -> str: ...  # noqa: D102
+    @property
+    def timed(self) -> bool: ...  # noqa: D102
 
 
 class Reader(Protocol):
@@ -80,7 +85,7 @@ class Reader(Protocol):
 
     Attributes:
         format: Name of the format, for people.
-        options: Names of the keyword arguments that its constructor takes beside path and camera.
+        options: Names of the options of ``open_sequence`` that the format has.
     """
 
     @property
@@ -142,7 +147,18 @@ def is_recording(path: Path) -> bool:
     return path.exists() and (reader_of(path) is not None or is_archive(path))
 
 
-def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
+def is_timed(sequence: object) -> bool:
+    """Whether the times of a sequence are known: not those of a recording whose frames are only numbered."""
+    return getattr(sequence, "timed", True)
+
+
+def open_sequence(
+    path: str | Path,
+    camera: "Camera | str | None" = None,
+    fps: float | None = None,
+    depth_unit: float | None = None,
+    **options: Any,  # noqa: ANN401
+) -> Recording:
     """Open a recording with the first reader of ``readers()`` that recognises it.
 
     A folder that is no recording itself may contain one. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is
@@ -152,6 +168,8 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **opti
         path: Folder, file or archive.
         camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
             (default: the size of the images, and the depth scale that is usual in the format).
+        fps: Frames per second of a recording whose frames are numbered, not timed; else 30 are assumed.
+        depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces that of camera and recording.
         options: Of one format, e.g. ``topics`` of bags; None stands for an option that is not given.
 
     Raises:
@@ -162,13 +180,27 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **opti
     with damaged(DatasetError, f"the recording {path}"):
         place, reader = _find(path)
     given = {name: value for name, value in options.items() if value is not None}
-    foreign = [f"--{name}" for name in given if name not in reader.options]
+    numbers = {"fps": fps, "depth_unit": depth_unit}
+    for name, number in numbers.items():
+        if number is not None and not (isfinite(number) and number > 0):
+            raise DatasetError(f"found {_option(name)} {number:g}; expected a positive number")
+    asked = [*given, *(name for name, number in numbers.items() if number is not None)]
+    foreign = [_option(name) for name in asked if name not in reader.options]
     if foreign:
         raise DatasetError(
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
         )
     with damaged(DatasetError, f"the recording {place}"):
-        return reader(place, camera, **given)
+        recording: Any = reader(place, camera, **given)
+        if depth_unit is not None:
+            recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
+        if fps is not None:
+            recording.set_rate(fps)
+        return recording
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
 
 
 def _find(path: Path) -> tuple[Path, Reader]:

@@ -65,7 +65,8 @@ class RosBag:
     """
 
     format = "ROS bag"
-    options: tuple[str, ...] = ("topics",)
+    options: tuple[str, ...] = ("topics", "depth_unit")
+    timed = True
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None, topics: str | None = None) -> None:
         self.path = Path(path)

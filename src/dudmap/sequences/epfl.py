@@ -4,7 +4,7 @@ from pathlib import Path
 
 from dudmap.geometry.association import TimedFile
 from dudmap.sequences import intrinsics
-from dudmap.sequences.image_folder import ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import ImageFolder, numbered_files
 
 CAMERA = {
     "fx": 365.8046307762528, "fy": 365.80463336811664, "cx": 254.31510758228475, "cy": 206.98513348550657,
@@ -25,8 +25,8 @@ class EpflSequence(ImageFolder):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         files = list(self.path.iterdir())
-        return pair_numbered(
-            self.path, numbered_files(files, r"rgb(\d{6})\.png"), numbered_files(files, r"depth(\d{6})\.png")
+        return self._pair_numbered(
+            numbered_files(files, r"rgb(\d{6})\.png"), numbered_files(files, r"depth(\d{6})\.png")
         )
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:

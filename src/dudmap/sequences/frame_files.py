@@ -10,7 +10,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import images, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_matrices, read_matrix, rigid_trajectory
 
 NAME = r"frame-(\d+)"
@@ -38,7 +38,7 @@ class FrameFiles(ImageFolder):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         files = list(self.path.iterdir())
         colors = numbered_files(files, NAME + r"\.(?:color|rgb)\.(?:png|jpe?g)")
-        return pair_numbered(self.path, colors, numbered_files(files, NAME + r"\.depth\.(?:png|pgm)"))
+        return self._pair_numbered(colors, numbered_files(files, NAME + r"\.depth\.(?:png|pgm)"))
 
     def _find_ground_truth(self) -> Trajectory | None:
         poses = numbered_files(self.path.iterdir(), NAME + r"\.pose\.txt")

@@ -11,7 +11,7 @@ from dudmap.geometry.association import TimedFile, read_rows
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import read_text
 from dudmap.sequences import intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import rigid_trajectory
 
 CAMERA = {"fx": 481.2, "fy": 480.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480, "depth_scale": 5000.0}
@@ -46,7 +46,7 @@ class IclNuimSequence(ImageFolder):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         colors = numbered_files((self.path / "rgb").iterdir(), r"(\d+)\.png")
         depths = numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png")
-        return pair_numbered(self.path, colors, depths)
+        return self._pair_numbered(colors, depths)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         return intrinsics.own_or(self.path, CAMERA, "the ICL-NUIM camera")
@@ -73,7 +73,7 @@ class IclNuimLoopSequence(ImageFolder):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         files = list(self.path.iterdir())
         colors = numbered_files(files, SCENE_FILE + r"\.png")
-        return pair_numbered(self.path, colors, numbered_files(files, SCENE_FILE + r"\.depth"))
+        return self._pair_numbered(colors, numbered_files(files, SCENE_FILE + r"\.depth"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         return intrinsics.own_or(self.path, CAMERA, "the ICL-NUIM camera")

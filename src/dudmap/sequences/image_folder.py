@@ -40,13 +40,15 @@ class ImageFolder(ABC):
         calibration: Of the colour camera, where it is another one; None for colour that is registered to depth.
         timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses, None if they are not known.
+        timed: Whether the times were read; False where frames are only numbered, and 1/30 s apart is assumed.
 
     Raises:
         DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
     """
 
     format = ""
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("fps", "depth_unit")
+    timed = True
     depth_scale = 1000.0
     """Depth units per metre where neither the recording nor the user says otherwise."""
 
@@ -85,6 +87,23 @@ class ImageFolder(ABC):
             )
         return frame
 
+    def set_rate(self, fps: float) -> None:
+        """Replace the assumed rate of numbered frames: as many of the usual steps of their numbers make a second.
+
+        Raises:
+            DatasetError: The recording has times of its own.
+        """
+        if self.timed:
+            raise DatasetError(
+                f"{self.path} has times of its own, which --fps {fps:g} does not replace; leave --fps out"
+            )
+        factor = 1.0 / (fps * float(np.median(np.diff(self.timestamps)))) if len(self) > 1 else FRAME_RATE / fps
+        self._pairs = [tuple(TimedFile(factor * file.timestamp, file.path) for file in pair) for pair in self._pairs]
+        self.timestamps = factor * self.timestamps
+        if self.ground_truth is not None:
+            self.ground_truth = Trajectory(factor * self.ground_truth.timestamps, self.ground_truth.Ts_world_camera)
+        self.timed = True
+
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame; this layout has none."""
         return None
@@ -100,6 +119,21 @@ class ImageFolder(ABC):
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""
         return None
+
+    def _pair_numbered(self, colors: dict[int, Path], depths: dict[int, Path]) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files of equal numbers; the time of a frame is its number over ``FRAME_RATE``.
+
+        Raises:
+            DatasetError: No number occurs in both.
+        """
+        numbers = sorted(colors.keys() & depths.keys())
+        if not numbers:
+            raise DatasetError(
+                f"{self.path} has {len(colors)} colour and {len(depths)} depth images, but none of them has the same "
+                "number"
+            )
+        self.timed = False
+        return [(TimedFile(n / FRAME_RATE, colors[n]), TimedFile(n / FRAME_RATE, depths[n])) for n in numbers]
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         """Depth image (H, W) in metres."""
@@ -167,19 +201,3 @@ def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
     """Files by the number that the first group of a pattern of the whole file name holds; others are left out."""
     matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
     return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}
-
-
-def pair_numbered(
-    path: Path, colors: dict[int, Path], depths: dict[int, Path], rate: float = FRAME_RATE
-) -> list[tuple[TimedFile, TimedFile]]:
-    """(colour, depth) files of equal numbers; the time of a frame is its number over the frame rate.
-
-    Raises:
-        DatasetError: No number occurs in both.
-    """
-    numbers = sorted(colors.keys() & depths.keys())
-    if not numbers:
-        raise DatasetError(
-            f"{path} has {len(colors)} colour and {len(depths)} depth images, but none of them has the same number"
-        )
-    return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]

@@ -42,7 +42,8 @@ class KlgRecording:
     """
 
     format = "ElasticFusion .klg"
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("depth_unit",)
+    timed = True
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)

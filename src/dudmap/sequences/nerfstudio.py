@@ -61,6 +61,7 @@ class NerfstudioSequence(ImageFolder):
         given = [frame.get("timestamp") for frame in self._frames]
         if all(isinstance(stamp, int | float) for stamp in given) and np.all(np.diff(given) > 0):
             return [float(stamp) for stamp in given]
+        self.timed = False
         return [n / FRAME_RATE for n in range(len(self._frames))]
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:

@@ -9,7 +9,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry.association import TimedFile, associate
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import camera_json, intrinsics
-from dudmap.sequences.image_folder import ImageFolder, pair_numbered
+from dudmap.sequences.image_folder import ImageFolder
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 DEPTH_WORDS = ("depth",)
@@ -41,9 +41,7 @@ class NumberedSequence(ImageFolder):
         kinds = _kinds(self.path)
         colors, depths = ({_number(file): file for file in kinds[kind]} for kind in ("color", "depth"))
         if max(map(abs, colors)) < LARGEST_NUMBER and all(float(n).is_integer() for n in (*colors, *depths)):
-            return pair_numbered(
-                self.path, {int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()}
-            )
+            return self._pair_numbered({int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()})
         first = sorted(TimedFile(_seconds(n), file) for n, file in colors.items())
         second = sorted(TimedFile(_seconds(n), file) for n, file in depths.items())
         pairs = associate(np.array([f.timestamp for f in first]), np.array([f.timestamp for f in second]))

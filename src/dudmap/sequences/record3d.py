@@ -37,6 +37,7 @@ class Record3DRecording:
 
     format = "Record3D .r3d"
     options: tuple[str, ...] = ()
+    timed = True
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)

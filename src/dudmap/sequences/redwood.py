@@ -6,7 +6,7 @@ from pathlib import Path
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import camera_json, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_log, rigid_trajectory
 
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480, "depth_scale": 1000.0}
@@ -41,9 +41,10 @@ class RedwoodSequence(ImageFolder):
             int(file.stem[:7]): int(file.stem[8:]) / 1e6 for file in depths if re.fullmatch(OBJECT_SCAN, file.name)
         }
         pattern = r"(\d{7})-\d{12}\.(?:jpe?g|png)" if timed else r"\D*(\d+)\.(?:jpe?g|png)"
-        pairs = pair_numbered(self.path, numbered_files(colors, pattern), numbered_files(depths, pattern))
+        pairs = self._pair_numbered(numbered_files(colors, pattern), numbered_files(depths, pattern))
         if not timed:
             return pairs
+        self.timed = True
         stamps = [timed[int(depth.path.stem[:7])] for _, depth in pairs]
         return [(TimedFile(t, c.path), TimedFile(t, d.path)) for t, (c, d) in zip(stamps, pairs, strict=True)]
 

@@ -5,7 +5,7 @@ from pathlib import Path
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import camera_json, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_matrices, rigid_trajectory
 
 CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "width": 1200, "height": 680, "depth_scale": 6553.5}
@@ -29,7 +29,7 @@ class ReplicaSequence(ImageFolder):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         files = list((self.path / "results").iterdir())
         colors = numbered_files(files, r"frame(\d+)\.(?:jpe?g|png)")
-        return pair_numbered(self.path, colors, numbered_files(files, r"depth(\d+)\.png"))
+        return self._pair_numbered(colors, numbered_files(files, r"depth(\d+)\.png"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         for place in (self.path, self.path.resolve().parent):

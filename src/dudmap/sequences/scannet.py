@@ -10,7 +10,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import images, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files, pair_numbered
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_matrix, rigid_trajectory
 
 
@@ -32,7 +32,7 @@ class ScanNetSequence(ImageFolder):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         colors = numbered_files((self.path / "color").iterdir(), r"(\d+)\.(?:jpe?g|png)")
-        return pair_numbered(self.path, colors, numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png"))
+        return self._pair_numbered(colors, numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         depth = self._values("depth") | {"depth_scale": self.depth_scale}

@@ -51,7 +51,7 @@ class SensRecording:
     """
 
     format = "ScanNet .sens"
-    options: tuple[str, ...] = ()
+    options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)
@@ -71,8 +71,8 @@ class SensRecording:
         calibration = Calibration(header.camera(header.color_intrinsic, header.color_size), T_color_depth)
         self.calibration = None if calibration.is_registered(self.camera) else calibration
         self.timestamps = _times([entry.depth_time for entry in self._entries])
-        timed = self.timestamps[-1] == 1e-6 * self._entries[-1].depth_time
-        self._color_times = [1e-6 * entry.color_time if timed else None for entry in self._entries]
+        self.timed = self.timestamps[-1] == 1e-6 * self._entries[-1].depth_time
+        self._color_times = [1e-6 * entry.color_time if self.timed else None for entry in self._entries]
         valid = np.isfinite(poses).all(axis=(1, 2))
         truth = Trajectory(self.timestamps[valid], poses[valid] @ header.depth_extrinsic)
         self.ground_truth = truth if valid.any() else None
