@@ -25,7 +25,6 @@ from dudmap.config import Config
 from dudmap.exporting.run_content import RunContent
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
-from dudmap.pipeline.calibration import calibrate_start
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from dudmap.views.cleaning import Cleaner
@@ -170,10 +169,7 @@ def score(name, sequence, twin, work: Path, passes: int, pictures: Path | None):
     folder = work / name.replace(" ", "_").replace(",", "")
     if not (folder / "map.npz").is_file():
         config = Config()
-        run(
-            sequence, config, folder, save_masks=True, progress=False, passes=passes,
-            calibration=calibrate_start(sequence, config),
-        )  # fmt: skip
+        run(sequence, config, folder, save_masks=True, progress=False, passes=passes, calibrate=True)
     cleaner = Cleaner(RunContent.load(folder), sequence)
     poses = true_poses(sequence)
     views = static_views(sequence, twin, poses)

@@ -1,5 +1,7 @@
 """Commands on saved maps: what is asked for is passed on, and bad input is one sentence before anything is written."""
 
+from types import SimpleNamespace
+
 import pytest
 from typer.testing import CliRunner
 
@@ -21,8 +23,8 @@ def saved(tmp_path, monkeypatch):
     folder = tmp_path / "earlier"
     folder.mkdir()
     Config().override(["volume.voxel_size=0.03"]).save(folder / "config.toml")
-    asked = []
-    monkeypatch.setattr(SavedMap, "load", classmethod(lambda cls, *arguments: asked.append(arguments) or "the map"))
+    asked, the_map = [], SimpleNamespace(folder=folder)
+    monkeypatch.setattr(SavedMap, "load", classmethod(lambda cls, *arguments: asked.append(arguments) or the_map))
     return folder, asked
 
 
@@ -49,7 +51,7 @@ def test_a_run_goes_on_in_a_map_with_its_configuration(slam, recording, saved, t
     assert asked == [(folder, 0.03)]
     (_, config), given = made[0]
     assert config.volume.voxel_size == 0.03
-    assert (given["saved_map"], given["localize"]) == ("the map", True)
+    assert (given["saved_map"].folder, given["localize"]) == (folder, True)
     written = {path.name for path in (tmp_path / "next").iterdir()}
     assert "trajectory.txt" in written
     assert not written & {"map.npz", "keyframes.npz", "mesh.ply"}

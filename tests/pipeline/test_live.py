@@ -63,6 +63,17 @@ def test_all_frames_are_recorded_while_some_are_dropped(slam, sequence, tmp_path
         np.testing.assert_array_equal(frame.color, color_image(index))
 
 
+def test_the_recording_is_complete_though_the_run_folder_cannot_be_written(slam, sequence, tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise DudmapError("no space left")
+
+    monkeypatch.setattr("dudmap.pipeline.live.write_run_folder", full)
+    file = tmp_path / "walk.mcap"
+    with pytest.raises(DudmapError, match="no space left"):
+        run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)
+    assert len(open_sequence(file)) >= 7, "a busy machine may be late with one"
+
+
 def test_ctrl_c_ends_a_run_and_writes_the_results(slam, sequence, tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(slam, "script", {4: KeyboardInterrupt()})
     report = run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=tmp_path / "walk.mcap", progress=False)

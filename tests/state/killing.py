@@ -13,6 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from delayed_color import FAULTS
 from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.errors import StateError
@@ -34,7 +35,6 @@ CONFIG = Config().override(
         "submaps.patience=0.3",
         "loops.min_age=1.0",
         "loops.gap=3",
-        "sensor.self_calibration=false",
     ]
 )
 EVERY = 0.3
@@ -61,7 +61,8 @@ class Rendered:
 
 
 def lost_and_found():
-    """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps."""
+    """A room, a jump to another part of it that begins a second map, and the way back, which joins the maps; the colour
+    is taken after the depth."""
     yaw = np.concatenate([np.zeros(6), np.full(9, 80.0), 78 * np.cos(np.linspace(0, np.pi / 2, 26)), np.zeros(18)])
     base = synthetic.sequence(movers=(), frames=len(yaw), seed=1, camera=SMALL, camera_path="slow", fps=15.0,
                               noise="realsense")  # fmt: skip
@@ -69,7 +70,8 @@ def lost_and_found():
     for T, angle in zip(Ts, np.radians(yaw), strict=True):
         T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), angle * up]))[:3, :3] @ T[:3, :3]
     moved = Trajectory(base.timestamps, Ts)
-    return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0))
+    return Rendered(SyntheticSequence(base.scene, [], moved, SMALL, noise="realsense", seed=1, fps=15.0,
+                                      faults=FAULTS))  # fmt: skip
 
 
 def begin(sequence, out, every=EVERY, **options):
@@ -133,15 +135,14 @@ def after(calls, function):
     return counted
 
 
-def killed(sequence, out, moment, rng, duration, go=begin):
-    """Run and be killed at a random moment of a kind."""
+def killed(sequence, out, moment, rng, duration, statements, go=begin):
+    """Run and be killed at a random moment of a kind; an undisturbed run takes so many seconds and statements."""
     if moment == "anywhere":
         timer = threading.Timer(rng.uniform(0, 0.9 * duration), die)
         timer.daemon = True
         timer.start()
     elif moment == "checkpoint":  # between two statements of a transaction
-        most = 4 * max(duration / EVERY, 3)  # four statements each, if they take no time
-        StateDatabase._execute = after(int(rng.integers(4, 0.7 * most)), StateDatabase._execute)
+        StateDatabase._execute = after(int(rng.integers(4, 0.6 * statements)), StateDatabase._execute)
     elif moment == "join":  # a map is half rebuilt from stored frames
         Atlas.join = after(0, Atlas.join)
         FrameStore.__getitem__ = after(int(rng.integers(0, 3)), FrameStore.__getitem__)

@@ -16,6 +16,24 @@ class NoDatabase:
         pass
 
 
+def test_a_writer_that_fails_in_any_way_does_not_end_the_run(monkeypatch):
+    monkeypatch.setattr(checkpoints, "take_snapshot", lambda *_, **__: None)
+    said, database = [], NoDatabase()
+    writer = Checkpoints(database, 0.0, said.append)
+    database.write = lambda snapshot, meta: 1 / 0
+    for _ in range(2):
+        writer.take(None, {}, wait=True)
+    del database.write
+    writer.take(None, {}, wait=True)
+    writer.close()
+    assert said == [
+        "the state of the run cannot be stored: ZeroDivisionError('division by zero'); it goes on in memory and tries "
+        "again",
+        "checkpoints are written again",
+    ]
+    assert writer.written == 1
+
+
 def due_after(monkeypatch, snapshot, seconds):
     """Whether the second checkpoint is due so many seconds after the first, which ``snapshot()`` took."""
     monkeypatch.setattr(checkpoints, "take_snapshot", lambda *_, **__: snapshot())

@@ -10,37 +10,48 @@ import numpy as np
 import pytest
 from killing import begin, in_child, killed, lost_and_found, proceed, results
 
+from delayed_color import DELAY, find_early
 from dudmap.errors import DudmapError
+from dudmap.pipeline.progress import RunProgress
+from dudmap.state.database import StateDatabase
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
 
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """The recording, the results of a run that was not interrupted, and its duration in seconds."""
-    before = cv2.getNumThreads()
+    """The recording, the results of a run that was not interrupted, its duration in seconds and statements."""
+    before, patch = cv2.getNumThreads(), pytest.MonkeyPatch()
     cv2.setNumThreads(1)  # threads do not survive the fork
+    find_early(patch, (4, 20, 40))
     sequence, out = lost_and_found(), tmp_path_factory.mktemp("whole")
-    start = time.perf_counter()
-    begin(sequence, out)
-    duration = time.perf_counter() - start
+    statements, said, execute = [], [], StateDatabase._execute
+    with pytest.MonkeyPatch.context() as during:
+        during.setattr(StateDatabase, "_execute", lambda *given: statements.append(given[1]) or execute(*given))
+        during.setattr(RunProgress, "note", lambda self, sentence: said.append(sentence))
+        start = time.perf_counter()
+        begin(sequence, out)
+        duration = time.perf_counter() - start
+    assert not [sentence for sentence in said if "cannot be stored" in sentence]
     found = results(out)
     assert found["corrected"] >= 1
     assert found["lost"] >= 3
     assert found["complete"]
-    yield sequence, found, duration
+    assert f"delay = {DELAY}" in (out / "calibration.toml").read_text()
+    yield sequence, found, duration, len(statements)
+    patch.undo()
     cv2.setNumThreads(before)
 
 
 def trial(whole, out, moment, seed):
     """Kill, sometimes kill what continues it too, and continue; whether the first was killed at all."""
-    sequence, expected, duration = whole
+    sequence, expected, duration, statements = whole
     rng = np.random.default_rng(seed)
     out.mkdir()
-    status = in_child(killed, sequence, out, moment, rng, duration)
+    status = in_child(killed, sequence, out, moment, rng, duration, statements)
     assert status in (0, -9)
     if status == -9 and rng.uniform() < 0.3:
-        in_child(killed, sequence, out, "anywhere", rng, duration, proceed)
+        in_child(killed, sequence, out, "anywhere", rng, duration, statements, proceed)
     if (status == -9 and not (out / "metrics.json").exists()) or (out / "state.db").exists():
         assert in_child(proceed, sequence, out) == 0
     found = results(out)
@@ -56,10 +67,10 @@ def test_a_killed_run_is_continued(whole, tmp_path, moment):
 @pytest.mark.slow
 def test_fifty_killed_runs_are_continued(whole, tmp_path):
     kinds = ["anywhere"] * 26 + ["checkpoint"] * 10 + ["join"] * 6 + ["export"] * 8
-    sequence, expected, _ = whole
+    sequence, expected, _, statements = whole
     count, start = 0, time.perf_counter()
     assert in_child(begin, sequence, tmp_path / "timed") == 0
-    whole = sequence, expected, time.perf_counter() - start  # the first run may have compiled kernels
+    whole = sequence, expected, time.perf_counter() - start, statements  # the first run may have compiled kernels
     for seed, moment in enumerate(np.random.default_rng(0).permutation(kinds)):
         count += trial(whole, tmp_path / str(seed), moment, seed)
         shutil.rmtree(tmp_path / str(seed))
@@ -92,7 +103,7 @@ def on_a_full_disk(sequence, out, report):
 
 def test_a_run_goes_on_in_memory_while_the_disk_is_full(whole, tmp_path):
     """It says so once, and what is stored is not damaged."""
-    (sequence, expected, _), out = whole, tmp_path / "out"
+    (sequence, expected, _, _), out = whole, tmp_path / "out"
     assert in_child(on_a_full_disk, sequence, out, tmp_path / "report") == 0
     told = json.loads((tmp_path / "report").read_text())
     warnings = [sentence for sentence in told["said"] if "cannot be stored" in sentence]

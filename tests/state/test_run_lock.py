@@ -6,11 +6,13 @@ import signal
 import socket
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
+from dudmap.geometry.calibration import Calibration
 from dudmap.pipeline.resume import resume
 from dudmap.pipeline.run import run
 from dudmap.pipeline.storing import Storing
@@ -59,6 +61,30 @@ def test_neither_a_second_run_nor_a_resume_enters_a_folder_in_use(slam, tmp_path
             resume(out)
         assert (out / "trajectory.txt").read_text() == "of the other"
     assert run(sequence, Config(), out, progress=False).metrics["complete"]
+
+
+def test_the_folder_is_taken_before_the_calibration_which_a_resumed_run_repeats(slam, tmp_path, monkeypatch):
+    recording, out = write_recording(tmp_path / "desk", 4), tmp_path / "out"
+    sequence = open_sequence(recording)
+    found = replace(Calibration.registered(sequence.camera), delay=0.02)
+
+    def killed(*_):
+        with pytest.raises(DudmapError, match="in use by process"):
+            run(sequence, Config(), out, progress=False)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("dudmap.pipeline.calibration.calibrate_start", killed)
+    ordered = {"progress": False, "calibrate": True, "storing": Storing({"path": str(recording)})}
+    (tmp_path / "file").touch()
+    with pytest.raises(DudmapError, match="cannot write into the run folder"):
+        run(sequence, Config(), tmp_path / "file", **ordered)
+    with pytest.raises(KeyboardInterrupt):
+        run(sequence, Config(), out, max_frames=3, save_masks=True, **ordered)
+    monkeypatch.setattr("dudmap.pipeline.calibration.calibrate_start", lambda *_: found)
+    assert resume(out, progress=False).metrics["frames"] == 3
+    assert Calibration.load(out / "calibration.toml").delay == 0.02
+    assert len(list((out / "masks").iterdir())) == 3
+    assert not (out / "state.db").exists()
 
 
 def test_why_a_folder_cannot_be_continued(slam, tmp_path):

@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 
+from delayed_color import DELAY, FAULTS, find_early
 from dudmap import synthetic
 from dudmap.config import Config
 from dudmap.frames.frame import Frame
@@ -76,6 +77,30 @@ def test_a_stored_system_is_the_same_and_goes_on_the_same(tmp_path, case):
     mesh, other = slam.volume.extract_mesh(), again.volume.extract_mesh()
     for name in ("vertices", "faces", "colors", "normals"):
         np.testing.assert_array_equal(getattr(mesh, name), getattr(other, name))
+
+
+def test_a_system_that_calibrates_itself_is_stored_after_every_frame(tmp_path, monkeypatch):
+    """The colours of the recording are late: what is kept of a frame has levels whose colours nobody has needed yet."""
+    find_early(monkeypatch, (4,))
+    sequence = synthetic.sequence("room", movers=("person",), frames=14, camera=SMALL, camera_path="fast",
+                                  faults=FAULTS)  # fmt: skip
+    settings = [
+        "volume.voxel_size=0.02",
+        "dynamics.start_seconds=0.1",
+        "tracker.widths=[40, 80, 160]",
+        "dynamics.width=80",
+    ]
+    slam = again = Slam(sequence.camera, Config().override(settings))
+    for index in range(len(sequence)):
+        frame = dark(sequence[index]) if index in (9, 10) else sequence[index]
+        result = slam.process(frame)
+        if again is not slam:
+            assert_same_results(result, again.process(frame))
+        assert (result.state == "lost", result.calibrated) == (index in (9, 10), index == 6)
+        slam.save(tmp_path / "state.db")
+        again = Slam.resume(tmp_path / "state.db")
+        assert differences(whole(slam, tmp_path, f"a{index}"), whole(again, tmp_path, f"b{index}")) == []
+    assert slam.calibration.delay == DELAY
 
 
 def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch):

@@ -85,7 +85,6 @@ def measure_sequence(
         DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     from dudmap.geometry.mesh import Mesh
-    from dudmap.pipeline.calibration import calibrate_start
     from dudmap.pipeline.frame_source import AHEAD
     from dudmap.pipeline.run import run
     from dudmap.synthetic.recording import SyntheticSequence
@@ -98,7 +97,7 @@ def measure_sequence(
         report = run(
             sequence, config, folder,
             max_frames=max_frames, progress=False, ahead=ahead, save_map=out is not None, passes=passes,
-            calibration=calibrate_start(sequence, config, max_frames) if calibrate else None,
+            calibrate=calibrate,
         )  # fmt: skip
         row: Row = {key: value for key, value in report.metrics.items() if isinstance(value, int | float)}
         row["tracked_share"] = round(report.metrics["tracked"] / report.metrics["frames"], 4)

@@ -46,7 +46,6 @@ def clean(
 
     from dudmap.cli.progress import counted
     from dudmap.exporting.run_content import RunContent
-    from dudmap.pipeline.calibration import calibrate_start
     from dudmap.pipeline.run import run as run_sequence
     from dudmap.sequences import open_sequence
     from dudmap.views.cleaning import clean_recording
@@ -56,10 +55,9 @@ def clean(
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
         parameters = read_config(config, preset, assignments or [])
-        given = calibrate_start(recording, parameters)
         run_sequence(
             recording, parameters, out / "run",
-            save_masks=True, passes=passes, progress=not (quiet or as_json), calibration=given,
+            save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,
         )  # fmt: skip
     with counted("cleaning", quiet=quiet or as_json) as progress:
         report = clean_recording(RunContent.load(run or out / "run"), recording, out, progress)

@@ -181,12 +181,7 @@ def run(
     for warning in inspect(recording).warnings:
         _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
-    if calibration == "auto" and not live:
-        from dudmap.pipeline.calibration import calibrate_start
-
-        given = calibrate_start(recording, parameters, max_frames, None if quiet or as_json else _print_notice)
-    else:
-        given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
+    given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
     opened = {
@@ -197,7 +192,8 @@ def run(
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, saved_map=saved_map, localize=localize,
+            depth_model=depth_model, calibration=given, calibrate=calibration == "auto" and not live,
+            saved_map=saved_map, localize=localize,
             max_memory=None if max_memory is None else memory_size(max_memory), observers=watching, storing=storing,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)

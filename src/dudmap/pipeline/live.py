@@ -90,12 +90,14 @@ def run_live(
             stopped, defect = repr(error), not isinstance(error, OSError)
             raise
         finally:
-            camera.close()
-            display.working("writing")
-            report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map, defect=defect)
-            for observer in observers:
-                observer.finish(out)
-            _finish(recorder, display)
+            try:
+                camera.close()
+                display.working("writing")
+                report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map, defect=defect)
+                for observer in observers:
+                    observer.finish(out)
+            finally:
+                _finish(recorder, display)
     if metrics.dropped:
         display.note(f"live: {metrics.dropped} of {metrics.dropped + len(metrics.rows)} frames were dropped")
     if not metrics.rows:

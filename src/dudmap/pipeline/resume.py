@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 from dudmap.config import Config
 from dudmap.errors import StateError
 from dudmap.pipeline.progress import RunProgress
-from dudmap.pipeline.run import Job
+from dudmap.pipeline.run import Job, run
 from dudmap.pipeline.run_folder import RunReport, locked
-from dudmap.pipeline.storing import RunStore, check_recording, restored, stored_options
+from dudmap.pipeline.storing import RunStore, Storing, check_recording, restored, stored_options
 from dudmap.sequences import is_timed
 from dudmap.state.system import on_device
 
@@ -30,8 +30,9 @@ def resume(
 ) -> RunReport:
     """Go on with a run that was killed or interrupted, from its last checkpoint to the end.
 
-    Recording, configuration and options are those the run began with. Results are those of a run that was not
-    interrupted: the same poses, masks, map and mesh, bit for bit.
+    One that ended while it calibrated the colour camera begins anew. Recording, configuration and options are those the
+    run began with. Results are those of a run that was not interrupted: the same poses, masks, map and mesh, bit for
+    bit.
 
     Args:
         out: The run folder.
@@ -46,6 +47,7 @@ def resume(
         DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
     """
     from dudmap.mapping.memory_limit import MemoryLimit
+    from dudmap.places.saved_map import SavedMap
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -59,20 +61,33 @@ def resume(
                 sequence = open_recording(options["recording"])
             check_recording(sequence, meta, out)
             config = on_device(Config.model_validate_json(options["config"]), device)
-            display = RunProgress(options["count"] * options["passes"], bar=progress)
-            try:
-                store = RunStore(out, options["every"], display.note)
-                limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
-                timed = is_timed(sequence)
-                systems = (Slam(sequence.camera, config, max_blocks=limit, timed=timed) for _ in range(2))
-                state = restored(reader, store, *systems)
-            except sqlite3.Error as error:
-                raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
-            job = Job(
-                sequence, config, out, options["count"], display, _masks(options["masks"], sequence),
-                options["save_masks"], options["save_map"], options["ahead"], False, options["passes"], None, observers,
-            )  # fmt: skip
-            return job.carry_out(state, store)
+            limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
+            if "pass" in meta:
+                display = RunProgress(options["count"] * options["passes"], bar=progress)
+                try:
+                    store = RunStore(out, options["every"], display.note)
+                    systems = (
+                        Slam(sequence.camera, config, max_blocks=limit, timed=is_timed(sequence)) for _ in range(2)
+                    )
+                    state = restored(reader, store, *systems)
+                except sqlite3.Error as error:
+                    raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
+                job = Job(
+                    sequence, config, out, options["count"], display, _masks(options["masks"], sequence),
+                    options["save_masks"], options["save_map"], options["ahead"], False, options["passes"], None,
+                    observers,
+                )  # fmt: skip
+                return job.carry_out(state, store)
+    saved = options["saved_map"]
+    return run(
+        sequence, config, out,
+        max_frames=options["count"], save_masks=options["save_masks"], save_map=options["save_map"],
+        masks=options["masks"], progress=progress, ahead=options["ahead"], passes=options["passes"],
+        depth_model=options["depth_model"], calibrate=True, localize=options["localize"],
+        saved_map=None if saved is None else SavedMap.load(saved, config.volume.voxel_size),
+        max_memory=options["max_memory"], observers=observers,
+        storing=Storing(options["recording"], options["every"], options["report"]),
+    )  # fmt: skip
 
 
 def open_recording(arguments: dict[str, Any]) -> "Sequence":

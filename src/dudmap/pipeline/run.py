@@ -43,6 +43,7 @@ def run(
     passes: int = 1,
     depth_model: str | Path | None = None,
     calibration: "Calibration | None" = None,
+    calibrate: bool = False,
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
     max_memory: int | None = None,
@@ -82,6 +83,7 @@ def run(
             written.
         depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         calibration: Of the colour camera; None takes that of the recording.
+        calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
@@ -99,6 +101,7 @@ def run(
     """
     from dudmap.calibration.depth_model import DepthModel
     from dudmap.mapping.memory_limit import MemoryLimit
+    from dudmap.pipeline.calibration import calibrate_start
     from dudmap.slam import Slam
 
     out = Path(out)
@@ -119,43 +122,39 @@ def run(
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     if storing is not None and live:
         raise ConfigError("a live replay cannot be stored: it does not stop for what is missed; drop live or storing")
-    given_masks = None if masks is None else _open_masks(masks, sequence)
-    model = None if depth_model is None else DepthModel.load(Path(depth_model))
-    calibration = calibration or sequence.calibration
-    slam = Slam(
-        sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
-        localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
-        timed=is_timed(sequence),
-    )  # fmt: skip
-    record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
-    state = RunState(slam, record, calibration, model)
-    display = RunProgress(count * passes, bar=progress)
-    job = Job(
-        sequence,
-        config,
-        out,
-        count,
-        display,
-        given_masks,
-        save_masks,
-        save_map,
-        ahead,
-        live,
-        passes,
-        observe,
-        observers,
-    )
     with locked(out):
+        given_masks = None if masks is None else _open_masks(masks, sequence)
+        model = None if depth_model is None else DepthModel.load(Path(depth_model))
         prepare_run_folder(out, masks, save_masks=save_masks)
-        store = None if storing is None else RunStore(out, storing.every, display.note)
-        if store is not None and storing is not None:
+        display = RunProgress(count * passes, bar=progress)
+        store = None
+        if storing is not None:
+            store = RunStore(out, storing.every, display.note)
             options = {
                 "recording": storing.recording, "report": storing.report, "every": storing.every, "count": count,
                 "masks": None if masks is None else str(Path(masks).resolve()), "save_masks": save_masks,
                 "save_map": save_map, "ahead": ahead, "passes": passes, "config": config.model_dump_json(),
-                "max_memory": max_memory,
+                "max_memory": max_memory, "localize": localize,
+                "saved_map": None if saved_map is None else str(saved_map.folder.resolve()),
+                "depth_model": None if depth_model is None else str(Path(depth_model).resolve()),
             }  # fmt: skip
-            store.begin(state, sequence, options)
+            store.order(sequence, options)
+        if calibrate:
+            calibration = calibrate_start(sequence, config, count, display.note if progress else None)
+        calibration = calibration or sequence.calibration
+        slam = Slam(
+            sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
+            localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
+            timed=is_timed(sequence),
+        )  # fmt: skip
+        record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
+        state = RunState(slam, record, calibration, model)
+        if store is not None:
+            store.begin(state)
+        job = Job(
+            sequence, config, out, count, display, given_masks, save_masks, save_map, ahead, live, passes, observe,
+            observers,
+        )  # fmt: skip
         return job.carry_out(state, store)
 
 

@@ -103,17 +103,26 @@ class RunStore:
         self.checkpoints = Checkpoints(self.database, every, notice)
         self._out, self._every, self._notice = out, every, notice
 
-    def begin(self, state: RunState, sequence: "Sequence", options: dict[str, Any]) -> None:
-        """Store what the run is, and the state before the first frame.
+    def order(self, sequence: "Sequence", options: dict[str, Any]) -> None:
+        """Store what the run is, before anything that takes time.
 
         Args:
-            state: Where the run stands.
             sequence: The recording.
             options: Everything else that a continued run needs, as plain values.
+
+        Raises:
+            DudmapError: It cannot be written.
         """
         about = {"options": options, "recording": recording_fingerprint(sequence), "code": code_fingerprint()}
         times = {"versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
-        self.checkpoints.take(state.tree(), about | times | {"pass": 0, "next": 0, "frame": ""}, wait=True)
+        try:
+            self.database.write_meta(about | times)
+        except sqlite3.Error as error:
+            raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
+
+    def begin(self, state: RunState) -> None:
+        """Store the state before the first frame."""
+        self.checkpoints.take(state.tree(), {"pass": 0, "next": 0, "frame": ""}, wait=True)
 
     def frame(self, state: RunState, frame: "Frame | Exception") -> None:
         """A frame was processed; take a checkpoint if one is due."""
@@ -152,7 +161,7 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
     if not meta:
         raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
-    if not {"options", "recording", "pass", "next", "frame"} <= meta.keys():
+    if not {"options", "recording"} <= meta.keys() or len({"pass", "next", "frame"} & meta.keys()) not in (0, 3):
         raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
     return reader, meta
 
@@ -163,7 +172,7 @@ def check_recording(sequence: "Sequence", meta: dict[str, Any], out: Path) -> No
     Raises:
         StateError: It is not.
     """
-    last = meta["frame"]
+    last = meta.get("frame")
     same = recording_fingerprint(sequence) == meta["recording"]
     if not same or (last and frame_fingerprint(sequence, meta["next"] - 1) != last):
         raise StateError(

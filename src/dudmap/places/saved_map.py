@@ -28,11 +28,13 @@ class SavedMap:
         volume: The map.
         keyframes: Its keyframes; all have the submap number 0.
         registrations: Residuals of the last registrations to it, by which the first ones of the next run are judged.
+        folder: Run folder that it was read from.
     """
 
     volume: TsdfVolume
     keyframes: list[Keyframe]
     registrations: RegistrationHistory = field(default_factory=RegistrationHistory)
+    folder: Path = Path()
 
     @classmethod
     def load(cls, folder: str | Path, voxel_size: float | None = None) -> "SavedMap":
@@ -66,7 +68,7 @@ class SavedMap:
                 f"{folder} is mixed up: {MAP_FILE} has voxels of {volume.voxel_size:g} m, {KEYFRAME_FILE} belongs to a "
                 f"map with {stored_size:g} m; repeat the run"
             )
-        return cls(volume, keyframes, registrations)
+        return cls(volume, keyframes, registrations, folder)
 
     def save_keyframes(self, path: str | Path) -> None:
         """Write all but the volume, which ``TsdfVolume.save`` writes.

@@ -29,8 +29,8 @@ FIRST = 5.0
 class Checkpoints:
     """Decides when a checkpoint is due, takes the snapshot, and has it written.
 
-    A checkpoint that cannot be written, since the disk is full or fails, is announced once and tried again when the
-    next one is due; what is in the database stays as it is.
+    A checkpoint that cannot be written, since the disk is full or fails or by a defect of this program, is announced
+    once and tried again when the next one is due; what is in the database stays as it is.
 
     Args:
         database: The database, which only the writing thread uses from now on.
@@ -128,8 +128,6 @@ class Checkpoints:
             if self._failing:
                 self._notice("checkpoints are written again")
             self._failing = False
-        elif not isinstance(error, OSError | sqlite3.Error):
-            raise error
         else:
             self._warn(error)
 
@@ -137,5 +135,7 @@ class Checkpoints:
         """Say once that no checkpoints are written."""
         if not self._failing:
             self._failing = True
-            hint = "" if isinstance(error, StateError) else "; make room on the disk of the run folder"
-            self._notice(f"the state of the run cannot be stored: {error}; it goes on in memory and tries again{hint}")
+            of_disk = isinstance(error, OSError | sqlite3.Error)
+            what = str(error) if of_disk or isinstance(error, StateError) else repr(error)
+            hint = "; make room on the disk of the run folder" if of_disk else ""
+            self._notice(f"the state of the run cannot be stored: {what}; it goes on in memory and tries again{hint}")

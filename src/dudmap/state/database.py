@@ -77,13 +77,13 @@ class StateDatabase:
         self._chunks = {row[0].hex() for row in self._execute("SELECT key FROM chunks")}
 
     def write_meta(self, values: dict[str, Any]) -> None:
-        """Set values that describe the run, in a transaction of its own.
+        """Set values that describe the run, all of them or none.
 
         Raises:
             sqlite3.Error: They cannot be written.
         """
-        rows = [(key, json.dumps(value)) for key, value in values.items()]
-        self._connection.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", rows)
+        rows = json.dumps({key: json.dumps(value) for key, value in values.items()})
+        self._connection.execute("INSERT OR REPLACE INTO meta SELECT key, value FROM json_each(?)", [rows])
 
     def write(self, snapshot: Snapshot, meta: dict[str, Any]) -> None:
         """Store a snapshot that was taken with ``maps`` and ``frames``, as one transaction.

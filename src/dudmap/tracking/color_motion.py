@@ -1,8 +1,7 @@
 """Registration of the colour image with the camera's motion between depth and colour."""
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import cache, cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +13,7 @@ from dudmap.frames.observation import Level, Observation
 from dudmap.frames.pyramid import Pyramid
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
@@ -22,21 +22,31 @@ from dudmap.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
 class RegisteredLevel(Level):
     """A level whose intensities are registered when they are first asked for, since few frames need all levels.
 
-    Args:
-        camera, depth: Of the level.
-        register: Gives the intensities (h, w).
+    The intensities follow from the other attributes, so that they are no part of the state of a system.
+
+    Attributes:
+        observation: The frame.
+        calibration: Of the colour camera.
+        velocity: (6,) twist of the camera per second.
+        backend: Compute device.
     """
 
-    def __init__(self, camera: Camera, depth: NDArray[np.float32], register: Callable[[], NDArray[np.float32]]) -> None:
-        object.__setattr__(self, "camera", camera)
-        object.__setattr__(self, "depth", depth)
-        self.__dict__["_register"] = register
+    observation: Observation
+    calibration: Calibration
+    velocity: NDArray[np.float64]
+    backend: Backend
 
-    def __getattr__(self, name: str) -> NDArray[np.float32]:
-        if name != "intensity":
-            raise AttributeError(f"a level has no {name}")
-        self.__dict__["intensity"] = self.__dict__.pop("_register")()
-        return self.intensity
+    def __init__(self, level: Level, **attributes: object) -> None:
+        self.__dict__.update(camera=level.camera, depth=level.depth, **attributes)
+
+    @cached_property
+    def intensity(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Registered intensities (h, w)."""
+        halvings = round(np.log2(self.observation.camera.width / self.camera.width))
+        scaled = replace(self.calibration, camera=self.calibration.camera.scaled(halvings))
+        projection = color_projection(scaled, self.velocity, self.observation.color_offset)
+        recorded = recorded_intensity(self.observation, halvings)
+        return register_color(recorded, self.depth, self.camera, projection, self.backend)
 
 
 class ColorMotion:
@@ -137,28 +147,16 @@ class ColorMotion:
         calibration = self.calibration
         if calibration is None or self.is_prepared(view.observation):
             return view
-        levels: dict[int, Level] = {}
-
-        def registered(level: Level) -> Level:
-            halvings = round(np.log2(view.observation.camera.width / level.camera.width))
-            if halvings not in levels:
-                register = partial(self._intensity, view, calibration, level, halvings, velocity)
-                levels[halvings] = RegisteredLevel(level.camera, level.depth, register)
-            return levels[halvings]
-
-        pyramid = Pyramid([registered(level) for level in view.pyramid.tracked], registered(view.pyramid.labelled))
+        pyramid = view.pyramid
+        given = {"observation": view.observation, "calibration": calibration, "velocity": velocity}
+        levels = {
+            level: RegisteredLevel(level, **given, backend=self._backend)
+            for level in (*pyramid.tracked, pyramid.labelled)
+        }
+        pyramid = Pyramid([levels[level] for level in pyramid.tracked], levels[pyramid.labelled])
 
         @cache
         def segmentation() -> Segmentation:
             return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
 
         return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)
-
-    def _intensity(
-        self, view: FrameView, calibration: Calibration, level: Level, halvings: int, velocity: NDArray[np.float64]
-    ) -> NDArray[np.float32]:
-        """Registered intensities (h, w) of a level."""
-        scaled = replace(calibration, camera=calibration.camera.scaled(halvings))
-        projection = color_projection(scaled, velocity, view.observation.color_offset)
-        recorded = recorded_intensity(view.observation, halvings)
-        return register_color(recorded, level.depth, level.camera, projection, self._backend)

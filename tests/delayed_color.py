@@ -1,0 +1,27 @@
+"""A recording whose colour is taken after the depth, and a self-calibration that finds it out after a few frames."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dudmap.calibration import self_calibration
+from dudmap.calibration.estimator import CalibrationEstimator, Estimate
+from dudmap.synthetic.faults import SensorFaults
+
+DELAY = 0.03
+"""Seconds."""
+FAULTS = SensorFaults(color_delay=DELAY)
+
+
+class KnownDelay(CalibrationEstimator):
+    """Finds the true delay, which needs more and larger images than a quick test has; it has tests of its own."""
+
+    def estimate(self, keyframes):
+        return Estimate(replace(self.given, delay=DELAY, sigma=np.ones(13), estimated=("delay",)), {}, 0.3, 80)
+
+
+def find_early(monkeypatch, attempts):
+    """Let the self-calibration estimate after these numbers of frames, and use the result two frames later."""
+    monkeypatch.setattr(self_calibration, "ATTEMPTS", attempts)
+    monkeypatch.setattr(self_calibration, "DELAY", 2)
+    monkeypatch.setattr(self_calibration, "CalibrationEstimator", KnownDelay)
