@@ -90,7 +90,6 @@ class Slam(SlamResults):
         *,
         timed: bool = True,
     ) -> None:
-        self.timed = timed
         self.max_blocks = max_blocks
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
@@ -104,7 +103,7 @@ class Slam(SlamResults):
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor)
-        self.motion = MotionModel(config.tracker)
+        self.motion = MotionModel(config.tracker, timed=timed)
         self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
