@@ -18,7 +18,7 @@ from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.input_files import foreign, open_plain
+from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
 from dudmap.sequences.bag_definitions import limit_definitions
 from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
@@ -296,11 +296,11 @@ class RosBag:
 
 
 def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file starts with these bytes."""
+    """Whether a file starts with these bytes, or will once Git LFS has fetched it."""
     if not path.is_file():
         return False
-    with open_plain(path) as file:
-        return file.read(len(magic)) == magic
+    with open_plain(path, pointers=True) as file:
+        return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
 
 def _open(path: Path) -> "AnyReader":

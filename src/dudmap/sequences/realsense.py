@@ -47,7 +47,7 @@ class RealSenseRecording(RosBag):
         """Whether a .bag or .db3 file has the topics of librealsense."""
         if path.suffix.lower() not in (".bag", ".db3") or not path.is_file():
             return False
-        with open_plain(path) as file:
+        with open_plain(path, pointers=True) as file:
             head = file.read(HEAD)
         return head.startswith(MAGIC[path.suffix.lower()]) and TOPICS in head
 
