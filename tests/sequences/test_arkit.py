@@ -1,4 +1,4 @@
-"""What recordings of iPhones have beyond the tests of all formats: videos, confidence, Polycam's two sets of cameras."""
+"""What recordings of iPhones have beyond the tests of all formats: videos, confidence, two sets of cameras."""
 
 import shutil
 

@@ -2,6 +2,7 @@
 
 import json
 import re
+import shutil
 import tarfile
 import zipfile
 
@@ -20,6 +21,7 @@ from layouts import (
     millimetres,
     nerfstudio,
     pose,
+    realsense,
     scannet,
     seven_scenes,
     tum,
@@ -167,6 +169,14 @@ def test_a_plain_folder_asks_for_its_camera(tmp_path):
     assert open_sequence(folder, "60,61,31,23").camera == Camera(60, 61, 31, 23, 64, 48, 1000.0)
     (folder / "intrinsics.txt").write_text("fx 70\nfy 61\ncx 31\ncy 23\ndepth_scale 5000\n")
     assert open_sequence(folder).camera.depth_scale == 5000
+
+
+def test_gray_images_stand_for_colour_where_there_are_no_others(tmp_path):
+    folder, expected = write(realsense, tmp_path / "a")
+    shutil.copytree(folder / "color", folder / "mono")
+    assert open_sequence(folder)._pairs[0][0].path.parent.name == "color"
+    shutil.rmtree(folder / "color")
+    check(open_sequence(folder), expected)
 
 
 def test_several_recordings_in_one_place_are_named(tmp_path, cache):
