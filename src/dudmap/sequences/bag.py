@@ -1,10 +1,7 @@
 """ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), through the package rosbags."""
 
 import weakref
-from collections.abc import Generator
-from contextlib import closing
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
-from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
@@ -20,14 +16,11 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
-from dudmap.sequences.bag_definitions import limit_definitions
-from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
-from dudmap.sequences.bag_limits import check_bag, limit_decompression
+from dudmap.sequences.bag_file import BagFile, MessageTimes
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
 MAGIC = {".bag": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
@@ -71,15 +64,14 @@ class RosBag:
         self.path = Path(path)
         self.name = self.path.resolve().stem
         chosen = bag_topics.parse(topics)
-        self._reader = _open(self.path)
-        self._stream = MessageStream(self._reader)
-        weakref.finalize(self, _close, self._reader, self._stream)
+        self._bag = BagFile(self.path)
+        weakref.finalize(self, self._bag.close)
         with foreign(DatasetError, f"the bag {self.path}"):
             self._find_frames(chosen, camera)
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
         """Set topics, times and pairs of messages, and the cameras."""
-        self._topics = bag_topics.find(self._reader.connections, chosen, str(self.path))
+        self._topics = bag_topics.find(self._bag.connections, chosen, str(self.path))
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
         self._pairs = self._associated(depth, color)
@@ -143,7 +135,7 @@ class RosBag:
 
     def _times(self, connection: "Connection") -> MessageTimes:
         """Times of the messages of a topic."""
-        found = message_times(self._reader, connection)
+        found = self._bag.times(connection)
         if np.mean(np.diff(found.stamps, prepend=-np.inf) > 0) < 0.9:  # a driver that does not fill the headers
             return found._replace(stamps=1e-9 * found.recorded, exact=True)
         return found
@@ -165,13 +157,10 @@ class RosBag:
         """Colour and depth message of a frame."""
         topics, (color_time, depth_time) = self._topics, self._recorded[index]
         try:
-            raw = self._stream.read([(topics.color, color_time), (topics.depth, depth_time)])
-            return (
-                self._reader.deserialize(raw[0], topics.color.msgtype),
-                self._reader.deserialize(raw[1], topics.depth.msgtype),
-            )
+            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
         except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
             raise FrameError(f"frame {index} of {self.path} cannot be read: {error}") from error
+        return color, depth
 
     def _find_cameras(self, given: Camera | str | None) -> None:
         """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
@@ -250,7 +239,7 @@ class RosBag:
 
     def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
         """Lens of a camera_info, for images of a size; that of rectified images is in its projection matrix."""
-        info = self._first(connection)
+        info = self._bag.first(connection)
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
@@ -273,26 +262,11 @@ class RosBag:
         """Frames of /tf_static and of the first ``count`` messages of /tf, None for all."""
         tree = TransformTree()
         for topic, limit in ((TOPIC, count), (STATIC_TOPIC, FIRST_TRANSFORMS)):
-            found = [
-                connection for connection in self._reader.connections
-                if connection.topic == topic and connection.msgcount > 0
-            ]  # fmt: skip
+            found = [c for c in self._bag.connections if c.topic == topic and c.msgcount]
             if found:
-                with self._stream.lock:
-                    tree.add(islice(self._decoded(found), limit), static=topic == STATIC_TOPIC)
+                messages = (message for _, message in self._bag.messages(found, limit))
+                tree.add(messages, static=topic == STATIC_TOPIC)
         return tree
-
-    def _decoded(self, connections: "list[Connection]") -> Generator[Any]:
-        with closing(self._reader.messages(connections)) as messages:
-            for connection, _, raw in messages:
-                yield self._reader.deserialize(raw, connection.msgtype)
-
-    def _first(self, connection: "Connection | None") -> Any:  # noqa: ANN401
-        """First message of a connection, None without one."""
-        if connection is None:
-            return None
-        with closing(self._decoded([connection])) as messages:
-            return next(messages, None)
 
 
 def starts_with(path: Path, magic: bytes) -> bool:
@@ -301,28 +275,6 @@ def starts_with(path: Path, magic: bytes) -> bool:
         return False
     with open_plain(path, pointers=True) as file:
         return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
-
-
-def _open(path: Path) -> "AnyReader":
-    with extra("ros-bags", f"the ROS bag {path}"):
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    try:
-        check_bag(path)
-        limit_decompression()
-        limit_definitions()
-        if path.suffix == ".bag":
-            warm_index(path)
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
-        raise DatasetError(f"cannot open the bag {path}: {error}") from error
-    return reader
-
-
-def _close(reader: "AnyReader", stream: MessageStream) -> None:
-    stream.close()
-    reader.close()
 
 
 def _stamp(message: Any) -> float:  # noqa: ANN401

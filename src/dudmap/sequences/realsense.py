@@ -5,7 +5,6 @@ which the driver's playback does not offer.
 """
 
 import re
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.input_files import open_plain
 from dudmap.sequences.bag import MAGIC, MILLIMETRES, RosBag
-from dudmap.sequences.bag_index import MessageTimes
+from dudmap.sequences.bag_file import MessageTimes
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
@@ -57,11 +56,9 @@ class RealSenseRecording(RosBag):
         if metadata is None:
             return found
         stamps = {}
-        with closing(self._reader.messages([metadata])) as messages:
-            for _, time, raw in messages:
-                message: Any = self._reader.deserialize(raw, metadata.msgtype)
-                if match := re.search(r"(?:^|;)timestamp=([\d.]+)", message.data):
-                    stamps[time] = 1e-3 * float(match[1])
+        for time, message in self._bag.messages([metadata]):
+            if match := re.search(r"(?:^|;)timestamp=([\d.]+)", message.data):
+                stamps[time] = 1e-3 * float(match[1])
         kept = np.array([int(time) in stamps for time in found.recorded])
         if not kept.any():
             return found
@@ -78,7 +75,7 @@ class RealSenseRecording(RosBag):
     def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
         """Lens of a stream; the camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
-        model = re.search(r"model=([^;]*)", self._first(text).data) if text else None
+        model = re.search(r"model=([^;]*)", self._bag.first(text).data) if text else None
         self._model = model[1] if model else ""
         return super()._lens(connection, image, size)
 
@@ -88,22 +85,22 @@ class RealSenseRecording(RosBag):
     def _units(self) -> float:
         sensor = re.match(r"/device_\d+/sensor_\d+", self._topics.depth.topic)
         topic = f"{sensor[0]}/option/Depth_Units/value" if sensor else ""
-        for connection in self._reader.connections:
+        for connection in self._bag.connections:
             if connection.topic == topic and connection.msgcount:
-                unit = float(self._first(connection).data)
+                unit = float(self._bag.first(connection).data)
                 return round(1 / unit, 2) if unit > 0 else MILLIMETRES  # the option is a float32
         return MILLIMETRES
 
     def _motion(self, image: "Connection") -> NDArray[np.float64] | None:
         """Motion (4, 4) of points of the reference into a stream, from its topic ``tf/...``."""
         found = self._beside(image, "tf/", "")
-        return None if found is None else _motion(self._first(found))
+        return None if found is None else _motion(self._bag.first(found))
 
     def _beside(self, image: "Connection", name: str, msgtype: str) -> "Connection | None":
         """First topic of the same stream whose name goes on with ``name``."""
         stream = re.match(r"/device_\d+/sensor_\d+/\w+", image.topic)
         prefix = f"{stream[0] if stream else image.topic}/{name}"
-        for connection in self._reader.connections:
+        for connection in self._bag.connections:
             right = connection.topic.startswith(prefix) and connection.msgtype.startswith(msgtype)
             if right and connection.msgcount:
                 return connection
