@@ -18,6 +18,7 @@ from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
 from dudmap.sequences.bag_file import BagFile, MessageTimes
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
+from dudmap.sequences.image_folder import PROBES, size
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
@@ -25,8 +26,6 @@ if TYPE_CHECKING:
 
 MAGIC = {".bag": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
 """First bytes of the files by their suffix."""
-PROBES = 30
-"""Number of evenly spread frames that are tried until one can be decoded and gives the image sizes."""
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
@@ -98,25 +97,26 @@ class RosBag:
             FrameError: An image is damaged, of an unknown encoding, or of another size than its camera.
         """
         index = range(len(self))[index]
-        name = f"frame {index} of {self.path}"
-        with foreign(FrameError, name):
-            return self._frame(index, name)
-
-    def _frame(self, index: int, name: str) -> Frame:
-        color, depth = self._messages(index)
-        image = bag_images.color_of(color, f"the colour image of {name}")
-        values = bag_images.depth_of(depth, self.camera.depth_scale, f"the depth image of {name}")
+        depth, values, color, image = self._decoded(index, self.camera.depth_scale)
         expected = self.camera if self.calibration is None else self.calibration.camera
         for what, found, camera in (("colour", image, expected), ("depth", values, self.camera)):
             if found.shape[:2] != camera.shape:
                 raise FrameError(
-                    f"{name}: the {what} image is {found.shape[1]}x{found.shape[0]} pixels, but its camera is "
+                    f"frame {index} of {self.path}: the {what} image is {size(found)} pixels, but its camera is "
                     f"{camera.width}x{camera.height}"
                 )
         values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
         if self._exact:
             return Frame(float(self.timestamps[index]), values, image, float(self._color_stamps[index]))
         return Frame(_stamp(depth), values, image, _stamp(color))
+
+    def _decoded(self, index: int, depth_scale: float) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """Depth and colour message of a frame, each with its image."""
+        topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
+        with foreign(FrameError, name):
+            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
+            values = bag_images.depth_of(depth, depth_scale, f"the depth image of {name}")
+            return depth, values, color, bag_images.color_of(color, f"the colour image of {name}")
 
     def mask(self, index: int) -> None:
         """No true masks are known."""
@@ -153,19 +153,11 @@ class RosBag:
             )
         return pairs
 
-    def _messages(self, index: int) -> tuple[Any, Any]:
-        """Colour and depth message of a frame."""
-        topics, (color_time, depth_time) = self._topics, self._recorded[index]
-        try:
-            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
-        except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
-            raise FrameError(f"frame {index} of {self.path} cannot be read: {error}") from error
-        return color, depth
-
     def _find_cameras(self, given: Camera | str | None) -> None:
         """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
         topics = self._topics
-        depth, depth_size, color, color_size = self._probe()
+        depth, values, color, image = self._probe()
+        depth_size, color_size = values.shape[::-1], image.shape[1::-1]
         self._depth_frame = depth.header.frame_id
         color_lens = self._lens(topics.color_info, topics.color, color_size)
         one_size = depth_size == color_size
@@ -174,10 +166,10 @@ class RosBag:
             depth_lens = Lens(known.camera(*depth_size))
             self.intrinsics_source = known.source
         else:
-            info, image = topics.depth_info, topics.depth
+            info, beside = topics.depth_info, topics.depth
             if info is None and one_size and topics.registered:
-                info, image = topics.color_info, topics.color
-            depth_lens = self._lens(info, image, depth_size)
+                info, beside = topics.color_info, topics.color
+            depth_lens = self._lens(info, beside, depth_size)
             self.intrinsics_source = info.topic if info else ""
         if depth_lens is None:
             raise DatasetError(
@@ -186,9 +178,8 @@ class RosBag:
             )
         if color_lens is None and not one_size:
             raise DatasetError(
-                f"{self.path}: depth is {depth_size[0]}x{depth_size[1]} and colour {color_size[0]}x{color_size[1]} "
-                f"pixels, and there is no camera_info beside {topics.color.topic}; choose it with --topics "
-                "color_info=/..."
+                f"{self.path}: depth is {size(values)} and colour {size(image)} pixels, and there is no camera_info "
+                f"beside {topics.color.topic}; choose it with --topics color_info=/..."
             )
         if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
@@ -196,8 +187,8 @@ class RosBag:
         together = color_lens is depth_lens
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
-    def _probe(self) -> tuple[Any, tuple[int, int], Any, tuple[int, int]]:
-        """Depth and colour message of the first frame that can be decoded, each with its width and height.
+    def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """The first frame that can be decoded.
 
         Raises:
             DatasetError: None of some frames all over the bag can be decoded.
@@ -205,13 +196,9 @@ class RosBag:
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
-                color, depth = self._messages(int(index))
-                pixels = bag_images.depth_of(depth, 1.0, f"the depth image of frame {index}")
-                image = bag_images.color_of(color, f"the colour image of frame {index}")
+                return self._decoded(int(index), 1.0)
             except FrameError as error:
                 problem = problem or error
-            else:
-                return depth, pixels.shape[::-1], color, image.shape[1::-1]
         raise DatasetError(f"no frame of {self.path} is usable; {problem}")
 
     def _between(self, depth: Lens, color: Lens, color_frame: str) -> Calibration | None:
@@ -237,17 +224,17 @@ class RosBag:
         """Depth units per metre."""
         return MILLIMETRES
 
-    def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
-        """Lens of a camera_info, for images of a size; that of rectified images is in its projection matrix."""
+    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
+        """Lens of a camera_info for images of a width and height; for rectified ones it is in the projection matrix."""
         info = self._bag.first(connection)
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
         rectified = "rect" in bag_topics.base(image.topic).rpartition("/")[2] and P[0] > 0
         fx, cx, fy, cy = (P[0], P[2], P[5], P[6]) if rectified else (K[0], K[2], K[4], K[5])
-        width, height = (info.width, info.height) if info.width and info.height else size
+        width, height = (info.width, info.height) if info.width and info.height else shape
         units = self._units()
-        camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*size)
+        camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
         return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
 
     def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:

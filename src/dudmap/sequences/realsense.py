@@ -16,6 +16,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.input_files import open_plain
 from dudmap.sequences.bag import MAGIC, MILLIMETRES, RosBag
 from dudmap.sequences.bag_file import MessageTimes
+from dudmap.sequences.bag_transforms import motion_of
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
@@ -72,12 +73,12 @@ class RealSenseRecording(RosBag):
             return None
         return motions[0] @ se3.inverse(motions[1])
 
-    def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
+    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
         """Lens of a stream; the camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
         model = re.search(r"model=([^;]*)", self._bag.first(text).data) if text else None
         self._model = model[1] if model else ""
-        return super()._lens(connection, image, size)
+        return super()._lens(connection, image, shape)
 
     def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
         return Lens.of(camera, self._model or model, coefficients)
@@ -109,13 +110,10 @@ class RealSenseRecording(RosBag):
 
 def _motion(message: Any) -> NDArray[np.float64]:  # noqa: ANN401 - the type is made from the bag
     """Motion of a geometry_msgs/Transform, or of text with the rotation column by column."""
+    if not hasattr(message, "data"):
+        return motion_of(message)
     T = np.eye(4)
-    if hasattr(message, "data"):
-        numbers = [float(number) for number in re.findall(r"[-+\d.eE]*\d[\d.]*", message.data)]
-        T[:3, :3], T[:3, 3] = np.array(numbers[:9]).reshape(3, 3).T, numbers[9:12]
-        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return T
-    r, t = message.rotation, message.translation
-    T[:3, :3] = se3.quat_xyzw_to_rotation(np.array([r.x, r.y, r.z, r.w]))
-    T[:3, 3] = t.x, t.y, t.z
+    numbers = [float(number) for number in re.findall(r"[-+\d.eE]*\d[\d.]*", message.data)]
+    T[:3, :3] = se3.nearest_rotation(np.array(numbers[:9]).reshape(3, 3).T)
+    T[:3, 3] = numbers[9:12]
     return T
