@@ -80,9 +80,16 @@ def millimetres(index):
     return depth_image(index) // 5
 
 
-def write_bag(path, kind, frames=5, *, color_frame="rgb", depth_frame="rgb", delay=0.01, depth_topic=None, **options):
-    """Bag of registered frames at 10 Hz; colour is 4 ms later and everything is recorded ``delay`` seconds late."""
-    bag = BagWriter(path, kind, **options)
+def write_bag(path, kind, frames=5, **options):
+    """Bag of registered frames; the options of ``write_frames``, and of the writer."""
+    names = write_frames.__kwdefaults__
+    bag = BagWriter(path, kind, **{name: value for name, value in options.items() if name not in names})
+    write_frames(bag, frames, **{name: value for name, value in options.items() if name in names})
+    return path
+
+
+def write_frames(bag, frames, *, color_frame="rgb", depth_frame="rgb", delay=0.01, depth_topic=None):
+    """Registered frames at 10 Hz; colour is 4 ms later and everything is recorded ``delay`` seconds late."""
     depth_topic = depth_topic or "/camera/aligned_depth_to_color/image_raw"
     infos = {"/camera/color/camera_info": color_frame, f"{depth_topic.rpartition('/')[0]}/camera_info": depth_frame}
     for index in range(frames):
@@ -93,4 +100,3 @@ def write_bag(path, kind, frames=5, *, color_frame="rgb", depth_frame="rgb", del
         color = bag.image(color_image(index), "rgb8", stamp + 0.004, color_frame)
         bag.write("/camera/color/image_raw", color, stamp + 0.004 + delay)
     bag.close()
-    return path

@@ -340,6 +340,78 @@ def nerfstudio(folder):
     return Layout("nerfstudio", (60, 61, 31, 23), color=(120, 122, 62.5, 46.5, (96, 128)))
 
 
+def write_confidence(path, levels):
+    """All readings are trusted but those that ``millimetres`` leaves out."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    confidence = np.full((48, 64), levels[1], np.uint8)
+    confidence[24:] = levels[2]
+    confidence[:5, :7] = levels[0]
+    assert cv2.imwrite(str(path), confidence)
+
+
+def stray_scanner(folder):
+    """As OdometryEncoder, DepthEncoder, ConfidenceEncoder and DatasetEncoder of the application write it."""
+    video = cv2.VideoWriter(str(folder / "rgb.mp4"), cv2.VideoWriter.fourcc(*"mp4v"), 60, (128, 96))
+    odometry = "timestamp, frame, x, y, z, qx, qy, qz, qw\n"
+    for k in range(3):
+        video.write(color(k, 128, 96)[..., ::-1])
+        write_depth(folder / f"depth/{k:06d}.png", k, missing=900)
+        write_confidence(folder / f"confidence/{k:06d}.png", (0, 1, 2))
+        odometry += f"{9052.25 + k / 60}, {k:06d}, 0.1, 0.2, 0.3, 0.0, 0.0, 0.0, 1.0\n"
+    video.release()
+    (folder / "odometry.csv").write_text(odometry)
+    (folder / "imu.csv").write_text("timestamp, a_x, a_y, a_z, alpha_x, alpha_y, alpha_z\n")
+    (folder / "camera_matrix.csv").write_text("120.0, 0.0, 62.5\n0.0, 122.0, 46.5\n0.0, 0.0, 1.0")
+    stamps = [9052.25 + k / 60 for k in range(3)]
+    return Layout("Stray Scanner", (60, 61, 31, 23), stamps=stamps, truth=None, color=(120, 122, 62.5, 46.5, (96, 128)))
+
+
+def arkit_scenes(folder):
+    """As download_data.py of ARKitScenes unpacks it; not every image of a kind has one of the other kind."""
+    trajectory = ""
+    for k in range(4):
+        name = f"41069021_{305.377 + 0.1 * k:.3f}"
+        write_color(folder / f"lowres_wide/{name}.png", k)
+        if k < 3:
+            write_depth(folder / f"lowres_depth/{name}.png", k, missing=900)
+            write_confidence(folder / f"confidence/{name}.png", (0, 1, 2))
+            T = np.linalg.inv(pose(k))  # of points of the world into the camera
+            numbers = [305.377 + 0.1 * k, *cv2.Rodrigues(T[:3, :3])[0].ravel(), *T[:3, 3]]
+            trajectory += " ".join(f"{number:.9f}" for number in numbers) + "\n"
+        pincam = folder / f"lowres_wide_intrinsics/{name}.pincam"
+        pincam.parent.mkdir(exist_ok=True)
+        pincam.write_text(f"64 48 {59 + min(k, 2)} {60 + min(k, 2)} 31 23")
+    (folder / "lowres_wide.traj").write_text(trajectory)
+    stamps = [305.377 + 0.1 * k for k in range(3)]
+    return Layout("ARKitScenes", (60.5, 61.5, 31, 23), stamps=stamps, name="41069021")
+
+
+def polycam(folder):
+    """As the application exports it after its optimisation of the poses."""
+    for k in range(3):
+        name = f"keyframes/{{}}/{82_000_000 + 250_000 * k}"
+        for kind, shift in (("", 9), ("corrected_", 0)):
+            write_color(folder / f"{name.format(kind + 'images')}.jpg", k, 128, 96)
+            T = pose(k) @ np.diag([1.0, -1.0, -1.0, 1.0])
+            tree = {f"t_{i}{j}": T[i, j] + shift * (j == 3) for i in range(3) for j in range(4)}
+            tree |= {
+                "fx": 120.0 + k - 1 + shift,
+                "fy": 122.0 + k - 1,
+                "cx": 62.5,
+                "cy": 46.5,
+                "width": 128,
+                "height": 96,
+            }
+            file = folder / f"{name.format(kind + 'cameras')}.json"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(json.dumps(tree | {"blur_score": 71.5, "timestamp": 82_000_000 + 250_000 * k}))
+        write_depth(folder / f"{name.format('depth')}.png", k, missing=900)
+        write_confidence(folder / f"{name.format('confidence')}.png", (0, 127, 255))
+    (folder / "mesh_info.json").write_text(json.dumps({"faceCount": 0, "alignmentTransform": [0.0] * 16}))
+    stamps = [82 + 0.25 * k for k in range(3)]
+    return Layout("Polycam", (60, 61, 31, 23), stamps=stamps, color=(120, 122, 62.5, 46.5, (96, 128)))
+
+
 def realsense(folder):
     """As Open3D's realsense_recorder writes it: depth aligned to colour."""
     for k in range(3):
@@ -392,7 +464,7 @@ def timed(folder):
 
 LAYOUTS = (
     tum, bonn, icl_nuim, icl_nuim_loop, corbs, seven_scenes, volume_deform, scannet, replica, redwood, redwood_object,
-    openloris, epfl, nerfstudio, realsense, azure_kinect, zed, timed,
+    openloris, epfl, nerfstudio, stray_scanner, arkit_scenes, polycam, realsense, azure_kinect, zed, timed,
 )  # fmt: skip
 
 

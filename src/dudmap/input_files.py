@@ -40,6 +40,10 @@ LARGEST_RATIO = 100
 deflate reaches 1000."""
 RATIO_FREE_BYTES = 2**26
 """Unpacked size below which the ratio does not matter."""
+GIT_LFS = b"version https://git-lfs.github.com/spec/"
+"""First bytes of the text that stands for a large file where a repository was cloned without Git LFS."""
+LARGEST_POINTER = 1024
+"""Bytes that such a text does not reach (specification of Git LFS)."""
 SAFE_KINDS = "biufUS"
 """Kinds of NumPy types that are no objects and hold none: numbers and text."""
 DAMAGE = (
@@ -50,11 +54,15 @@ DAMAGE = (
 sizes are limited before memory is taken."""
 
 
-def open_plain(path: str | Path) -> IO[bytes]:
+def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
     """Open a plain file for reading; links are followed.
 
+    Args:
+        path: The file.
+        pointers: Whether a pointer of Git LFS is opened as any text.
+
     Raises:
-        OSError: There is no such file, or it is a folder, pipe, socket or device.
+        OSError: There is no such file, or it is a folder, pipe, socket or device, or a pointer of Git LFS.
     """
     try:
         _check_plain(os.stat(path).st_mode, path)
@@ -64,6 +72,10 @@ def open_plain(path: str | Path) -> IO[bytes]:
         raise OSError(errno.ENOENT, f"there can be no file of this name ({error})", str(path)) from None
     try:
         _check_plain(os.fstat(number).st_mode, path)  # not that it was replaced in the meantime
+        if not pointers and os.fstat(number).st_size < LARGEST_POINTER:
+            if os.read(number, len(GIT_LFS)) == GIT_LFS:
+                raise OSError(errno.EINVAL, "it is a Git LFS pointer, not the file itself; run git lfs pull", str(path))
+            os.lseek(number, 0, os.SEEK_SET)
     except OSError:
         os.close(number)
         raise

@@ -38,6 +38,24 @@ def test_what_is_no_plain_file(what, name, tmp_path):
     refused(read)
 
 
+POINTER = f"version https://git-lfs.github.com/spec/v1\noid sha256:{'4d7a' * 16}\nsize 12345\n"
+
+
+@pytest.mark.parametrize("name", ["depth/*", "rgb/*", "rgb.txt", "intrinsics.txt"])
+def test_a_folder_cloned_without_git_lfs(name, tmp_path):
+    folder, _ = layouts.write(layouts.tum, tmp_path)
+    for file in folder.glob(name):
+        file.write_text(POINTER)
+    refused(lambda: open_sequence(folder), DatasetError, "is a Git LFS pointer, not the file itself; run git lfs pull")
+
+
+@pytest.mark.parametrize("suffix", [".bag", ".db3", ".mcap", ".klg", ".sens", ".r3d", ".zip", ".tgz"])
+def test_a_recording_cloned_without_git_lfs(suffix, tmp_path):
+    (tmp_path / f"a{suffix}").write_text(POINTER)
+    for path in (tmp_path / f"a{suffix}", tmp_path):
+        refused(lambda path=path: open_sequence(path, "60,60,31.5,23.5"), DatasetError, "is a Git LFS pointer")
+
+
 @pytest.mark.parametrize("size", [(60000, 60000), (2**31 - 1, 2**31 - 1), (0, 5), (2**27, 1)])
 def test_huge_images(size):
     header = struct.pack(">II", *size) + bytes((8, 0, 0, 0, 0))

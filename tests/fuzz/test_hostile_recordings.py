@@ -50,10 +50,10 @@ def test_bombs_in_bags(monkeypatch):
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import storage_mcap
 
-    from dudmap.sequences import bag_limits
+    from dudmap.sequences import bag_file
 
-    monkeypatch.setattr(bag_limits, "LARGEST_CHUNK", 2**20)
-    bag_limits.limit_decompression()
+    monkeypatch.setattr(bag_file, "LARGEST_CHUNK", 2**20)
+    bag_file.limit_rosbags()
     zeros = {n: bytes(n) for n in (2**20, 2**20 + 1)}
     packers = {
         "bz2": (bz2.compress, ros1.decompressors["bz2"]), "lz4": (lz4.frame.compress, ros1.decompressors["lz4"]),
@@ -91,62 +91,3 @@ def test_a_tar_that_says_it_is_larger(tmp_path, monkeypatch):
     data[148:156] = b"%06o\0 " % (sum(data[:148]) + 8 * 32 + sum(data[156:512]))
     (tmp_path / "a.tar").write_bytes(data)
     refused(lambda: open_sequence(tmp_path / "a.tar"))
-
-
-IDL = "module a {{ module msg {{ {0} struct B {{ {1} }}; }}; }};"
-SEPARATOR = "=" * 80 + "\n"
-
-
-@pytest.mark.parametrize(
-    ("definition", "match"),
-    [
-        (IDL.format("", "int8 a[((((1))))];"), "outside of texts"),  # tried in 2^40 ways by the grammar
-        (IDL.format("", "int8 a[1 << 80000000000];"), "outside of texts"),
-        (IDL.format("const int64 C = 9 * 9;", "int8 a;"), "outside of texts"),
-        (IDL.format("", '@a(text="x\\") int8 a[((((1))))];'), "outside of texts"),
-        (IDL.format("/* (", "int8 a[((((1))))];"), "Could not parse"),
-        (IDL.format("", "sequence<" * 30 + "int8" + ">" * 30 + " a;"), "more deeply"),
-        ("int8 a\n" * 20_000, "has 140000 characters"),
-        ("string[100000000] a", "has 100000001 fields"),  # a line of code each
-        ("B a", "contains itself"),
-        (
-            "".join(f"C{k} x\nC{k} y\n{SEPARATOR}MSG: a/C{k}\n" for k in range(60)) + "int8[0] x",
-            "has 24575 fields",
-        ),
-    ],
-)
-def test_definitions_of_messages_that_never_end(definition, match):
-    pytest.importorskip("rosbags")
-    from rosbags.highlevel import anyreader
-    from rosbags.typesys import Stores
-
-    from dudmap.sequences.bag_definitions import limit_definitions
-
-    limit_definitions()
-
-    def read():
-        parse = anyreader.get_types_from_idl if "module" in definition else anyreader.get_types_from_msg
-        try:
-            types = parse(definition) if "module" in definition else parse(definition, "a/msg/B")
-            anyreader.get_typestore(Stores.EMPTY).register(types)
-        except Exception as error:
-            raise DatasetError(str(error)[:200]) from error
-
-    refused(read, DatasetError, match)
-
-
-def test_definitions_that_recorders_write():
-    pytest.importorskip("rosbags")
-    from rosbags.highlevel import anyreader
-    from rosbags.typesys import Stores, get_typestore
-
-    from dudmap.sequences.bag_definitions import check_types, limit_definitions
-
-    limit_definitions()
-    for store in Stores:
-        check_types(get_typestore(store).fielddefs)
-    text = IDL.format(
-        "module B_Constants { const int8 C = -1; };",
-        '@verbatim (language="comment", text="a (b) * c << d" "e \\" (f)") // (g)\n sequence<string<10>, 5> a;',
-    )
-    assert set(anyreader.get_types_from_idl(text)) == {"a/msg/B"}

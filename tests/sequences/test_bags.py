@@ -1,6 +1,7 @@
 """Bags of both ROS versions in three storages, written by the format's own library."""
 
 import os
+import re
 from pathlib import Path
 
 import cv2
@@ -9,7 +10,7 @@ import pytest
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
-from bags import START, BagWriter, millimetres, write_bag
+from bags import START, BagWriter, millimetres, write_bag, write_frames
 from dudmap.errors import DatasetError, FrameError, MissingExtraError
 from dudmap.geometry import se3
 from dudmap.sequences import open_sequence
@@ -61,6 +62,39 @@ def test_a_bag_compressed_by_chunks_or_messages(tmp_path, kind):
     check_frames(open_sequence(write_bag(tmp_path / KINDS[kind], kind, set_compression=compression)))
 
 
+@pytest.mark.parametrize("kind", ["sqlite", "mcap"])
+def test_a_bag_compressed_by_files(tmp_path, kind, monkeypatch):
+    compression = (CompressionMode.FILE, CompressionFormat.ZSTD)
+    path = write_bag(tmp_path / "folder", kind, set_compression=compression)
+    check_frames(open_sequence(path))
+    monkeypatch.setattr("dudmap.sequences.bag_file.RATIO_FREE_BYTES", 10_000)
+    monkeypatch.setattr("dudmap.sequences.bag_file.LARGEST_RATIO", 1)
+    with pytest.raises(DatasetError, match="one of its files unpacks to more than 1 times its size"):
+        open_sequence(path)
+
+
+def test_topics_that_cannot_be_parsed_do_not_matter(tmp_path, kind):
+    """Definitions that would take for ever (brackets in IDL), cannot be parsed, or are in an unknown language."""
+    bag = BagWriter(tmp_path / KINDS[kind], kind)
+    definitions = {
+        "pkg/srv/Tell_Event": "service_msgs/ServiceEventInfo info\npkg/srv/Tell_Request[<=1] request\n",
+        "pkg/msg/Deep": "module pkg { module msg { struct Deep { int8 a[((((1))))]; }; }; };",
+        "sensor_msgs/msg/PointCloud3": "?",
+    }
+    for number, (name, text) in enumerate(definitions.items()):
+        given = {"md5sum": 32 * "0"} if kind == "ros1" else {"rihs01": f"RIHS01_{64 * '0'}"}
+        name = name.replace("/srv/", "/msg/") if kind == "ros1" else name
+        topic = bag.writer.add_connection(f"/camera/other{number}", name, msgdef=text, **given)
+        bag.writer.write(topic, START * 10**9 + number, b"\0\1\0\0abcd")
+    write_frames(bag, 5)
+    if kind == "mcap":
+        (file,) = (tmp_path / KINDS[kind]).glob("*.mcap")
+        data = file.read_bytes()
+        assert data.count(b"ros2msg") > 3
+        file.write_bytes(re.sub(rb"(Tell_Event.{4})ros2msg", rb"\1unknown", data, flags=re.DOTALL))
+    check_frames(open_sequence(tmp_path / KINDS[kind]))
+
+
 def test_stamps_of_compressed_bags_are_those_of_recording_less_the_delay(tmp_path):
     """The frames themselves have the exact stamps."""
     bag = BagWriter(tmp_path / "a.bag", "ros1", set_compression=(Writer1.CompressionFormat.BZ2,))
@@ -100,11 +134,11 @@ def bytes_read():
 def test_sequential_reading_is_one_pass(tmp_path, kind):
     sequence = open_sequence(write_bag(tmp_path / KINDS[kind], kind, frames=30))
     opened = []
-    messages = sequence._reader.messages
-    sequence._reader.messages = lambda *args, **kwargs: opened.append(kwargs) or messages(*args, **kwargs)
+    messages = sequence._bag._reader.messages
+    sequence._bag._reader.messages = lambda *args, **kwargs: opened.append(kwargs) or messages(*args, **kwargs)
     for index in range(30):
         assert sequence[index].color[0, 0, 1] == index
-        assert len(sequence._stream._kept) <= 4, "only neighbours wait"
+        assert len(sequence._bag._kept) <= 4, "only neighbours wait"
     assert len(opened) <= 1
 
 
@@ -259,7 +293,7 @@ def test_a_damaged_bag_is_one_sentence(tmp_path, kind):
 
 def test_rosbags_missing_is_one_sentence(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "a.bag", "ros1")
-    monkeypatch.setitem(__import__("sys").modules, "rosbags.highlevel", None)
+    monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
     with pytest.raises(MissingExtraError, match=r'the ROS bag .* needs the extra ros-bags .*"dudmap\[ros-bags\]"'):
         open_sequence(path)
 

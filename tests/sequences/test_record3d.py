@@ -38,7 +38,8 @@ def write_r3d(path, frames=12, *, metadata=None, pack=None):
             jpeg = cv2.imencode(".jpg", color(index)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, 100])[1]
             archive.writestr(f"rgbd/{index}.jpg", jpeg.tobytes())
             archive.writestr(f"rgbd/{index}.depth", pack(values.tobytes()))
-            archive.writestr(f"rgbd/{index}.conf", pack(np.full((32, 24), 2, np.uint8).tobytes()))
+            confidence = np.repeat([2, 1, 0], [28, 2, 2]).astype(np.uint8)[:, None].repeat(24, axis=1)
+            archive.writestr(f"rgbd/{index}.conf", pack(confidence.tobytes()))
     return path
 
 
@@ -54,7 +55,8 @@ def test_frames_and_both_cameras(tmp_path):
     for index in (10, 2):  # in the order of numbers, not of names
         frame = sequence[index]
         assert frame.depth[0, 0] == 0
-        np.testing.assert_array_equal(frame.depth[1:], depth(index)[1:])
+        np.testing.assert_array_equal(frame.depth[1:30], depth(index)[1:30])
+        assert not frame.depth[30:].any(), "confidence 0"
         assert np.abs(frame.color.astype(int) - color(index)).max() <= 3
     assert sequence.ground_truth is None
 

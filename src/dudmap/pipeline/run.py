@@ -264,7 +264,7 @@ class Job:
         store.close(finished=False)
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
-            limit, timed = state.slam.max_blocks, state.slam.timed
+            limit, timed = state.slam.max_blocks, state.slam.motion.timed
             systems = (Slam(self.sequence.camera, self.config, max_blocks=limit, timed=timed) for _ in range(2))
             old, state = state, restored(reader, store, *systems)
             self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")

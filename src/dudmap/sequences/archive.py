@@ -15,7 +15,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
 
 from dudmap.errors import DatasetError
-from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES
+from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged, open_plain
 
 SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 LARGEST_BYTES = 256 * 2**30
@@ -63,6 +63,8 @@ def unpack(path: Path) -> Path:
         DatasetError: The archive is damaged, encrypted or too large, holds links, devices or paths that lead out of it,
             or the disk is full.
     """
+    with damaged(DatasetError, f"the archive {path}"):
+        open_plain(path).close()
     status = path.stat()
     key = f"{path.resolve()} {status.st_size} {status.st_mtime_ns}"
     place = cache_folder() / f"{stem(path)}-{hashlib.sha256(key.encode()).hexdigest()[:12]}"

@@ -1,10 +1,7 @@
 """ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), through the package rosbags."""
 
 import weakref
-from collections.abc import Generator
-from contextlib import closing
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,28 +9,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
-from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.association import LARGEST_GAP, associate
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.input_files import foreign, open_plain
+from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
-from dudmap.sequences.bag_definitions import limit_definitions
-from dudmap.sequences.bag_index import MessageStream, MessageTimes, message_times, warm_index
-from dudmap.sequences.bag_limits import check_bag, limit_decompression
+from dudmap.sequences.bag_file import BagFile, MessageTimes
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
+from dudmap.sequences.image_folder import PROBES, size
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
-    from rosbags.highlevel import AnyReader
     from rosbags.interfaces import Connection
 
 MAGIC = {".bag": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
 """First bytes of the files by their suffix."""
-PROBES = 30
-"""Number of evenly spread frames that are tried until one can be decoded and gives the image sizes."""
 MILLIMETRES = 1000.0
 """Units per metre of 16-bit depth images (ROS REP 118)."""
 FIRST_TRANSFORMS = 300
@@ -72,15 +64,14 @@ class RosBag:
         self.path = Path(path)
         self.name = self.path.resolve().stem
         chosen = bag_topics.parse(topics)
-        self._reader = _open(self.path)
-        self._stream = MessageStream(self._reader)
-        weakref.finalize(self, _close, self._reader, self._stream)
+        self._bag = BagFile(self.path)
+        weakref.finalize(self, self._bag.close)
         with foreign(DatasetError, f"the bag {self.path}"):
             self._find_frames(chosen, camera)
 
     def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
         """Set topics, times and pairs of messages, and the cameras."""
-        self._topics = bag_topics.find(self._reader.connections, chosen, str(self.path))
+        self._topics = bag_topics.find(self._bag.connections, chosen, str(self.path))
         depth, color = self._times(self._topics.depth), self._times(self._topics.color)
         self._exact = depth.exact and color.exact
         self._pairs = self._associated(depth, color)
@@ -107,25 +98,26 @@ class RosBag:
             FrameError: An image is damaged, of an unknown encoding, or of another size than its camera.
         """
         index = range(len(self))[index]
-        name = f"frame {index} of {self.path}"
-        with foreign(FrameError, name):
-            return self._frame(index, name)
-
-    def _frame(self, index: int, name: str) -> Frame:
-        color, depth = self._messages(index)
-        image = bag_images.color_of(color, f"the colour image of {name}")
-        values = bag_images.depth_of(depth, self.camera.depth_scale, f"the depth image of {name}")
+        depth, values, color, image = self._decoded(index, self.camera.depth_scale)
         expected = self.camera if self.calibration is None else self.calibration.camera
         for what, found, camera in (("colour", image, expected), ("depth", values, self.camera)):
             if found.shape[:2] != camera.shape:
                 raise FrameError(
-                    f"{name}: the {what} image is {found.shape[1]}x{found.shape[0]} pixels, but its camera is "
+                    f"frame {index} of {self.path}: the {what} image is {size(found)} pixels, but its camera is "
                     f"{camera.width}x{camera.height}"
                 )
         values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
         if self._exact:
             return Frame(float(self.timestamps[index]), values, image, float(self._color_stamps[index]))
         return Frame(_stamp(depth), values, image, _stamp(color))
+
+    def _decoded(self, index: int, depth_scale: float) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """Depth and colour message of a frame, each with its image."""
+        topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
+        with foreign(FrameError, name):
+            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
+            values = bag_images.depth_of(depth, depth_scale, f"the depth image of {name}")
+            return depth, values, color, bag_images.color_of(color, f"the colour image of {name}")
 
     def mask(self, index: int) -> None:
         """No true masks are known."""
@@ -144,7 +136,7 @@ class RosBag:
 
     def _times(self, connection: "Connection") -> MessageTimes:
         """Times of the messages of a topic."""
-        found = message_times(self._reader, connection)
+        found = self._bag.times(connection)
         if np.mean(np.diff(found.stamps, prepend=-np.inf) > 0) < 0.9:  # a driver that does not fill the headers
             return found._replace(stamps=1e-9 * found.recorded, exact=True)
         return found
@@ -162,22 +154,11 @@ class RosBag:
             )
         return pairs
 
-    def _messages(self, index: int) -> tuple[Any, Any]:
-        """Colour and depth message of a frame."""
-        topics, (color_time, depth_time) = self._topics, self._recorded[index]
-        try:
-            raw = self._stream.read([(topics.color, color_time), (topics.depth, depth_time)])
-            return (
-                self._reader.deserialize(raw[0], topics.color.msgtype),
-                self._reader.deserialize(raw[1], topics.depth.msgtype),
-            )
-        except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
-            raise FrameError(f"frame {index} of {self.path} cannot be read: {error}") from error
-
     def _find_cameras(self, given: Camera | str | None) -> None:
         """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
         topics = self._topics
-        depth, depth_size, color, color_size = self._probe()
+        depth, values, color, image = self._probe()
+        depth_size, color_size = values.shape[::-1], image.shape[1::-1]
         self._depth_frame = depth.header.frame_id
         color_lens = self._lens(topics.color_info, topics.color, color_size)
         one_size = depth_size == color_size
@@ -186,10 +167,10 @@ class RosBag:
             depth_lens = Lens(known.camera(*depth_size))
             self.intrinsics_source = known.source
         else:
-            info, image = topics.depth_info, topics.depth
+            info, beside = topics.depth_info, topics.depth
             if info is None and one_size and topics.registered:
-                info, image = topics.color_info, topics.color
-            depth_lens = self._lens(info, image, depth_size)
+                info, beside = topics.color_info, topics.color
+            depth_lens = self._lens(info, beside, depth_size)
             self.intrinsics_source = info.topic if info else ""
         if depth_lens is None:
             raise DatasetError(
@@ -198,9 +179,8 @@ class RosBag:
             )
         if color_lens is None and not one_size:
             raise DatasetError(
-                f"{self.path}: depth is {depth_size[0]}x{depth_size[1]} and colour {color_size[0]}x{color_size[1]} "
-                f"pixels, and there is no camera_info beside {topics.color.topic}; choose it with --topics "
-                "color_info=/..."
+                f"{self.path}: depth is {size(values)} and colour {size(image)} pixels, and there is no camera_info "
+                f"beside {topics.color.topic}; choose it with --topics color_info=/..."
             )
         if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
@@ -208,8 +188,8 @@ class RosBag:
         together = color_lens is depth_lens
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
-    def _probe(self) -> tuple[Any, tuple[int, int], Any, tuple[int, int]]:
-        """Depth and colour message of the first frame that can be decoded, each with its width and height.
+    def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """The first frame that can be decoded.
 
         Raises:
             DatasetError: None of some frames all over the bag can be decoded.
@@ -217,13 +197,9 @@ class RosBag:
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
-                color, depth = self._messages(int(index))
-                pixels = bag_images.depth_of(depth, 1.0, f"the depth image of frame {index}")
-                image = bag_images.color_of(color, f"the colour image of frame {index}")
+                return self._decoded(int(index), 1.0)
             except FrameError as error:
                 problem = problem or error
-            else:
-                return depth, pixels.shape[::-1], color, image.shape[1::-1]
         raise DatasetError(f"no frame of {self.path} is usable; {problem}")
 
     def _between(self, depth: Lens, color: Lens, color_frame: str) -> Calibration | None:
@@ -249,17 +225,17 @@ class RosBag:
         """Depth units per metre."""
         return MILLIMETRES
 
-    def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
-        """Lens of a camera_info, for images of a size; that of rectified images is in its projection matrix."""
-        info = self._first(connection)
+    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
+        """Lens of a camera_info for images of a width and height; for rectified ones it is in the projection matrix."""
+        info = self._bag.first(connection)
         if info is None:
             return None
         K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
         rectified = "rect" in bag_topics.base(image.topic).rpartition("/")[2] and P[0] > 0
         fx, cx, fy, cy = (P[0], P[2], P[5], P[6]) if rectified else (K[0], K[2], K[4], K[5])
-        width, height = (info.width, info.height) if info.width and info.height else size
+        width, height = (info.width, info.height) if info.width and info.height else shape
         units = self._units()
-        camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*size)
+        camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
         return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
 
     def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
@@ -274,56 +250,19 @@ class RosBag:
         """Frames of /tf_static and of the first ``count`` messages of /tf, None for all."""
         tree = TransformTree()
         for topic, limit in ((TOPIC, count), (STATIC_TOPIC, FIRST_TRANSFORMS)):
-            found = [
-                connection for connection in self._reader.connections
-                if connection.topic == topic and connection.msgcount > 0
-            ]  # fmt: skip
+            found = [c for c in self._bag.connections if c.topic == topic and c.msgcount]
             if found:
-                with self._stream.lock:
-                    tree.add(islice(self._decoded(found), limit), static=topic == STATIC_TOPIC)
+                messages = (message for _, message in self._bag.messages(found, limit))
+                tree.add(messages, static=topic == STATIC_TOPIC)
         return tree
-
-    def _decoded(self, connections: "list[Connection]") -> Generator[Any]:
-        with closing(self._reader.messages(connections)) as messages:
-            for connection, _, raw in messages:
-                yield self._reader.deserialize(raw, connection.msgtype)
-
-    def _first(self, connection: "Connection | None") -> Any:  # noqa: ANN401
-        """First message of a connection, None without one."""
-        if connection is None:
-            return None
-        with closing(self._decoded([connection])) as messages:
-            return next(messages, None)
 
 
 def starts_with(path: Path, magic: bytes) -> bool:
-    """Whether a file starts with these bytes."""
+    """Whether a file starts with these bytes, or will once Git LFS has fetched it."""
     if not path.is_file():
         return False
-    with open_plain(path) as file:
-        return file.read(len(magic)) == magic
-
-
-def _open(path: Path) -> "AnyReader":
-    with extra("ros-bags", f"the ROS bag {path}"):
-        from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
-    try:
-        check_bag(path)
-        limit_decompression()
-        limit_definitions()
-        if path.suffix == ".bag":
-            warm_index(path)
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
-        reader.open()
-    except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
-        raise DatasetError(f"cannot open the bag {path}: {error}") from error
-    return reader
-
-
-def _close(reader: "AnyReader", stream: MessageStream) -> None:
-    stream.close()
-    reader.close()
+    with open_plain(path, pointers=True) as file:
+        return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
 
 
 def _stamp(message: Any) -> float:  # noqa: ANN401

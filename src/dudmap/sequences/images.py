@@ -97,10 +97,18 @@ def read_mask(path: Path) -> NDArray[np.bool_]:
     Raises:
         FrameError: The file is missing, truncated, damaged or not an image.
     """
+    return read_gray(path) > 127
+
+
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """8-bit image (H, W) of one channel; colours are converted.
+
+    Raises:
+        FrameError: The file is missing, truncated, damaged or not an image.
+    """
     import cv2
 
-    image = _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
-    return image > 127
+    return _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
 
 
 def _bytes(path: Path) -> bytes:

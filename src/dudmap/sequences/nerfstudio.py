@@ -71,15 +71,9 @@ class NerfstudioSequence(ImageFolder):
         found = [values for frame in self._frames if (values := values_of(self._tree | frame)) is not None]
         if not found:
             raise DatasetError(f"{self.path}/transforms.json lacks fl_x, fl_y, cx or cy; give --camera fx,fy,cx,cy")
-        color = {key: float(np.median([values.get(key, 0.0) for values in found])) for key in found[0]}
-        color["height"], color["width"] = images.read_color(self._pairs[0][0].path).shape[:2]
-        depth_shape = self._read_depth(self._pairs[0][1].path, self.depth_scale).shape
-        source = "transforms.json"
-        if depth_shape == (color["height"], color["width"]):
-            return intrinsics.Intrinsics(color | {"depth_scale": self.depth_scale}, source)
-        view = intrinsics.Intrinsics(color, source).camera(int(color["width"]), int(color["height"]))
-        depth = intrinsics.from_camera(view.resized(depth_shape[1], depth_shape[0])).values
-        return intrinsics.Intrinsics(depth | {"depth_scale": self.depth_scale}, source, color)
+        color, depth = self._pairs[0]
+        shapes = images.read_color(color.path).shape[:2], self._read_depth(depth.path, self.depth_scale).shape
+        return one_view(found, *shapes, self.depth_scale, "transforms.json")
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         return images.read_depth_array(path) if path.suffix == ".npy" else images.read_depth(path, depth_scale)
@@ -99,3 +93,22 @@ class NerfstudioSequence(ImageFolder):
 def _order(frame: dict[str, Any]) -> tuple[int, str]:
     """Name of the image, shorter ones first, so that frame_2 comes before frame_10."""
     return len(frame["file_path"]), frame["file_path"]
+
+
+def one_view(
+    cameras: list[dict[str, float]], color: tuple[int, ...], depth: tuple[int, ...], depth_scale: float, source: str
+) -> intrinsics.Intrinsics:
+    """Intrinsics of depth images that show the view of the colour images, in the same or another size.
+
+    Args:
+        cameras: Numbers by key of each colour image; their median is taken.
+        color, depth: Shapes of the images.
+        depth_scale: Depth units per metre.
+        source: Origin of the numbers.
+    """
+    values = {key: float(np.median([camera.get(key, 0.0) for camera in cameras])) for key in cameras[0]}
+    values |= {"width": color[1], "height": color[0]}
+    if color == depth:
+        return intrinsics.Intrinsics(values | {"depth_scale": depth_scale}, source)
+    view = intrinsics.Intrinsics(values, source).camera(color[1], color[0]).resized(depth[1], depth[0])
+    return intrinsics.Intrinsics(intrinsics.from_camera(view).values | {"depth_scale": depth_scale}, source, values)

@@ -13,7 +13,7 @@ from dudmap.sequences.image_folder import ImageFolder
 
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 DEPTH_WORDS = ("depth",)
-COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img")
+COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img", "mono")
 NEITHER_WORDS = ("confidence", "right", "mask", "normal", "vis", "infra", "ir")
 """Words of files and folders that hold other images than depth and colour."""
 LARGEST_NUMBER = 10**8

@@ -5,7 +5,6 @@ which the driver's playback does not offer.
 """
 
 import re
-from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,8 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.input_files import open_plain
 from dudmap.sequences.bag import MAGIC, MILLIMETRES, RosBag
-from dudmap.sequences.bag_index import MessageTimes
+from dudmap.sequences.bag_file import MessageTimes
+from dudmap.sequences.bag_transforms import motion_of
 from dudmap.sequences.lens import Lens
 
 if TYPE_CHECKING:
@@ -47,7 +47,7 @@ class RealSenseRecording(RosBag):
         """Whether a .bag or .db3 file has the topics of librealsense."""
         if path.suffix.lower() not in (".bag", ".db3") or not path.is_file():
             return False
-        with open_plain(path) as file:
+        with open_plain(path, pointers=True) as file:
             head = file.read(HEAD)
         return head.startswith(MAGIC[path.suffix.lower()]) and TOPICS in head
 
@@ -57,11 +57,9 @@ class RealSenseRecording(RosBag):
         if metadata is None:
             return found
         stamps = {}
-        with closing(self._reader.messages([metadata])) as messages:
-            for _, time, raw in messages:
-                message: Any = self._reader.deserialize(raw, metadata.msgtype)
-                if match := re.search(r"(?:^|;)timestamp=([\d.]+)", message.data):
-                    stamps[time] = 1e-3 * float(match[1])
+        for time, message in self._bag.messages([metadata]):
+            if match := re.search(r"(?:^|;)timestamp=([\d.]+)", message.data):
+                stamps[time] = 1e-3 * float(match[1])
         kept = np.array([int(time) in stamps for time in found.recorded])
         if not kept.any():
             return found
@@ -75,12 +73,12 @@ class RealSenseRecording(RosBag):
             return None
         return motions[0] @ se3.inverse(motions[1])
 
-    def _lens(self, connection: "Connection | None", image: "Connection", size: tuple[int, int]) -> Lens | None:
+    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
         """Lens of a stream; the camera_info of .db3 files calls every model plumb_bob, the text beside it does not."""
         text = self._beside(image, "camera_info", "std_msgs/msg/String")
-        model = re.search(r"model=([^;]*)", self._first(text).data) if text else None
+        model = re.search(r"model=([^;]*)", self._bag.first(text).data) if text else None
         self._model = model[1] if model else ""
-        return super()._lens(connection, image, size)
+        return super()._lens(connection, image, shape)
 
     def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
         return Lens.of(camera, self._model or model, coefficients)
@@ -88,22 +86,22 @@ class RealSenseRecording(RosBag):
     def _units(self) -> float:
         sensor = re.match(r"/device_\d+/sensor_\d+", self._topics.depth.topic)
         topic = f"{sensor[0]}/option/Depth_Units/value" if sensor else ""
-        for connection in self._reader.connections:
+        for connection in self._bag.connections:
             if connection.topic == topic and connection.msgcount:
-                unit = float(self._first(connection).data)
+                unit = float(self._bag.first(connection).data)
                 return round(1 / unit, 2) if unit > 0 else MILLIMETRES  # the option is a float32
         return MILLIMETRES
 
     def _motion(self, image: "Connection") -> NDArray[np.float64] | None:
         """Motion (4, 4) of points of the reference into a stream, from its topic ``tf/...``."""
         found = self._beside(image, "tf/", "")
-        return None if found is None else _motion(self._first(found))
+        return None if found is None else _motion(self._bag.first(found))
 
     def _beside(self, image: "Connection", name: str, msgtype: str) -> "Connection | None":
         """First topic of the same stream whose name goes on with ``name``."""
         stream = re.match(r"/device_\d+/sensor_\d+/\w+", image.topic)
         prefix = f"{stream[0] if stream else image.topic}/{name}"
-        for connection in self._reader.connections:
+        for connection in self._bag.connections:
             right = connection.topic.startswith(prefix) and connection.msgtype.startswith(msgtype)
             if right and connection.msgcount:
                 return connection
@@ -112,13 +110,10 @@ class RealSenseRecording(RosBag):
 
 def _motion(message: Any) -> NDArray[np.float64]:  # noqa: ANN401 - the type is made from the bag
     """Motion of a geometry_msgs/Transform, or of text with the rotation column by column."""
+    if not hasattr(message, "data"):
+        return motion_of(message)
     T = np.eye(4)
-    if hasattr(message, "data"):
-        numbers = [float(number) for number in re.findall(r"[-+\d.eE]*\d[\d.]*", message.data)]
-        T[:3, :3], T[:3, 3] = np.array(numbers[:9]).reshape(3, 3).T, numbers[9:12]
-        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
-        return T
-    r, t = message.rotation, message.translation
-    T[:3, :3] = se3.quat_xyzw_to_rotation(np.array([r.x, r.y, r.z, r.w]))
-    T[:3, 3] = t.x, t.y, t.z
+    numbers = [float(number) for number in re.findall(r"[-+\d.eE]*\d[\d.]*", message.data)]
+    T[:3, :3] = se3.nearest_rotation(np.array(numbers[:9]).reshape(3, 3).T)
+    T[:3, 3] = numbers[9:12]
     return T

@@ -24,8 +24,8 @@ class Record3DRecording:
     """Recording in a ``.r3d`` file.
 
     The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same
-    place, so that the depth camera is the colour camera resized, and ``calibration`` holds the colour camera. The poses
-    in the file are estimates of ARKit and therefore no ground truth.
+    place, so that the depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Readings
+    of confidence 0 are left out. The poses in the file are estimates of ARKit and therefore no ground truth.
 
     Args:
         path: The file.
@@ -90,18 +90,26 @@ class Record3DRecording:
         """No true masks are known."""
 
     def _depth(self, number: int) -> NDArray[np.float32]:
-        name = f"rgbd/{number}.depth of {self.path}"
-        packed = self._member(f"rgbd/{number}.depth")
+        values = self._unpacked(f"rgbd/{number}.depth", "<f4")
+        depth = images.metres(values, 1.0, f"rgbd/{number}.depth of {self.path}")
+        if f"rgbd/{number}.conf" in self._zip.NameToInfo:
+            depth[self._unpacked(f"rgbd/{number}.conf", "u1") == 0] = 0
+        return depth
+
+    def _unpacked(self, member: str, kind: str) -> NDArray[Any]:
+        """Image (H, W) of a member that holds the pixels of the depth camera, compressed by LZFSE."""
+        name, width, height = f"{member} of {self.path}", self.camera.width, self.camera.height
+        packed = self._member(member)
         if largest_unpacked(packed) > RATIO_FREE_BYTES:
-            raise FrameError(f"{name} unpacks to too much; expected {self.camera.width}x{self.camera.height} floats")
+            raise FrameError(f"{name} unpacks to too much; expected {width}x{height} pixels")
         try:
             data = self._lzfse.decompress(packed)
         except (self._lzfse.error, MemoryError) as error:
             # where a block ends too early, the decoder asks for more and more memory, which it does not use
             raise FrameError(f"{name} cannot be decompressed: {error or 'a block ends too early'}") from error
-        if len(data) != 4 * self.camera.width * self.camera.height:
-            raise FrameError(f"{name} has {len(data)} bytes; expected {self.camera.width}x{self.camera.height} floats")
-        return images.metres(np.frombuffer(data, "<f4").reshape(self.camera.shape), 1.0, name)
+        if len(data) != np.dtype(kind).itemsize * width * height:
+            raise FrameError(f"{name} has {len(data)} bytes; expected {width}x{height} pixels of {kind}")
+        return np.frombuffer(data, kind).reshape(height, width)
 
     def _member(self, name: str) -> bytes:
         try:
