@@ -22,6 +22,7 @@ from dudmap.errors import StateError
 from dudmap.mapping.block_pager import Region
 from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
 from dudmap.mapping.voxel_blocks import BlockRecords
+from dudmap.own_folder import OwnFolder
 from dudmap.places.frame_store import EncodedFrame
 from dudmap.state.block_keys import MAP_SHIFT
 from dudmap.state.blocks import VOXELS, MapSnapshot, StoredMaps
@@ -58,12 +59,15 @@ class StateDatabase:
         maps, frames: Know what is in the database.
 
     Raises:
-        sqlite3.Error: The file cannot be created or opened.
+        OSError: The file is a link or anything but a plain file.
+        sqlite3.Error: It cannot be created or opened.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.maps, self.frames = StoredMaps(), StoredFrames()
+        with OwnFolder(path.parent, linked=True) as folder:
+            folder.check(path.name, alone=True)  # it is written in place
         self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
         self._chunks: set[str] = set()
         self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
