@@ -74,7 +74,7 @@ def test_a_dictionary_that_takes_a_gigabyte(tmp_path, monkeypatch, little):
     header[4] = 36  # 2^30
     header[-4:] = zlib.crc32(header[:-4]).to_bytes(4, "little")
     (tmp_path / "a.tar.xz").write_bytes(whole[:12] + bytes(header) + whole[12 + len(header) :])
-    with pytest.raises(DatasetError, match="cannot unpack .*[Mm]emory"):
+    with pytest.raises(DatasetError, match=r"cannot unpack .*[Mm]emory"):
         open_sequence(tmp_path / "a.tar.xz")
 
 

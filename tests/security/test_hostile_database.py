@@ -1,4 +1,4 @@
-"""A database of a run from elsewhere is data: it runs nothing, and takes neither memory nor time that it does not say."""
+"""A database of a run from elsewhere is data: it runs nothing, and is bounded in memory and time."""
 
 import os
 import signal

@@ -51,7 +51,7 @@ WRITTEN = {
     )),
     "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
 }  # fmt: skip
-"""Names of all files of a run by sub-folder, as regular expressions. They are removed before the next run, no others."""
+"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
 
 
 @dataclass(frozen=True, eq=False)

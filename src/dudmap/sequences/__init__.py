@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
+from dudmap.errors import DatasetError, printable
 from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
@@ -168,7 +168,9 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **opti
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
         )
     with damaged(DatasetError, f"the recording {place}"):
-        return reader(place, camera, **given)
+        sequence = reader(place, camera, **given)
+    sequence.name = printable(sequence.name)
+    return sequence
 
 
 def _find(path: Path) -> tuple[Path, Reader]:

@@ -37,8 +37,8 @@ SCHEMA = 2
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 STEPS, LIMIT = 10_000, 100_000
-"""Instructions of SQLite between two looks at ctrl-C, and looks after which a statement is ended; one row takes 10 to 50
-instructions."""
+"""Instructions of SQLite between two looks at ctrl-C, and looks after which a statement is ended; a row takes 10 to
+50 instructions."""
 ROWS = 4096
 """Blocks that are read at once."""
 TABLES = """
@@ -243,7 +243,8 @@ class StateReader:
             chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
             arrays = [_array(about, chunks) for about in described["arrays"]]
             texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
-            return described["tree"], arrays, [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
+            records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
+            return described["tree"], arrays, records
         except (ValueError, KeyError, TypeError, zlib.error, RecursionError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
 
@@ -320,7 +321,6 @@ class StateReader:
             if "interrupted" in str(error) and self._left > 0:  # what ctrl-C raises in the handler ends here
                 raise KeyboardInterrupt from None
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
-
 
     def _is_too_long(self) -> bool:
         """Whether a statement must end; called by SQLite, so that ctrl-C is heard."""

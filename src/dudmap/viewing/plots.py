@@ -126,7 +126,13 @@ def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
     from matplotlib.figure import Figure
 
     picture: list[str] = []
-    style = {"svg.fonttype": "none", "svg.hashsalt": name, "font.size": 9, "font.family": "sans-serif", "text.parse_math": False}
+    style = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": name,
+        "font.size": 9,
+        "font.family": "sans-serif",
+        "text.parse_math": False,
+    }
     with matplotlib.rc_context(rc=cast("Any", style)):
         figure = Figure(figsize=(7.2, 2.8), layout="constrained")
         FigureCanvasSVG(figure)
