@@ -1,32 +1,36 @@
 """Files that are either written completely or not at all."""
 
+import errno
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO
 
+from dudmap.own_folder import OwnFolder
+
 __all__ = ["UNFINISHED", "atomic_file", "atomic_path", "bring_to_disk", "put_in_place", "write_bytes", "write_text"]
 
-UNFINISHED = ".*.[0-9]*.part*"
-"""Pattern of the temporary names, under which a process that is killed leaves what it was writing."""
+UNFINISHED = r"\..+\.\d+\.part(\.\w+)?"
+"""Regular expression of the temporary names, under which a process that is killed leaves what it was writing."""
 
 
 @contextmanager
-def atomic_file(path: str | Path, *, sync: bool = True) -> Iterator[IO[bytes]]:
+def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> Iterator[IO[bytes]]:
     """Open a binary file that takes the place of ``path`` when the block ends without an error.
 
     It is written beside ``path`` under a temporary name, flushed to the disk and renamed, so that a process that is
-    killed leaves the old file, and a power cut leaves the old or the new one.
+    killed leaves the old file, and a power cut leaves the old or the new one. A link at ``path`` is replaced.
 
     Args:
         path: The file.
         sync: Wait until the file and its name are on the disk. Without it a power cut may lose the file, also the old.
+        own: The folder of the file is one that dudmap made itself, and must be no link.
 
     Raises:
-        OSError: The file cannot be written.
+        OSError: The file cannot be written; ``filename`` is that of ``path``.
     """
-    with atomic_path(path, sync=sync) as temporary, temporary.open("wb") as file:
+    with _unfinished(Path(path), sync, own) as (_, number), open(number, "wb") as file:
         yield file
 
 
@@ -37,11 +41,24 @@ def atomic_path(path: str | Path, *, sync: bool = True) -> Iterator[Path]:
     Raises:
         OSError: The file cannot be written.
     """
-    path = Path(path)
+    with _unfinished(Path(path), sync, own=False) as (temporary, number):
+        os.close(number)
+        yield temporary
+
+
+@contextmanager
+def _unfinished(path: Path, sync: bool, own: bool) -> Iterator[tuple[Path, int]]:
+    """Temporary path of a file and its handle."""
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
     try:
-        yield temporary
+        with OwnFolder(path.parent, linked=not own) as folder:
+            number = folder.create(temporary.name)
+        yield temporary, number
         put_in_place(temporary, path, sync=sync)
+    except OSError as error:
+        if isinstance(error.filename, str):
+            raise
+        raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -59,15 +76,15 @@ def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
         bring_to_disk(path.parent)
 
 
-def write_bytes(path: str | Path, content: bytes, *, sync: bool = True) -> None:
+def write_bytes(path: str | Path, content: bytes, *, sync: bool = True, own: bool = False) -> None:
     """Write a file as ``atomic_file`` does."""
-    with atomic_file(path, sync=sync) as file:
+    with atomic_file(path, sync=sync, own=own) as file:
         file.write(content)
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file in UTF-8 as ``atomic_file`` does."""
-    write_bytes(path, text.encode())
+    """Write a text file in UTF-8 as ``atomic_file`` does; what UTF-8 cannot hold, of a file name, becomes an escape."""
+    write_bytes(path, text.encode("utf-8", "backslashreplace"))
 
 
 def bring_to_disk(path: Path) -> None:

@@ -7,19 +7,26 @@ LARGEST_MESSAGE = 2000
 """Characters of a message; a damaged file may hold one line of a hundred megabytes, which messages quote."""
 
 
+def printable(text: object) -> str:
+    """A text as one line that shows what it says, for terminals, pages and files in UTF-8.
+
+    Characters that are not printable, such as a line break, a terminal's escape sequence, another direction of writing
+    or a byte that is no UTF-8 in the name of a file, are written as escapes.
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in str(text))
+
+
 class DudmapError(Exception):
     """Base class of all errors of dudmap; the command line prints them without a traceback.
 
-    Characters of a message that are not printable, such as a line break, a terminal's escape sequence or another
-    direction of writing in the name of a file, are written as escapes, so that it stays one line that shows what it
-    says.
+    A message is made ``printable``.
     """
 
     def __init__(self, message: object = "") -> None:
         text = str(message)
         if len(text) > LARGEST_MESSAGE:
             text = f"{text[: LARGEST_MESSAGE // 2]} ... {text[-LARGEST_MESSAGE // 2 :]}"
-        super().__init__("".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text))
+        super().__init__(printable(text))
 
 
 class ConfigError(DudmapError):

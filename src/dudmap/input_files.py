@@ -30,7 +30,13 @@ from dudmap.errors import DudmapError
 LARGEST_TEXT = 2**28
 """Largest text file, bytes: poses of 100 hours at 30 frames a second have 1 GB, an hour has 10 MB."""
 LARGEST_TREE = 2**26
-"""Largest JSON or TOML file, bytes; transforms.json with 10 000 frames has 5 MB. A tree takes 20 times the memory."""
+"""Largest JSON file, bytes; transforms.json with 10 000 frames has 5 MB."""
+LARGEST_TOML = 2**20
+"""Largest TOML file, bytes: all parameters with their meanings have 30 kB, and the parser takes 1 s for this size."""
+LARGEST_COUNT = 2**23
+"""Largest number of values of a JSON text: they take less than 1 GB. transforms.json with 10 000 frames has 200 000."""
+DEEPEST = 64
+"""Largest depth of a JSON or TOML tree; those of the formats that are read have 8 levels at most."""
 LARGEST_FILE = 2**28
 """Largest file that is read as a whole, bytes: an uncompressed image of ``LARGEST_PIXELS``."""
 LARGEST_ARCHIVE = 2**36
@@ -121,16 +127,40 @@ def read_json(path: str | Path) -> Any:  # noqa: ANN401 - any JSON value
     return parse_json(read_text(path, LARGEST_TREE))
 
 
-def parse_json(text: str | bytes) -> Any:  # noqa: ANN401 - any JSON value
-    """Value of a JSON text; whole numbers beyond 64 bit become floats.
+def parse_json(text: str | bytes, *, exact: bool = False) -> Any:  # noqa: ANN401 - any JSON value
+    """Value of a JSON text; whole numbers beyond 64 bit become floats unless ``exact``.
 
     Raises:
-        ValueError: It is not UTF-8 or not JSON, or nested too deeply.
+        ValueError: It is not UTF-8 or not JSON, too large, or nested too deeply.
     """
+    comma, opening = (b",", (b"[", b"{")) if isinstance(text, bytes) else (",", ("[", "{"))
+    if text.count(comma) + sum(text.count(one) for one in opening) > LARGEST_COUNT:
+        raise ValueError(f"it has more than {LARGEST_COUNT} values")
     try:
-        return json.loads(text, parse_int=_number)
+        return _shallow(json.loads(text, parse_int=int if exact else _number))
     except RecursionError:
-        raise ValueError("it is nested too deeply") from None
+        raise ValueError(TOO_DEEP) from None
+
+
+TOO_DEEP = f"it is nested too deeply, by more than {DEEPEST} levels"
+
+
+def _shallow(tree: Any) -> Any:  # noqa: ANN401 - any JSON value
+    """The tree, if what goes through it by recursion is safe.
+
+    Raises:
+        ValueError: It is not.
+    """
+    level = [tree]
+    for _ in range(DEEPEST):
+        parts = (one.values() if isinstance(one, dict) else one for one in level)
+        level = [one for part in parts if not isinstance(part, _PLAIN) for one in part if isinstance(one, dict | list)]
+        if not level:
+            return tree
+    raise ValueError(TOO_DEEP)
+
+
+_PLAIN = str | int | float | None
 
 
 def _number(text: str) -> int | float:
@@ -144,7 +174,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
         OSError: The file cannot be read, is no plain file, or is too large.
         ValueError: It is not UTF-8 or not TOML (``tomllib.TOMLDecodeError``), or nested too deeply.
     """
-    return parse_toml(read_text(path, LARGEST_TREE))
+    return parse_toml(read_text(path, LARGEST_TOML))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
@@ -154,11 +184,25 @@ def parse_toml(text: str) -> dict[str, Any]:
         tomllib.TOMLDecodeError: It is not TOML, or nested too deeply.
     """
     try:
-        return tomllib.loads(text)
+        return _shallow(tomllib.loads(text))
     except RecursionError:
-        raise tomllib.TOMLDecodeError("it is nested too deeply") from None
+        raise tomllib.TOMLDecodeError(TOO_DEEP) from None
     except (ValueError, OverflowError) as error:  # a date or number that Python cannot hold
         raise tomllib.TOMLDecodeError(str(error)) from None
+
+
+def inflated(packed: bytes, largest: int) -> bytes:
+    """Content of a zlib stream of at most ``largest`` bytes.
+
+    Raises:
+        ValueError: It is larger or cut off.
+        zlib.error: It is damaged.
+    """
+    unpacker = zlib.decompressobj()
+    data = unpacker.decompress(packed, largest)
+    if not unpacker.eof:
+        raise ValueError(f"{len(packed)} bytes unpack to more than {largest}, or are cut off")
+    return data
 
 
 @contextmanager

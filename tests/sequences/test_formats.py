@@ -21,8 +21,8 @@ from layouts import (
     millimetres,
     nerfstudio,
     pose,
-    replica,
     realsense,
+    replica,
     scannet,
     seven_scenes,
     tum,
@@ -302,7 +302,7 @@ def test_rate_is_that_of_the_images_that_lie_there(tmp_path):
 def test_rate_of_timed_recordings_is_theirs(tmp_path):
     folder, _ = write(tum, tmp_path)
     assert open_sequence(folder).timed
-    with pytest.raises(DatasetError, match="has times of its own.* leave --fps out"):
+    with pytest.raises(DatasetError, match=r"has times of its own.* leave --fps out"):
         open_sequence(folder, fps=5)
 
 

@@ -14,6 +14,7 @@ from browsers import SOFTWARE, find_chromium
 from dudmap.viewing.report import write_report
 from dudmap.viewing.run_files import RunFiles
 from run_folders import write_run
+from security.hostile_runs import MARKUP, write_hostile_run
 
 playwright = pytest.importorskip("playwright.sync_api", reason="the package playwright is not installed")
 CHROMIUM = find_chromium()
@@ -74,6 +75,22 @@ def test_the_report_loads_offline_without_errors(report):
     assert report.errors == []
     assert [url for url in report.requests if not url.startswith(("file:", "data:", "blob:"))] == []
     assert report.page.text_content("#notice") == ""
+
+
+def test_a_report_of_a_hostile_run_runs_nothing_but_its_own_script(browser, tmp_path):
+    tab = Tab(browser)
+    page = write_report(write_hostile_run(tmp_path / "run"))
+    tab.page.goto(page.as_uri())
+    tab.page.wait_for_selector("html[data-ready=true]", timeout=30000)
+    assert tab.errors == []
+    assert tab.page.evaluate("window.harmed") is None
+    assert "<img src=x onerror" in tab.page.text_content("ul.cards ~ *, section h2 ~ ul")
+    # even markup that got through would run nothing
+    page.write_text(page.read_text(encoding="utf-8").replace("<header>", f"<header>{MARKUP}"), encoding="utf-8")
+    tab.page.goto(page.as_uri())
+    tab.page.wait_for_selector("html[data-ready=true]", timeout=30000)
+    assert tab.page.evaluate("window.harmed") is None
+    assert sum("Content Security Policy" in error for error in tab.errors) >= 2
 
 
 def test_the_report_draws_the_map(report):

@@ -79,7 +79,9 @@ def fail(sentence: str, code: int = 1) -> None:
     Raises:
         typer.Exit: Always.
     """
-    typer.echo(f"dudmap: {sentence}", err=True)
+    from dudmap.terminal import say
+
+    say(f"dudmap: {sentence}", err=True)
     raise typer.Exit(code)
 
 

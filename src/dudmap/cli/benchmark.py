@@ -12,6 +12,7 @@ from dudmap.benchmark.suites import SUITES
 from dudmap.cli.benchmark_gpu import gpu
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.progress import counted
+from dudmap.terminal import say
 
 app = typer.Typer(
     add_completion=False,
@@ -75,7 +76,7 @@ def _answer(tree: dict[str, Any], text: str, out: Path, *, as_json: bool) -> Non
 
 def _print_outcome(row: dict[str, Any]) -> None:
     outcome = row.get("error") or f"{row.get('tracked', row.get('frames'))} of {row.get('frames')} frames"
-    typer.echo(f"{row['sequence']}, {row['system']}: {outcome}", err=True)
+    say(f"{row['sequence']}, {row['system']}: {outcome}", err=True)
 
 
 @app.command()
@@ -143,7 +144,7 @@ def random(
 def _print_world(row: dict[str, Any]) -> None:
     ate = row.get("ate_rmse_m")
     figure = row.get("error") or "no ATE" if ate is None else f"{100 * ate:.2f} cm, {row['lost']} lost"
-    typer.echo(f"world {row['world']}: {figure}", err=True)
+    say(f"world {row['world']}: {figure}", err=True)
 
 
 @app.command()
@@ -180,7 +181,7 @@ def bias(
         pulls = measure_pulls(opened(), config, stride)
         found[name] = [{"term": pull.term, "mean": pull.mean, "spread": pull.spread} for pull in pulls]
         if not as_json:
-            typer.echo(f"{name}:\n\n{bias_table(pulls)}")
+            say(f"{name}:\n\n{bias_table(pulls)}")
     if as_json:
         answer({"corrections_mm_deg": found}, "", as_json=True)
 
@@ -234,20 +235,20 @@ def faults(
     config = Config().override(assignments or [])
     source = default_room(frames, width, seed) if recording is None else open_sequence(recording)
     lines, failed, rows = [table_head(source.name, frames)], 0, []
-    typer.echo(lines[0], err=as_json)
+    say(lines[0], err=as_json)
     for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], frames):
         lines.append(fault_row(run, clean))
         outcome = run.outcome(clean)
         rows.append({"fault": run.fault, "outcome": outcome, "rejected": run.rejected, "lost": run.lost})
         failed += outcome.startswith("FAILED")
-        typer.echo(lines[-1], err=as_json)
+        say(lines[-1], err=as_json)
     if as_json:
         answer({"recording": source.name, "frames": frames, "faults": rows}, "", as_json=True)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text("\n".join(lines) + "\n", encoding="utf-8")
     if failed:
-        typer.echo(f"dudmap: {failed} of {len(lines) - 1} streams failed; see the column outcome", err=True)
+        say(f"dudmap: {failed} of {len(lines) - 1} streams failed; see the column outcome", err=True)
         raise typer.Exit(1)
 
 
@@ -282,7 +283,7 @@ def gate(
     tree = {"failed": failed, "checks": [asdict(check) | {"passed": check.passed} for check in checks]}
     answer(tree, gates.verdict(checks), as_json=as_json)
     if failed:
-        typer.echo(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
+        say(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)
         raise typer.Exit(1)
 
 
@@ -359,7 +360,7 @@ def speed(
     figures = speed_figures(
         frames,
         long_frames if long else 0,
-        lambda what: typer.echo(f"measuring {what}", err=True),
+        lambda what: say(f"measuring {what}", err=True),
         find_open3d(open3d),
         recording,
     )

@@ -9,6 +9,7 @@ import typer
 
 from dudmap.atomic_file import write_text
 from dudmap.cli.output import JsonOption, answer
+from dudmap.terminal import say
 
 
 def gpu(
@@ -50,11 +51,11 @@ def gpu(
     for name, each in measurements.recordings(shapes, frames, recording or []):
         for step in steps:
             for one in measurements.devices(device):
-                typer.echo(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
+                say(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
                 rows.append(measurements.measure(name, each, frames, step, one))
         if python is not None:
             other = measurements.devices(device)[0].upper()
-            typer.echo(f"measuring {name}, Open3D's dense SLAM", err=True)
+            say(f"measuring {name}, Open3D's dense SLAM", err=True)
             rows += measurements.measure_open3d(python, name, each, frames, steps, "CPU:0" if other == "CPU" else other)
     text = measurements.table(rows)
     out.mkdir(parents=True, exist_ok=True)

@@ -48,11 +48,10 @@ def calibrate(
     Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
     the images do not prove stays as the files give it.
     """
-    from rich.console import Console
-
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.calibration import calibrate_sequence
     from dudmap.sequences import open_sequence
+    from dudmap.terminal import plain_console
 
     recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
@@ -64,12 +63,12 @@ def calibrate(
         evidence = {name: value for name, value in estimate.evidence.items() if value == value}
         answer(estimate.calibration.tree() | {"evidence": evidence, "gain": estimate.gain}, "", as_json=True)
         return
-    console = Console()
+    console = plain_console()
     console.print(table(given, estimate))
     for line in remarks(estimate):
-        console.print(line, highlight=False, soft_wrap=True)
+        console.print(line, soft_wrap=True)
     if out is not None:
-        console.print(f"written to {out}", highlight=False, soft_wrap=True)
+        console.print(f"written to {out}", soft_wrap=True)
 
 
 def table(given: "Calibration", estimate: "Estimate") -> "Table":

@@ -5,9 +5,11 @@ from typing import Annotated
 
 import typer
 
+from dudmap.terminal import plain_console, say
+
 app = typer.Typer(add_completion=False)
 
-MARKS = {"good": "[green]good[/]", "note": "[yellow]note[/]", "bad": "[red]bad [/]"}
+MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", "red")}
 
 
 @app.command()
@@ -24,19 +26,20 @@ def doctor(
     if licences:
         _print_licences(as_json)
         return
-    from rich.console import Console
+    from rich.text import Text
 
     from dudmap.doctor import checks
 
     found = list(checks())
     works = all(check.state != "bad" for check in found)
     if as_json:
-        typer.echo(json.dumps({"works": works, "checks": [check.tree() for check in found]}))
+        say(json.dumps({"works": works, "checks": [check.tree() for check in found]}))
     else:
-        console = Console(soft_wrap=True, highlight=False)
+        console = plain_console(soft_wrap=True)
         for check in found:
-            console.print(f"{MARKS[check.state]}  [bold]{check.name}[/]: ", end="")
-            console.print(check.found + (f" -> {check.mend}" if check.mend else ""), markup=False)
+            mark, style = MARKS[check.state]
+            console.print(Text.assemble((mark, style), "  ", (check.name, "bold"), ": "), end="")
+            console.print(check.found + (f" -> {check.mend}" if check.mend else ""))
         console.print("dudmap works here" if works else "dudmap does not work here before this is mended")
     if not works:
         raise typer.Exit(1)
@@ -47,7 +50,7 @@ def _print_licences(as_json: bool) -> None:
 
     rows = licences()
     if as_json:
-        typer.echo(json.dumps([{"package": r.package, "version": r.version, "licence": r.licence} for r in rows]))
+        say(json.dumps([{"package": r.package, "version": r.version, "licence": r.licence} for r in rows]))
         return
     for row in rows:
-        typer.echo(f"{row.package:<24} {row.version:<12} {row.licence}")
+        say(f"{row.package:<24} {row.version:<12} {row.licence}")

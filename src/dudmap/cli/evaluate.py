@@ -11,6 +11,7 @@ from typer.core import TyperGroup
 from dudmap.atomic_file import write_text
 from dudmap.cli.output import JsonOption
 from dudmap.errors import ConfigError, DatasetError, DudmapError
+from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from dudmap.evaluation.trajectory import Align
@@ -267,18 +268,19 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
     except OSError as error:
         raise DudmapError(f"cannot write {file}: {error.strerror or error}; name a folder with --out") from error
     if as_json:
-        typer.echo(text)
+        say(text)
         return
-    from rich.console import Console
     from rich.table import Table
+
+    from dudmap.terminal import plain_console
 
     table = Table(title=title, show_header=False)
     for key, value in figures.items():
         if value is not None and not isinstance(value, list | dict):
             table.add_row(key, f"{value:.6g}" if isinstance(value, float) else str(value))
-    console = Console()
+    console = plain_console()
     console.print(table)
-    console.print("written: " + ", ".join(str(path) for path in [file, *pictures]), soft_wrap=True, highlight=False)
+    console.print("written: " + ", ".join(str(path) for path in [file, *pictures]), soft_wrap=True)
 
 
 def _rounded(value: float, digits: int = 9) -> float | None:

@@ -32,12 +32,12 @@ def info(
     Warnings name what looks wrong: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are
     read.
     """
-    from rich.console import Console
     from rich.table import Table
 
     from dudmap.pipeline.contact_sheet import save_overview
     from dudmap.pipeline.inspection import inspect, sample
     from dudmap.sequences import open_sequence
+    from dudmap.terminal import plain_console
 
     recording = open_sequence(path, camera, fps, depth_unit, topics=topics)
     frames, unreadable = sample(recording)
@@ -47,15 +47,15 @@ def info(
     if as_json:
         answer(found.tree(), "", as_json=True)
         return
-    console = Console()
+    console = plain_console()
     table = Table.grid(padding=(0, 2))
     for row in rows(found):
         table.add_row(*row)
-    console.print(table, highlight=False)
+    console.print(table)
     for warning in found.warnings:
-        console.print(f"warning: {warning}", highlight=False, soft_wrap=True, markup=False)
+        console.print(f"warning: {warning}", soft_wrap=True)
     if sheet is not None:
-        console.print(f"written to {sheet}", highlight=False, soft_wrap=True)
+        console.print(f"written to {sheet}", soft_wrap=True)
 
 
 def rows(found: "Inspection") -> list[tuple[str, str]]:

@@ -7,6 +7,7 @@ import typer
 
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import QuietOption, free_folder
+from dudmap.terminal import say
 
 app = typer.Typer(add_completion=False)
 
@@ -51,12 +52,12 @@ def merge(
 
         def note(sentence: str) -> None:
             if not (quiet or as_json):
-                typer.echo(sentence, err=True)
+                say(sentence, err=True)
 
         fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=workers, note=note)
         found = fleet.tree
         for sentence in fleet.sentences:
-            typer.echo(f"dudmap: {sentence}", err=True)
+            say(f"dudmap: {sentence}", err=True)
         text = (
             f"{len(found['runs'])} of {len(runs)} runs joined: {found['map_blocks']} blocks in {len(found['ranges'])} "
             f"parts, {found['tiles']} tiles\nwritten to {fleet.out}"

@@ -7,15 +7,17 @@ from typing import Annotated, Any
 
 import typer
 
+from dudmap.terminal import say
+
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
 
 
 def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
     """Print the result of a command to stdout: as one JSON object, as text, or not at all."""
     if as_json:
-        typer.echo(json.dumps(plain(tree), allow_nan=False))
+        say(json.dumps(plain(tree), allow_nan=False))
     elif not quiet:
-        typer.echo(text)
+        say(text)
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds

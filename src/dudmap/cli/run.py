@@ -8,6 +8,7 @@ import typer
 from dudmap.cli.output import JsonOption, answer, parameter_names, preset_names
 from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
+from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from dudmap.config import Config
@@ -232,7 +233,7 @@ def _resume(
 
 
 def _print_notice(text: str) -> None:
-    typer.echo(text, err=True)
+    say(text, err=True)
 
 
 def read_config(file: Path | None, preset: str | None, assignments: list[str]) -> "Config":
@@ -274,10 +275,9 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
     if as_json:
         answer(metrics, "", as_json=True)
     elif not quiet:
-        from rich.console import Console
-
         from dudmap.pipeline.progress import summary
+        from dudmap.terminal import plain_console
 
-        console = Console()
+        console = plain_console()
         console.print(summary(metrics))
-        console.print(f"written to {out}", highlight=False, soft_wrap=True)
+        console.print(f"written to {out}", soft_wrap=True)

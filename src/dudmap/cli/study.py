@@ -8,6 +8,7 @@ from typer.core import TyperGroup
 
 from dudmap.cli.output import JsonOption, answer
 from dudmap.extras import STUDY, need
+from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -143,4 +144,4 @@ def _executor(jobs: int, cluster: str) -> "Executor":
 
 def _shown_with(price: float) -> "Callable[[Progress], None]":
     """Function that shows the progress with its cost at a price per core-hour."""
-    return lambda progress: typer.echo(progress.describe(price), err=True)
+    return lambda progress: say(progress.describe(price), err=True)

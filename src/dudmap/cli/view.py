@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dudmap.errors import DudmapError
+from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from dudmap.pipeline.observer import RunObserver
@@ -39,7 +40,7 @@ def view(
     from dudmap.viewing.stored_view import open_run
 
     window = open_run(run, host, port, token)
-    typer.echo(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)
+    say(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)
     _wait()
     window.stop()
 
@@ -79,7 +80,7 @@ def observers(
             live_view = LiveView(window)
             stack.callback(live_view.close)
             watching.append(live_view)
-            typer.echo(f"{window.url} shows the run {window.access.notice}", err=True)
+            say(f"{window.url} shows the run {window.access.notice}", err=True)
         try:
             yield tuple(watching)
         except (DudmapError, OSError, typer.Exit):
@@ -87,7 +88,7 @@ def observers(
         except Exception as error:  # a defect of ours, whatever it is
             raise report_crash(error, events.out or Path.cwd(), events.recent) from error
         if page is not None and sys.stdin.isatty():
-            typer.echo("the page stays open; ctrl-C ends it", err=True)
+            say("the page stays open; ctrl-C ends it", err=True)
             _wait()
 
 

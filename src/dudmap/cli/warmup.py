@@ -22,16 +22,16 @@ def warmup(
     """
     from contextlib import nullcontext
 
-    from rich.console import Console
+    from dudmap.terminal import plain_console
 
-    console = Console(stderr=True, quiet=quiet or as_json)
+    console = plain_console(stderr=True, quiet=quiet or as_json)
     taken: dict[str, float] = {}
     for name, step in steps():
         with console.status(name) if console.is_terminal else nullcontext():
             begin = time.perf_counter()
             step()
         taken[name] = round(time.perf_counter() - begin, 3)
-        console.print(f"{name}: {taken[name]:.1f} s", highlight=False)
+        console.print(f"{name}: {taken[name]:.1f} s")
     total = sum(taken.values())
     answer({"seconds": total, "steps": taken}, f"ready after {total:.1f} s", as_json=as_json, quiet=quiet)
 

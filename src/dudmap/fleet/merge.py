@@ -1,6 +1,7 @@
 """Merging of many run folders into worlds: maps by range, tiles, trajectories, and a report."""
 
 import json
+import re
 import shutil
 import time
 from collections.abc import Callable, Sequence
@@ -20,16 +21,23 @@ from dudmap.fleet.registration import RegisteredPair
 from dudmap.fleet.rounds import registered_runs
 from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
+from dudmap.input_files import DAMAGE, describe, read_json
 from dudmap.mapping import morton
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging.block_sums import MAX_COUNT, VOXELS
 from dudmap.merging.map_fusion import FusedRange, joined
 from dudmap.merging.map_samples import sample_map
 from dudmap.merging.run_graph import RunGraph
+from dudmap.own_folder import remove_files
 from dudmap.pipeline.merge import run_trajectories
 
 WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
 WORK_FOLDER = ".work"
+WRITTEN = {
+    "": rf"{re.escape(WORLD_FILE)}|{re.escape(TILESET_FILE)}|trajectory(-\d+)?\.txt",
+    MAP_FOLDER: r"[0-9a-f]{13}\.npz", TILE_FOLDER: r"[\w-]+\.glb", WORK_FOLDER: r"[\w-]+\.ply",
+}  # fmt: skip
+"""Names of all files of a world by sub-folder, as regular expressions. They are removed before the next merge."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -130,15 +138,20 @@ def read_world(world: str | Path) -> dict[str, Any]:
     """Content of world.json.
 
     Raises:
-        MapError: It is missing or of another version.
+        MapError: It is missing, damaged or of another version, or names files that are not its own.
     """
     path = Path(world) / WORLD_FILE
     try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError) as error:
-        raise MapError(f"{world} holds no world of `dudmap merge`: {error}") from error
-    if tree.get("format") != FORMAT:
-        raise MapError(f"{path} has the format {tree.get('format')!r}; this version reads {FORMAT!r}")
+        tree = read_json(path)
+        if tree.get("format") != FORMAT:
+            raise MapError(f"{path} has the format {tree.get('format')!r}; this version reads {FORMAT!r}")
+        for one in tree["ranges"]:
+            if not re.fullmatch(f"{MAP_FOLDER}/{WRITTEN[MAP_FOLDER]}", one["file"]):
+                raise ValueError(f"it names a map file {one['file']!r}; expected one of the folder {MAP_FOLDER}")
+            if np.array([one["low_m"], one["high_m"]], float).shape != (2, 3):
+                raise ValueError(f"the corners of {one['file']} are no two points")
+    except DAMAGE as error:
+        raise MapError(f"{world} holds no world of `dudmap merge`: {describe(error)}") from error
     return tree
 
 
@@ -186,13 +199,15 @@ def _check_out(out: Path) -> None:
         if out.exists() and any(out.iterdir()):
             if not (out / WORLD_FILE).is_file():
                 raise DudmapError(f"{out} is not empty and holds no world of `dudmap merge`; name another folder")
-            for name in (MAP_FOLDER, TILE_FOLDER, WORK_FOLDER, *(path.name for path in out.glob("part-[0-9]*"))):
-                shutil.rmtree(out / name, ignore_errors=True)
-            for path in (out / WORLD_FILE, out / TILESET_FILE, *out.glob("trajectory*.txt")):
-                path.unlink(missing_ok=True)
+            parts = ["", *(path.name for path in out.iterdir() if re.fullmatch(r"part-\d+", path.name))]
+            places = {f"{part}/{name}".strip("/"): form for part in parts for name, form in WRITTEN.items()}
+            remove_files(out, places)
+            for name in sorted(places, reverse=True):  # what a folder holds before the folder
+                if name and (out / name).exists():
+                    (out / name).rmdir()
         out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise DudmapError(f"cannot write the world to {out}: {error.strerror or error}") from error
+        raise DudmapError(f"cannot write the world to {out}: {error}") from error
 
 
 def _load_kernels(like: MapHeader) -> None:

@@ -1,6 +1,7 @@
 """Merging of run folders: two saved maps of one place become one run folder."""
 
 import json
+import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -8,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from dudmap.atomic_file import write_bytes, write_text
-from dudmap.errors import DudmapError, MapError
+from dudmap.errors import DatasetError, DudmapError, MapError
 from dudmap.geometry.trajectory import Trajectory
+from dudmap.input_files import damaged, read_bytes, read_json
 from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
 from dudmap.pipeline.run_folder import prepare_run_folder
 from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
@@ -62,7 +64,7 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     mesh = merged.volume.extract_mesh()
     mesh.save(out / "mesh.ply")
     if (a / "config.toml").is_file():
-        write_bytes(out / "config.toml", (a / "config.toml").read_bytes())
+        write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
     tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
     tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
     tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
@@ -73,9 +75,16 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
 
 
 def run_trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
-    """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several."""
+    """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several.
+
+    Raises:
+        DatasetError: One of them, or the list of them in merge.json, is damaged.
+    """
     names = ["trajectory.txt"]
     if (folder / MERGE_FILE).is_file():
-        names = json.loads((folder / MERGE_FILE).read_text(encoding="utf-8"))["trajectories"]
+        with damaged(DatasetError, folder / MERGE_FILE):
+            names = read_json(folder / MERGE_FILE)["trajectories"]
+            if not all(re.fullmatch(r"trajectory(-\d+)?\.txt", name) for name in names):
+                raise ValueError(f"it names {names} as its trajectories")
     found = [Trajectory.load(folder / name) for name in names]
     return [Trajectory(one.timestamps, T @ one.Ts_world_camera) for one in found]

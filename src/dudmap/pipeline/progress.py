@@ -5,9 +5,11 @@ from collections import deque
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
+
+from dudmap.terminal import plain_console
 
 if TYPE_CHECKING:
     from dudmap.result import FrameResult
@@ -24,7 +26,7 @@ class RunProgress:
     """
 
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
-        self.console = Console(stderr=True)
+        self.console = plain_console(stderr=True)
         self._bar = Progress(
             TextColumn("frame"),
             MofNCompleteColumn(),
@@ -74,7 +76,7 @@ class RunProgress:
 
     def note(self, sentence: str) -> None:
         """Print a sentence above the bar."""
-        self.console.print(sentence, style="yellow", markup=False, highlight=False, soft_wrap=True)
+        self.console.print(sentence, style="yellow", soft_wrap=True)
 
     def once(self, sentence: str) -> None:
         """Print a sentence above the bar unless it was printed before."""
@@ -97,7 +99,7 @@ def summary(metrics: dict[str, Any]) -> Table:
     for key in counts:
         value = metrics[key]
         bad = key in ("lost", "unreadable") and value
-        table.add_row(f"  {key.replace('_', ' ')}", f"[red]{value}[/]" if bad else str(value))
+        table.add_row(f"  {key.replace('_', ' ')}", Text(str(value), "red" if bad else ""))
     if "dropped" in metrics:
         table.add_row("  dropped", str(metrics["dropped"]))
         table.add_row("latency, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))

@@ -1,6 +1,8 @@
 """The run folder: creation, cleaning and writing of all result files."""
 
 import json
+import os
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
@@ -18,6 +20,7 @@ from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.mesh_pieces import save_pieces
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.gpu.device import resolve
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.storing import FILES as STATE_FILES
@@ -35,16 +38,20 @@ FILES = (
     "checks.csv", "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz",
     "merge.json", "report.html",
 )  # fmt: skip
-PARTS = (
-    "trajectory-[0-9]*.txt", "mesh-[0-9]*.ply", "movers/[0-9]*.ply", "movers/[0-9]*.txt", "thumbnails/*.jpg",
-    "crash-[0-9]*.txt",
-)  # fmt: skip
-"""Patterns of further files of a run, which are removed before the next run as well."""
+PROBE = ".dudmap-probe"
+"""File that is made and removed to see whether the folder can be written."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
 )  # fmt: skip
-"""Files of `dudmap evaluate` in a run folder, which are removed before the next run."""
+"""Files of `dudmap evaluate` in a run folder."""
+WRITTEN = {
+    "": "|".join((
+        *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
+    )),
+    "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
+}  # fmt: skip
+"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +73,7 @@ def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
     """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
     import cv2
 
-    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False)
+    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False, own=True)
 
 
 @contextmanager
@@ -78,16 +85,26 @@ def locked(out: Path) -> Iterator[None]:
     Raises:
         DudmapError: Another process writes into the folder, or it cannot be created or written.
     """
-    try:
+    with _writing_into(out):
         out.mkdir(parents=True, exist_ok=True)
         lock = RunLock(out)
+    with lock:
+        with _writing_into(out):
+            remove_files(out, dict.fromkeys(WRITTEN, UNFINISHED))
+        yield
+
+
+@contextmanager
+def _writing_into(out: Path) -> Iterator[None]:
+    """Say that it is the run folder that cannot be written.
+
+    Raises:
+        DudmapError: Instead of any error of the operating system.
+    """
+    try:
+        yield
     except OSError as error:
         raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
-    with lock:
-        for folder in (out, *(out / name for name in ("masks", "movers", "thumbnails"))):
-            for path in folder.glob(UNFINISHED):
-                path.unlink(missing_ok=True)
-        yield
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
@@ -102,21 +119,14 @@ def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool)
         )
     if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
         raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
-    try:
+    with _writing_into(out):
         out.mkdir(parents=True, exist_ok=True)
-        probe = out / ".dudmap-probe"
-        probe.touch()
-        probe.unlink()
-        for name in FILES + SCORES + STATE_FILES:
-            (out / name).unlink(missing_ok=True)
-        for mask in (out / "masks").glob("*.png"):
-            mask.unlink()
-        for part in (path for pattern in PARTS for path in out.glob(pattern)):
-            part.unlink()
+        with OwnFolder(out, linked=True) as folder:
+            os.close(folder.create(PROBE))
+            folder.remove(PROBE)
+        remove_files(out, WRITTEN)
         if save_masks:
-            (out / "masks").mkdir(exist_ok=True)
-    except OSError as error:
-        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+            make_folder(out / "masks")
 
 
 def write_run_folder(
@@ -217,7 +227,7 @@ def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, 
     for obj in objects:
         row = {"id": obj.id, "rigid": obj.rigid, "why_not": obj.reason or None, "frames": obj.frames}
         if obj.mesh is not None and obj.trajectory is not None:
-            folder.mkdir(exist_ok=True)
+            make_folder(folder)
             obj.mesh.save(folder / f"{obj.id}.ply")
             obj.trajectory.save(folder / f"{obj.id}.txt")
             row["mesh_triangles"] = len(obj.mesh.faces)

@@ -1,6 +1,6 @@
 """The state of a run in its folder: what is stored, when, and what a continued run finds there."""
 
-import json
+import re
 import sqlite3
 from dataclasses import dataclass
 from datetime import datetime
@@ -8,6 +8,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import DudmapError, StateError
+from dudmap.input_files import DAMAGE, read_json
+from dudmap.own_folder import remove_files
 from dudmap.pipeline.environment import versions
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.state.checkpoints import Checkpoints
@@ -98,7 +100,7 @@ class RunStore:
     def __init__(self, out: Path, every: float | None, notice: "Callable[[str], None]") -> None:
         try:
             self.database = StateDatabase(out / DATABASE)
-        except sqlite3.Error as error:
+        except (OSError, sqlite3.Error) as error:
             raise DudmapError(f"the state of the run cannot be stored in {out / DATABASE}: {error}") from error
         self.checkpoints = Checkpoints(self.database, every, notice)
         self._out, self._every, self._notice = out, every, notice
@@ -144,8 +146,7 @@ class RunStore:
         """Close the database, and remove it where the run is finished, so that only its results remain."""
         self.checkpoints.close()
         if finished:
-            for name in FILES:
-                (self._out / name).unlink(missing_ok=True)
+            remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
 
 
 def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
@@ -205,9 +206,9 @@ def _position(state: RunState, frame: "Frame | Exception") -> dict[str, Any]:
 def _why_nothing(out: Path) -> str:
     """Sentence on why a folder holds no run that can be continued."""
     try:
-        metrics = json.loads((out / "metrics.json").read_text(encoding="utf-8"))
+        metrics = read_json(out / "metrics.json")
         if metrics["complete"]:
             return f"the run in {out} is finished ({metrics['frames']} frames); there is nothing to resume"
-    except (OSError, ValueError, KeyError, TypeError):
+    except DAMAGE:
         pass
     return f"{out} holds no state of a run ({DATABASE}); expected the folder of an interrupted dudmap run"

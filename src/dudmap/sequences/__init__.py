@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
+from dudmap.errors import DatasetError, printable
 from dudmap.input_files import damaged
 
 if TYPE_CHECKING:
@@ -199,7 +199,8 @@ def open_sequence(
             recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
         if fps is not None:
             recording.set_rate(fps)
-        return recording
+    recording.name = printable(recording.name)
+    return recording
 
 
 def _option(name: str) -> str:

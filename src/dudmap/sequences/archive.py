@@ -1,7 +1,10 @@
 """Recordings in archives: unpacked once into a cache, with everything refused that an image sequence does not need."""
 
+import bz2
 import errno
+import gzip
 import hashlib
+import lzma
 import os
 import shutil
 import stat
@@ -15,13 +18,17 @@ from pathlib import Path, PurePosixPath
 from typing import IO, NamedTuple
 
 from dudmap.errors import DatasetError
-from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged, open_plain
+from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged, open_plain, read_bytes
 
 SUFFIXES = (".zip", ".tar", ".tgz", ".tar.gz", ".tar.bz2", ".tbz2", ".tar.xz", ".txz")
 LARGEST_BYTES = 256 * 2**30
 """Largest unpacked size. The largest recording of the data sets that are read (a CoRBS scene) has less than 30 GB."""
 LARGEST_COUNT = 1_000_000
 """Largest number of members, 4.6 hours of colour and depth files at 30 frames a second."""
+LARGEST_HEADER = 2**20
+"""Largest header of a member of a tar archive with what extends it, bytes: a long name and its times have 10 kB."""
+LARGEST_DICTIONARY = 2**27
+"""Largest memory for unpacking xz, bytes; the preset 9 needs 65 MB."""
 CHUNK = 2**20
 ORIGIN = "origin.txt"
 """File beside the unpacked folder that names the archive."""
@@ -76,11 +83,11 @@ def unpack(path: Path) -> Path:
         with tempfile.TemporaryDirectory(dir=cache_folder(), prefix="unfinished-") as unfinished:
             content = Path(unfinished) / "place" / stem(path)
             _unpack_into(path, content, status.st_size)
-            (content.parent / ORIGIN).write_text(str(path.resolve()), encoding="utf-8")
+            (content.parent / ORIGIN).write_bytes(os.fsencode(path.resolve()))
             _publish(content.parent, place)
     except (zipfile.BadZipFile, tarfile.TarError, RuntimeError, *DAMAGE) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
-            raise
+            raise OSError(error.errno, error.strerror, str(cache_folder())) from error
         raise DatasetError(f"cannot unpack {path}: {error}") from error
     return folder
 
@@ -98,7 +105,7 @@ def origin(path: Path) -> Path | None:
     """Archive that a folder was unpacked from; None if it was not."""
     for parent in path.resolve().parents:
         if (parent / ORIGIN).is_file() and cache_folder().resolve() == parent.parent:
-            return Path((parent / ORIGIN).read_text(encoding="utf-8"))
+            return Path(os.fsdecode(read_bytes(parent / ORIGIN)))
     return None
 
 
@@ -172,7 +179,42 @@ def _zip_members(path: Path) -> "Generator[Member]":
 
 
 def _tar_members(path: Path) -> "Generator[Member]":
-    with tarfile.open(path, "r|*") as archive:
-        for info in archive:
-            kind = "folder" if info.isdir() else "file" if info.isreg() else "link or device"
-            yield Member(info.name, kind, partial(archive.extractfile, info))
+    with open_plain(path) as file, _unpacked(file) as content:
+        bounded = _Bounded(content)
+        with tarfile.open(fileobj=bounded, mode="r|") as archive:
+            while (info := archive.next()) is not None:
+                kind = "folder" if info.isdir() else "file" if info.isreg() else "link or device"
+                bounded.left = info.size + LARGEST_HEADER
+                yield Member(info.name, kind, partial(archive.extractfile, info))
+                bounded.left = LARGEST_HEADER
+
+
+def _unpacked(file: IO[bytes]) -> IO[bytes]:
+    """Content of a file that may be packed, which is found by its first bytes."""
+    start = file.read(6)
+    file.seek(0)
+    if start.startswith(b"\x1f\x8b"):
+        return gzip.GzipFile(fileobj=file)
+    if start.startswith(b"BZh"):
+        return bz2.BZ2File(file)
+    if start.startswith((b"\xfd7zXZ\0", b"]\0\0\x80", b"]\0\0\0")):
+        # a dictionary that is declared larger than that of any preset is refused before memory is taken for it
+        lzma.LZMADecompressor(memlimit=LARGEST_DICTIONARY).decompress(file.read(CHUNK), max_length=1)
+        file.seek(0)
+        return lzma.LZMAFile(file)
+    return file
+
+
+class _Bounded:
+    """A stream that ends with an error where the headers of one member take more than ``LARGEST_HEADER`` bytes."""
+
+    def __init__(self, content: IO[bytes]) -> None:
+        self._content, self.left = content, LARGEST_HEADER
+
+    def read(self, size: int) -> bytes:
+        """At most ``size`` bytes, which the library keeps until a header is whole."""
+        data = self._content.read(size)
+        self.left -= len(data)
+        if self.left < 0:
+            raise tarfile.ReadError(f"the headers of a member have more than {LARGEST_HEADER / 1e6:.0f} MB")
+        return data

@@ -11,6 +11,7 @@ import sqlite3
 import weakref
 import zlib
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -19,9 +20,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import StateError
+from dudmap.input_files import LARGEST_FILE, LARGEST_RATIO, LARGEST_TREE, RATIO_FREE_BYTES, inflated, parse_json
 from dudmap.mapping.block_pager import Region
 from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
 from dudmap.mapping.voxel_blocks import BlockRecords
+from dudmap.own_folder import OwnFolder
 from dudmap.places.frame_store import EncodedFrame
 from dudmap.state.block_keys import MAP_SHIFT
 from dudmap.state.blocks import VOXELS, MapSnapshot, StoredMaps
@@ -33,6 +36,9 @@ APPLICATION = 0x44554453
 SCHEMA = 2
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
+STEPS, LIMIT = 10_000, 100_000
+"""Instructions of SQLite between two looks at ctrl-C, and looks after which a statement is ended; a row takes 10 to
+50 instructions."""
 ROWS = 4096
 """Blocks that are read at once."""
 TABLES = """
@@ -58,16 +64,20 @@ class StateDatabase:
         maps, frames: Know what is in the database.
 
     Raises:
-        sqlite3.Error: The file cannot be created or opened.
+        OSError: The file is a link or anything but a plain file.
+        sqlite3.Error: It cannot be created or opened.
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.maps, self.frames = StoredMaps(), StoredFrames()
+        with OwnFolder(path.parent, linked=True) as folder:
+            folder.check(path.name, alone=True)  # it is written in place
         self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
         self._chunks: set[str] = set()
         self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
         weakref.finalize(self, self._connection.close)
+        self._execute("PRAGMA trusted_schema = OFF")
         self._execute("PRAGMA journal_mode = WAL")
         self._execute("PRAGMA synchronous = FULL")  # a commit is on the disk when it returns
         if not self._execute("SELECT 1 FROM sqlite_master").fetchone():
@@ -185,10 +195,18 @@ class StateReader:
         self.path = path
         if not path.is_file():
             raise StateError(f"there is no state of a run at {path}")
+        if path.with_name(f"{path.name}-journal").exists():  # SQLite would do what is in it, also to other files
+            raise StateError(f"there is a {path.name}-journal beside {path}, which no run leaves; remove it")
+        _check_size(path)
+        self._left = 0
         try:
             self._connection = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True, timeout=5,
                                                isolation_level=None, check_same_thread=False)  # fmt: skip
             weakref.finalize(self, self._connection.close)
+            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_FILE)
+            self._connection.set_progress_handler(self._is_too_long, STEPS)
+            for safety in ("trusted_schema = OFF", "cell_size_check = ON"):
+                self._connection.execute(f"PRAGMA {safety}")
             self._connection.execute("BEGIN")  # one state for all that is read
             found = [self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in _HEADER]
         except sqlite3.Error as error:
@@ -197,6 +215,8 @@ class StateReader:
             raise StateError(f"{path} is not the state of a run")
         if found[1] != SCHEMA:
             raise StateError(f"{path} was written in version {found[1]} of the format; this version reads {SCHEMA}")
+        if list(self._rows(_TABLES_OF)) != _own_tables() or list(self._rows("PRAGMA quick_check(1)")) != [("ok",)]:
+            raise StateError(f"{path} is damaged or not of this program: its tables are not those of a state")
 
     def meta(self) -> dict[str, Any]:
         """What describes the run, by name.
@@ -219,11 +239,12 @@ class StateReader:
         try:
             if zlib.crc32(packed) != crc:
                 raise ValueError("its checksum is wrong")
-            described = json.loads(zlib.decompress(packed))
+            described = parse_json(inflated(packed, LARGEST_TREE), exact=True)
             chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
             arrays = [_array(about, chunks) for about in described["arrays"]]
             texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
-            return described["tree"], arrays, [[json.loads(line) for line in text.splitlines()] for text in texts]
+            records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
+            return described["tree"], arrays, records
         except (ValueError, KeyError, TypeError, zlib.error, RecursionError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
 
@@ -293,13 +314,41 @@ class StateReader:
         self._connection.close()
 
     def _rows(self, statement: str, *values: object) -> Iterable[Sequence[Any]]:
+        self._left = LIMIT
         try:
             yield from self._connection.execute(statement, values)
         except (sqlite3.Error, UnicodeDecodeError) as error:
+            if "interrupted" in str(error) and self._left > 0:  # what ctrl-C raises in the handler ends here
+                raise KeyboardInterrupt from None
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+
+    def _is_too_long(self) -> bool:
+        """Whether a statement must end; called by SQLite, so that ctrl-C is heard."""
+        self._left -= 1
+        return self._left <= 0
 
 
 _HEADER = "application_id", "user_version"
+_TABLES_OF = "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name"
+
+
+def _own_tables() -> list[tuple[str, ...]]:
+    """What ``_TABLES_OF`` finds in a new database."""
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(TABLES)
+        return list(connection.execute(_TABLES_OF))
+
+
+def _check_size(path: Path) -> None:
+    """Refuse a file that is much larger than what of it is on the disk.
+
+    Raises:
+        StateError: It is.
+    """
+    status = path.stat()
+    stored = 512 * getattr(status, "st_blocks", status.st_size)
+    if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):
+        raise StateError(f"{path} is damaged or not of this program: {stored} of its {status.st_size} bytes are there")
 
 
 def _region_rows(records: BlockRecords) -> Iterable[list[Any]]:
@@ -347,6 +396,6 @@ def _checked(key: str, content: bytes) -> bytes:
 
 def _parsed(text: str, path: Path) -> Any:  # noqa: ANN401
     try:
-        return json.loads(text)
-    except (ValueError, TypeError, RecursionError) as error:
+        return parse_json(text, exact=True)
+    except (ValueError, TypeError, AttributeError) as error:
         raise StateError(f"the state of the run in {path} is damaged: {error}") from error

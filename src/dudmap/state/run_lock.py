@@ -9,6 +9,7 @@ from types import TracebackType
 from typing import IO
 
 from dudmap.errors import DudmapError
+from dudmap.own_folder import OwnFolder
 
 NAME = ".lock"
 BYTE = 1 << 20
@@ -23,34 +24,43 @@ class RunLock:
 
     Raises:
         DudmapError: Another process, or another run of this one, holds the lock; the sentence says which.
-        OSError: The file cannot be written.
+        OSError: The file cannot be written, or is a link or anything but a plain file.
     """
 
     def __init__(self, folder: Path) -> None:
-        self.path = folder / NAME
-        while True:
-            self._file: IO[bytes] = os.fdopen(os.open(self.path, os.O_RDWR | os.O_CREAT, 0o644), "r+b")
-            try:
-                _lock(self._file)
-            except OSError:
-                holder = self._file.read(1000).decode(errors="replace")
-                self._file.close()
-                raise DudmapError(
-                    f"{folder} is in use by {_described(holder)}; wait for it, end it, or name another folder"
-                ) from None
-            if self.path.exists() and os.path.samestat(os.fstat(self._file.fileno()), self.path.stat()):
-                break
-            self._file.close()  # whoever held it has removed this file in between
+        self._folder = OwnFolder(folder, linked=True)
+        try:
+            self._file = self._locked(folder)
+        except BaseException:
+            self._folder.close()
+            raise
         about = {"pid": os.getpid(), "host": socket.gethostname(), "since": datetime.now().isoformat(" ", "seconds")}
         self._file.truncate(0)
         self._file.write(json.dumps(about).encode())
         self._file.flush()
 
+    def _locked(self, folder: Path) -> IO[bytes]:
+        while True:
+            file = os.fdopen(self._folder.open(NAME, os.O_RDWR | os.O_CREAT), "r+b")
+            try:
+                _lock(file)
+            except OSError:
+                holder = file.read(1000).decode(errors="replace")
+                file.close()
+                raise DudmapError(
+                    f"{folder} is in use by {_described(holder)}; wait for it, end it, or name another folder"
+                ) from None
+            there = self._folder.status(NAME)
+            if there is not None and os.path.samestat(os.fstat(file.fileno()), there):
+                return file
+            file.close()  # whoever held it has removed this file in between
+
     def close(self) -> None:
         """Give the lock up and remove its file."""
         if os.name == "posix":
-            self.path.unlink(missing_ok=True)
+            self._folder.remove(NAME)
         self._file.close()
+        self._folder.close()
 
     def __enter__(self) -> "RunLock":
         return self

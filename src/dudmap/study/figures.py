@@ -154,6 +154,6 @@ def screening_figure(effects: Table, keys: Sequence[str], heading: str) -> bytes
         ax.axvline(0, color="0.7", lw=0.8, zorder=0)
         ax.set_yticks(y, keys if ax is axes[0][0] else [""] * len(keys), fontsize=7)
         ax.tick_params(axis="x", labelsize=7)
-        ax.set_title(recording, fontsize=8)
+        ax.set_title(recording, fontsize=8, parse_math=False)
     figure.supxlabel(f"effect on {heading}", fontsize=8)
     return png(figure)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.errors import printable
 from dudmap.evaluation.plots import draw_residuals
 from dudmap.viewing.run_files import RunFiles
 
@@ -55,7 +56,7 @@ def _times(run: RunFiles) -> str:
     highest = 1.3 * max(float(np.percentile(np.sum([curve[1] for curve in curves], axis=0), 95)), 1e-3)
     with _drawing("times") as (figure, picture):
         axes = figure.subplots()
-        labels = [f"{stage}: {times[stage].mean():.1f} ms" for stage in ranked]
+        labels = [f"{printable(stage)[:30]}: {times[stage].mean():.1f} ms" for stage in ranked]
         axes.stackplot(curves[0][0], *(curve[1] for curve in curves), labels=labels, linewidth=0)
         axes.set(xlabel="time, s", ylabel="ms per frame", xlim=_limits(t), ylim=(0, highest))
         handles, names = axes.get_legend_handles_labels()
@@ -125,7 +126,13 @@ def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
     from matplotlib.figure import Figure
 
     picture: list[str] = []
-    style = {"svg.fonttype": "none", "svg.hashsalt": name, "font.size": 9, "font.family": "sans-serif"}
+    style = {
+        "svg.fonttype": "none",
+        "svg.hashsalt": name,
+        "font.size": 9,
+        "font.family": "sans-serif",
+        "text.parse_math": False,
+    }
     with matplotlib.rc_context(rc=cast("Any", style)):
         figure = Figure(figsize=(7.2, 2.8), layout="constrained")
         FigureCanvasSVG(figure)

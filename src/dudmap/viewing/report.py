@@ -3,7 +3,6 @@
 import base64
 import json
 import re
-from html import escape
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,11 @@ import numpy as np
 
 from dudmap import __version__
 from dudmap.atomic_file import write_text
-from dudmap.errors import DudmapError
+from dudmap.errors import DudmapError, printable
 from dudmap.geometry import se3
 from dudmap.geometry.mesh_simplification import simplified
+from dudmap.input_files import damaged
+from dudmap.viewing.markup import Html, html, joined, script_source
 from dudmap.viewing.packed_mesh import packed
 from dudmap.viewing.plots import plots
 from dudmap.viewing.run_files import RunFiles
@@ -25,6 +26,8 @@ TRIANGLES = 200_000
 """Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
 POSES = 5000
 """Poses in the page; those of a longer run are thinned evenly."""
+POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
+"""Content security policy: the page's own scripts by their hashes, its styles and pictures, and nothing else."""
 LISTED = 200
 """Lost or unreadable frames that are listed one by one."""
 CARDS = {
@@ -53,7 +56,9 @@ def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
         DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
     """
     path = Path(out) if out is not None else Path(folder) / REPORT
-    page = report_page(RunFiles.load(folder))
+    run = RunFiles.load(folder)
+    with damaged(DudmapError, f"the run folder {folder}"):
+        page = report_page(run)
     try:
         write_text(path, page)
     except OSError as error:
@@ -65,26 +70,29 @@ def report_page(run: RunFiles) -> str:
     """HTML text of the report."""
     found = run.mesh
     about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
+    license, three, script = (_asset(name) for name in ("three.LICENSE.txt", "three.min.js", "report.js"))
+    library = f"\n/* three.js\n{license}*/\n{three}"
     parts = {
+        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
         "version": __version__,
-        "title": escape(str(run.metrics.get("sequence") or run.folder.name)),
-        "verdict": escape(_verdict(run.metrics)),
+        "title": printable(run.metrics.get("sequence") or run.folder.name),
+        "verdict": _verdict(run.metrics),
         "cards": _cards(run.metrics),
         "strips": _strip(run),
         "losses": _losses(run.metrics),
-        "plots": "".join(
-            f"<figure>{svg}<figcaption>{escape(t)}</figcaption></figure>" for t, svg in plots(run).items()
+        "plots": joined(
+            html("<figure>{svg}<figcaption>{title}</figcaption></figure>", svg=Html(svg), title=title)
+            for title, svg in plots(run).items()
         ),
         "table": _table(run.metrics),
-        "config": escape(run.config or "The run folder has no config.toml."),
-        "run": json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c"),
+        "config": run.config or "The run folder has no config.toml.",
+        "run": Html(json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c")),
         "mesh": mesh,
         "css": _asset("report.css"),
-        "three": _asset("three.min.js"),
-        "licence": _asset("three.LICENSE.txt"),
-        "script": _asset("report.js"),
+        "library": Html(library),
+        "script": script,
     }
-    return re.sub(r"\{\{(\w+)\}\}", lambda match: parts[match[1]], _asset("report.html"))
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), _asset("report.html"))
 
 
 def scene_data(run: RunFiles) -> dict[str, Any]:
@@ -117,8 +125,8 @@ class ReportObserver(Thumbnails):
         write_report(out)
 
 
-def _asset(name: str) -> str:
-    return (files("dudmap.viewing") / "page" / name).read_text(encoding="utf-8")
+def _asset(name: str) -> Html:
+    return Html((files("dudmap.viewing") / "page" / name).read_text(encoding="utf-8"))
 
 
 def _verdict(metrics: dict[str, Any]) -> str:
@@ -129,35 +137,37 @@ def _verdict(metrics: dict[str, Any]) -> str:
     return f"Incomplete: {metrics.get('stopped_by') or 'the run was stopped'}; {tracked}."
 
 
-def _cards(metrics: dict[str, Any]) -> str:
-    known = [
-        (label, form.format(factor * metrics[key]))
+def _cards(metrics: dict[str, Any]) -> Html:
+    return joined(
+        html("<li><b>{value}</b><span>{label}</span></li>", value=form.format(factor * metrics[key]), label=label)
         for key, (label, factor, form) in CARDS.items()
         if isinstance(metrics.get(key), int | float)
-    ]
-    return "".join(f"<li><b>{escape(value)}</b><span>{escape(label)}</span></li>" for label, value in known)
+    )
 
 
-def _strip(run: RunFiles) -> str:
+def _strip(run: RunFiles) -> Html:
     """Columns of colour image and mask; depth and residuals are kept for the frame at the slider."""
     if not run.thumbnails:
-        return "<p>This run kept no images (it was made with --no-report).</p>"
+        return Html("<p>This run kept no images (it was made with --no-report).</p>")
     start = float(next(iter(run.thumbnails)))
     columns = []
     for stamp, images in run.thumbnails.items():
         data = {kind: "data:image/jpeg;base64," + base64.b64encode(jpg).decode() for kind, jpg in images.items()}
         at = f"{float(stamp) - start:.1f} s"
-        hidden = "".join(f' data-{kind}="{data[kind]}"' for kind in ("depth", "residuals") if kind in data)
-        shown = "".join(
-            f'<img src="{data[kind]}" alt="{kind} at {at}" loading="lazy">'
+        hidden = joined(
+            html(' data-{kind}="{data}"', kind=kind, data=data[kind]) for kind in ("depth", "residuals") if kind in data
+        )
+        shown = joined(
+            html('<img src="{data}" alt="{kind} at {at}" loading="lazy">', data=data[kind], kind=kind, at=at)
             for kind in ("color", "mask")
             if kind in data
         )
-        columns.append(f'<figure data-t="{stamp}"{hidden}>{shown}{at}</figure>')
-    return f'<div class="strip">{"".join(columns)}</div>'
+        figure = '<figure data-t="{stamp}"{hidden}>{shown}{at}</figure>'
+        columns.append(html(figure, stamp=stamp, hidden=hidden, shown=shown, at=at))
+    return html('<div class="strip">{columns}</div>', columns=joined(columns))
 
 
-def _losses(metrics: dict[str, Any]) -> str:
+def _losses(metrics: dict[str, Any]) -> Html:
     """Lost frames by reason, unreadable frames, and frames that were left out of the map."""
     lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
     notes = [
@@ -167,32 +177,31 @@ def _losses(metrics: dict[str, Any]) -> str:
         (metrics.get("dropped"), "frames arrived too fast and were dropped"),
         ((metrics.get("maps") or 1) - 1, "submaps could not be joined with the main one"),
     ]
-    out = "".join(f"<li>{count} {escape(text)}</li>" for count, text in notes if count)
+    rows: list[object] = [f"{count} {text}" for count, text in notes if count]
     reasons: dict[str, list[float]] = {}
     for row in lost:
         reasons.setdefault(str(row["reason"]), []).append(float(row["timestamp"]))
     for reason, stamps in sorted(reasons.items(), key=lambda item: -len(item[1])):
         times = ", ".join(f"{stamp:.3f}" for stamp in stamps[:LISTED])
         more = f" and {len(stamps) - LISTED} more" if len(stamps) > LISTED else ""
-        out += (
-            f"<li>{len(stamps)} lost: {escape(reason)}<details><summary>times, s</summary>{times}{more}</details></li>"
-        )
-    out += "".join(f"<li>unreadable: {escape(str(text))}</li>" for text in unreadable[:LISTED])
+        row = "{count} lost: {reason}<details><summary>times, s</summary>{times}{more}</details>"
+        rows.append(html(row, count=len(stamps), reason=reason, times=times, more=more))
+    rows += [f"unreadable: {text}" for text in unreadable[:LISTED]]
     if len(unreadable) > LISTED:
-        out += f"<li>{len(unreadable) - LISTED} more frames were unreadable</li>"
-    return (
-        f"<ul>{out}</ul>" if out else "<p>Nothing: every frame was read and tracked, and every view is in the map.</p>"
-    )
+        rows.append(f"{len(unreadable) - LISTED} more frames were unreadable")
+    if not rows:
+        return Html("<p>Nothing: every frame was read and tracked, and every view is in the map.</p>")
+    return html("<ul>{rows}</ul>", rows=joined(html("<li>{row}</li>", row=row) for row in rows))
 
 
-def _table(metrics: dict[str, Any]) -> str:
+def _table(metrics: dict[str, Any]) -> Html:
     left_out = ("lost_frames", "unreadable_frames")
-    rows = "".join(
-        f"<tr><td>{escape(key)}</td><td>{escape(_text(value))}</td></tr>"
+    rows = joined(
+        html("<tr><td>{key}</td><td>{value}</td></tr>", key=key, value=_text(value))
         for key, value in metrics.items()
         if key not in left_out
     )
-    return f"<table>{rows}</table>"
+    return html("<table>{rows}</table>", rows=rows)
 
 
 def _text(value: object) -> str:

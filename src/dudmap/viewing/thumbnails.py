@@ -5,7 +5,9 @@ from typing import TYPE_CHECKING
 
 from dudmap.atomic_file import write_bytes
 from dudmap.errors import FrameError
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
 from dudmap.pipeline.observer import RunObserver
+from dudmap.pipeline.run_folder import WRITTEN
 from dudmap.viewing.snapshot import FrameImages, jpeg
 
 if TYPE_CHECKING:
@@ -32,14 +34,13 @@ class Thumbnails(RunObserver):
     def start(self, slam: "Slam", out: Path, count: int | None) -> None:
         """Remember where the images go and how many frames come."""
         self._out, self._count, self._next, self._step, self._kept = out / FOLDER, count, 0, 1, []
-        self._out.mkdir(exist_ok=True)
-        for path in self._out.glob("*.jpg"):  # of the first pass, whose timestamps may differ in a live run
-            path.unlink()
+        make_folder(self._out)
+        remove_files(out, {FOLDER: WRITTEN[FOLDER]})  # of the first pass, whose timestamps may differ in a live run
 
     def resume(self, slam: "Slam", out: Path, count: int | None, first: int) -> None:
         """Keep the images of the frames before number ``first``."""
         self._out, self._count, self._step, self._kept = out / FOLDER, count, 1, []
-        self._out.mkdir(exist_ok=True)
+        make_folder(self._out)
         self._next = self._next_after(first - 1)
 
     def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
@@ -49,7 +50,7 @@ class Thumbnails(RunObserver):
         paths = []
         for kind, image in FrameImages.of(read.frame, result).pictures().items():
             paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
-            write_bytes(paths[-1], jpeg(image), sync=False)
+            write_bytes(paths[-1], jpeg(image), sync=False, own=True)
         self._kept.append(paths)
         if self._count is None:
             self._thin()
@@ -66,7 +67,7 @@ class Thumbnails(RunObserver):
         """Remove every second frame if there are too many, and keep half as many from now on."""
         if len(self._kept) <= 2 * NUMBER:
             return
-        for paths in self._kept[1::2]:
-            for path in paths:
-                path.unlink()
+        with OwnFolder(self._out) as folder:
+            for path in (path for paths in self._kept[1::2] for path in paths):
+                folder.remove(path.name)
         self._kept, self._step = self._kept[::2], 2 * self._step

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_path
-from dudmap.errors import ConfigError
+from dudmap.errors import ConfigError, printable
 
 CODECS = {".mp4": "vp09", ".avi": "XVID"}
 """Codec by the ending: VP9 plays in browsers and takes 0.1 s a frame, MPEG-4 in desktop players and takes 3 ms."""
@@ -32,6 +32,8 @@ class VideoWriter:
         codec = CODECS.get(path.suffix.lower())
         if codec is None:
             raise ConfigError(f"cannot write a video as {path.name!r}; the ending must be one of {', '.join(CODECS)}")
+        if str(path) != printable(path):  # OpenCV ends the process at a name that is no UTF-8
+            raise ConfigError(f"cannot write a video as {path}; expected a name of printable characters")
         self._place = ExitStack()
         temporary = self._place.enter_context(atomic_path(path))
         self._writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*codec), fps, size)

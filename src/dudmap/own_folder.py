@@ -1,0 +1,134 @@
+"""Folders that dudmap writes: what is opened, made or deleted in them lies in them, and is a plain file or a folder.
+
+A run may go on in a folder that comes from elsewhere, or replace its results. Files are found relative to the open
+folder, so that a link in it leads nowhere, and only names that dudmap itself gives are ever deleted.
+"""
+
+import errno
+import os
+import re
+import stat
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+
+_HAS_RELATIVE_NAMES = os.name == "posix"
+NO_LINK = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+
+
+class OwnFolder:
+    """An open folder; names are single ones, without a separator.
+
+    Args:
+        path: The folder.
+        linked: The folder itself may be a link, as one that the command line names; what is in it may not.
+
+    Raises:
+        OSError: There is no such folder, or it is something else; the text names it.
+    """
+
+    def __init__(self, path: Path, *, linked: bool = False) -> None:
+        self.path = path
+        if not linked and not stat.S_ISDIR(os.lstat(path).st_mode):
+            raise _refused(path, "is a link or no folder; expected a folder of its own")
+        flags = os.O_RDONLY | getattr(os, "O_DIRECTORY", 0) | (0 if linked else NO_LINK)
+        self._at = os.open(path, flags) if _HAS_RELATIVE_NAMES else None
+
+    def close(self) -> None:
+        """Close the folder."""
+        if self._at is not None:
+            os.close(self._at)
+
+    def __enter__(self) -> "OwnFolder":
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, at: TracebackType | None) -> None:
+        self.close()
+
+    def status(self, name: str) -> os.stat_result | None:
+        """Status of a file itself, not of what it leads to; None if there is none."""
+        try:
+            return os.stat(self._place(name), dir_fd=self._at, follow_symlinks=False)
+        except FileNotFoundError:
+            return None
+
+    def open(self, name: str, flags: int) -> int:
+        """Open a plain file that has this one name.
+
+        Raises:
+            OSError: It is a link, pipe or anything else, has a second name, or cannot be opened.
+        """
+        self.check(name, alone=True)
+        number = os.open(self._place(name), flags | NO_LINK, 0o644, dir_fd=self._at)
+        if not stat.S_ISREG(os.fstat(number).st_mode):  # not that it was replaced in the meantime
+            os.close(number)
+            raise _refused(self.path / name, "is no plain file")
+        return number
+
+    def create(self, name: str) -> int:
+        """Open a new file for writing; an old one of this name, or a link, makes room for it."""
+        self.remove(name)
+        return os.open(self._place(name), os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666, dir_fd=self._at)
+
+    def check(self, name: str, *, alone: bool = False) -> None:
+        """Check that a name is free or that of a plain file, which with ``alone`` has no second name.
+
+        Raises:
+            OSError: It is that of something else.
+        """
+        status = self.status(name)
+        if status is not None and not (stat.S_ISREG(status.st_mode) and (status.st_nlink == 1 or not alone)):
+            raise _refused(self.path / name, "is a link or no plain file")
+
+    def files(self, form: str) -> list[str]:
+        """Names of the plain files that a regular expression describes wholly.
+
+        Raises:
+            OSError: Something else has such a name.
+        """
+        names = os.listdir(self.path if self._at is None else self._at)
+        found = sorted(name for name in names if re.fullmatch(form, name))
+        for name in found:
+            self.check(name)
+        return found
+
+    def remove(self, name: str) -> None:
+        """Delete a file, if there is one."""
+        try:
+            os.unlink(self._place(name), dir_fd=self._at)
+        except FileNotFoundError:
+            pass
+
+    def _place(self, name: str) -> str | Path:
+        return self.path / name if self._at is None else name
+
+
+def make_folder(path: Path) -> None:
+    """Make a folder in one of ours, unless it is there.
+
+    Raises:
+        OSError: A link or a file has its name.
+    """
+    path.mkdir(exist_ok=True)
+    OwnFolder(path).close()
+
+
+def remove_files(folder: Path, written: Mapping[str, str]) -> None:
+    """Delete the files of a folder that ``written`` describes: a regular expression per sub-folder, ``""`` for itself.
+
+    Raises:
+        OSError: A sub-folder is a link, or something other than a plain file has such a name; nothing is deleted then.
+    """
+    there = {name: form for name, form in written.items() if not name or os.path.lexists(folder / name)}
+    found = {}
+    for name, form in there.items():
+        with OwnFolder(folder / name, linked=not name) as place:
+            found[name] = place.files(form)
+    for name, files in found.items():
+        with OwnFolder(folder / name, linked=not name) as place:
+            for file in files:
+                place.remove(file)
+
+
+def _refused(path: Path, why: str) -> OSError:
+    return OSError(errno.EINVAL, f"{path.name} {why}; remove it, or name another folder", str(path))

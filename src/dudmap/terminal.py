@@ -1,0 +1,33 @@
+"""What is printed: names of files are shown as they are, whatever a terminal or markup would make of them."""
+
+from typing import TYPE_CHECKING, Any
+
+import typer
+
+from dudmap.errors import printable
+
+if TYPE_CHECKING:
+    from rich.console import Console
+    from rich.text import Text
+
+
+def say(text: object, *, err: bool = False) -> None:
+    """Print a text of one or several lines to stdout, or to stderr."""
+    typer.echo(lines(str(text)), err=err)
+
+
+def lines(text: str) -> str:
+    """A text whose lines are ``printable``."""
+    return "\n".join(map(printable, text.split("\n")))
+
+
+def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Console
+    """Console on which texts are ``printable`` and hold no markup; styles are given by ``rich.text.Text`` only."""
+    from rich.console import Console  # here, as its import takes a third of the time of the program's start
+
+    class PlainConsole(Console):
+        def render_str(self, text: str, **options: Any) -> "Text":  # noqa: ANN401
+            options.update(markup=False, emoji=False)
+            return super().render_str(lines(text), **options)
+
+    return PlainConsole(markup=False, emoji=False, highlight=False, **options)
