@@ -21,7 +21,7 @@ from dudmap.frames.pyramid import Pyramid
 from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
-from dudmap.gpu.device import make_backend, make_clock
+from dudmap.gpu.device import make_backend, resolve
 from dudmap.mapper import Mapper
 from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.mapping.memory_limit import MemoryLimit
@@ -90,7 +90,8 @@ class Slam(SlamResults):
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        self.device = config.device
+        adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
+        self.device = resolve(config.device, adaptive=adaptive)
         backend = make_backend(self.device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
@@ -156,7 +157,7 @@ class Slam(SlamResults):
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size, observation.backend)
-            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)}, make_clock(self.device))
+            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
@@ -378,7 +379,7 @@ class Slam(SlamResults):
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.times(),
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable,
