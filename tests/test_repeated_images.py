@@ -58,16 +58,19 @@ def test_where_depth_alone_repeats_the_pose_is_interpolated(recording):
     assert np.median(errors[3:-1:2]) < np.median(errors[2:-1:2]) + 0.25 * step  # as good as the tracked ones beside
 
 
-def test_depth_that_stands_still_is_not_believed_for_long(recording):
+@pytest.mark.parametrize("what", [{"depth"}, {"depth", "color"}])
+def test_a_sensor_that_hangs_is_not_believed_for_long(recording, what):
     frames, _ = recording
     slam = Slam(CAMERA, CONFIG)
     for frame in frames[:4]:
         assert slam.process(frame).state == "tracked"
-    frozen = [slam.process(replace(frame, depth=frames[3].depth)) for frame in frames[4:12]]
+    old = {name: getattr(frames[3], name) for name in what}
+    frozen = [slam.process(replace(frame, **old)) for frame in frames[4:12]]
     states = [result.state for result in frozen]
     assert states == sorted(states, reverse=True)  # repeated first, lost then
     assert set(states) == {"repeated", "lost"}
-    assert "has repeated for" in frozen[-1].lost_reason
+    assert "the sensor hangs" in frozen[-1].lost_reason
+    assert slam.process(replace(frames[11], timestamp=frames[11].timestamp + 0.03, **old)).state == "lost"
     assert slam.process(frames[12]).state == "tracked"
 
 

@@ -22,4 +22,4 @@ def test_no_time_counts_twice(monkeypatch):
     now[0] += 1.0
     with timer("next"):
         now[0] += 0.004
-    assert timer.times() == pytest.approx({"before": 5.0, "outer": 13.0, "inner": 50.0, "next": 4.0})
+    assert timer.timings == pytest.approx({"before": 5.0, "outer": 13.0, "inner": 50.0, "next": 4.0})

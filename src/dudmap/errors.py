@@ -58,6 +58,10 @@ class CameraError(DudmapError):
     """A camera or its driver is missing, or the camera stopped to deliver frames."""
 
 
+class DeviceError(DudmapError):
+    """A GPU has failed or is full; it is not used again in this process."""
+
+
 class InternalError(DudmapError):
     """A defect of dudmap itself: something happened that it does not foresee, and a report of it was written."""
 

@@ -22,7 +22,7 @@ from dudmap.frames.pyramid import Pyramid
 from dudmap.frames.stream_check import Rejection, StreamCheck
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
-from dudmap.gpu.device import make_backend, make_clock
+from dudmap.gpu.device import make_backend, resolve
 from dudmap.mapper import Mapper
 from dudmap.mapping.adaptive_volume import make_volume
 from dudmap.mapping.memory_limit import MemoryLimit
@@ -95,7 +95,8 @@ class Slam(SlamResults):
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
         voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-        self.device = config.device
+        adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
+        self.device = resolve(config.device, adaptive=adaptive)
         backend = make_backend(self.device)
         self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
         self.camera = self.preprocess.camera
@@ -162,7 +163,7 @@ class Slam(SlamResults):
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
             segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size, observation.backend)
-            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)}, make_clock(self.device))
+            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:
             frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
@@ -247,21 +248,21 @@ class Slam(SlamResults):
         """Result of a frame that repeats the one before, or its depth.
 
         It has the pose of the frame it repeats. With new colours the camera may have moved: the pose is the predicted
-        one, as long as that can be trusted, and in the trajectory interpolated once the next frame is tracked.
+        one, and in the trajectory interpolated once the next frame is tracked. Neither is believed for longer than a
+        prediction can be trusted.
         """
-        result = replace(last, timestamp=view.timestamp, repeats=self.stream.repeats, timings=view.timer.times())
-        if last.T_world_camera is None:
-            return result
-        predicted = self.stream.repeats == "depth" or last.repeats == "depth"
-        T_world_camera = last.T_world_camera
-        if self.stream.repeats == "depth":
-            if self.motion.drift(view.timestamp) > MAX_DRIFT:
-                reason = f"the depth image has repeated for {view.timestamp - self.motion.timestamp:.2f} s"
-                return replace(result, state="lost", lost_reason=reason, T_world_camera=None)
-            T_world_camera = self.motion.predict(view.timestamp)
-        self.atlas.add_pose(view.timestamp, T_world_camera, repeats="depth" if predicted else "frame")
-        self._last = replace(result, state="repeated", T_world_camera=T_world_camera)
-        return self._last
+        repeats, time = self.stream.repeats, view.timestamp
+        result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.times())
+        if last.T_world_camera is not None and self.motion.drift(time) > MAX_DRIFT:
+            what = "the depth image has" if repeats == "depth" else "both images have"
+            reason = f"{what} repeated for {time - self.motion.timestamp:.2f} s: the sensor hangs"
+            result = replace(result, state="lost", lost_reason=reason, T_world_camera=None)
+        elif last.T_world_camera is not None:
+            T_world_camera = self.motion.predict(time) if repeats == "depth" else last.T_world_camera
+            result = replace(result, state="repeated", T_world_camera=T_world_camera)
+            self.atlas.add_pose(time, T_world_camera, "depth" if "depth" in (repeats, last.repeats) else "frame")
+        self._last = result
+        return result
 
     def _resumed(self, view: FrameView) -> FrameView:
         """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
@@ -410,7 +411,7 @@ class Slam(SlamResults):
             dynamic_mask=self.preprocess.distorted(dynamic_mask),
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
-            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.times(),
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},

@@ -12,8 +12,8 @@ make_backend("warp-cpu")
 
 from dudmap.gpu import ahead
 
-DOUBLE = {"images", "surface", "descent", "cubes"}
-"""Modules with sums in float64, intensities, steps of a registration, or positions of vertices."""
+DOUBLE = {"images", "surface"}
+"""Modules with sums in float64, or intensities."""
 
 
 @pytest.fixture(scope="module")

@@ -8,9 +8,11 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.errors import ConfigError, MissingExtraError
+from dudmap.errors import ConfigError, DeviceError, MissingExtraError
 from dudmap.gpu import device, faults
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.slam import Slam
+from dudmap.synthetic.recording import DEFAULT_CAMERA
 
 
 @pytest.fixture
@@ -23,13 +25,14 @@ def machine(monkeypatch):
         monkeypatch.setattr(device, "num_gpus", lambda: gpus)
         monkeypatch.setattr(device, "_has_warp", lambda: warp)
         monkeypatch.setattr(device, "warp_failure", lambda: "")
+        monkeypatch.setattr(device, "start_failure", lambda name: "")
         if not warp:
             monkeypatch.setitem(sys.modules, "warp", None)
         monkeypatch.setattr(device, "supported_gpus", lambda: list(supported))
-        device.resolve.cache_clear()
+        device._resolved.cache_clear()
 
     yield make
-    device.resolve.cache_clear()
+    device._resolved.cache_clear()
 
 
 def test_automatic_choice(machine):
@@ -99,27 +102,32 @@ def test_a_warp_that_does_not_start(monkeypatch):
 def test_a_gpu_that_does_nothing(machine, monkeypatch):
     """Another program fills its memory: ``auto`` says so and takes the CPU, and who asked for it is refused."""
     machine()
-    monkeypatch.setattr(device, "_load_warp", lambda: None)
     monkeypatch.setattr(device, "start_failure", lambda name: f"Failed to acquire primary context for device {name}")
     with pytest.raises(ConfigError, match=r"device cuda cannot be used: Failed to acquire .*; take --device cpu"):
         device.make_backend("cuda")
-    try:
-        with pytest.warns(faults.DeviceWarning, match=r"cuda:0 failed \(Failed to acquire"):
-            assert isinstance(device.make_backend("auto"), CpuBackend)
-    finally:
-        faults.forget()
+    with pytest.warns(device.DeviceWarning, match=r"cuda:0 cannot be used \(Failed to acquire"):
+        assert isinstance(device.make_backend("auto"), CpuBackend)
 
 
 def test_a_device_that_has_failed_is_not_used_again(machine):
     machine()
-    with pytest.warns(faults.DeviceWarning, match="cuda:0 failed"):
-        faults.lose(RuntimeError("CUDA error 700"), "cuda:0")
+    with pytest.raises(DeviceError, match=r"cuda:0 failed \(CUDA error 700\)"), faults.using("cuda:0"):
+        raise RuntimeError("CUDA error 700")
     try:
         assert isinstance(device.make_backend("auto"), CpuBackend)
-        assert isinstance(device.make_backend("cuda:0"), CpuBackend)
-        assert faults.lost_devices() == {"cuda:0"}
+        assert device.resolve("cuda:0") == "cpu"
+        with pytest.raises(DeviceError, match="cuda:0 has failed before"), faults.using("cuda:0"):
+            pass
     finally:
         faults.forget()
+
+
+def test_maps_with_several_voxel_sizes_are_the_cpus(machine):
+    machine()
+    config = Config().override(["volume.adaptive=true"])
+    assert Slam(DEFAULT_CAMERA, config).device == "cpu"
+    with pytest.raises(ConfigError, match=r"found device cuda and volume\.adaptive=true.*take --device cpu"):
+        Slam(DEFAULT_CAMERA, config.override(["device=cuda"]))
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ make_backend("warp-cpu")
 
 from dudmap.gpu.kernels import formulas
 from dudmap.gpu.kernels.structs import FusionParameters, struct
-from dudmap.kernels import labeling, parameters, residual, voxel
+from dudmap.kernels import parameters, residual, voxel
 
 PARAMETERS = parameters.FusionParameters(
     parameters.TruncationBand(0.04, 0.04, 3.0, 0.3, parameters.SensorNoise(0.001, 0.0019)),
@@ -32,14 +32,6 @@ def fuse_all(
     out[n, 0] = word
     out[n, 1] = formulas.fuse_color(words[n] & 0x3FFFFFFF, paints[n], share)
     shares[n] = share
-
-
-@wp.kernel
-def mix_all(squares: wp.array(dtype=wp.float64), out: wp.array2d(dtype=wp.float64)):
-    n = wp.tid()
-    prior, static, dynamic = wp.float64(0.2), wp.float64(1.1), wp.float64(4.3)
-    out[n, 0] = formulas.dynamic_responsibility(squares[n], prior, static, dynamic)
-    out[n, 1] = formulas.bounded_sigma(squares[n], wp.float64(7.0), wp.float64(0.5), wp.float64(3.0))
 
 
 @wp.kernel
@@ -83,16 +75,6 @@ def test_fused_voxels_are_equal():
         assert np.abs((found.numpy()[:, 0] >> shift & mask) - (expected >> shift & mask)).max() <= 1
     np.testing.assert_allclose(found_shares.numpy(), shares, rtol=1e-6)
     assert (found.numpy()[:, 1] != colors).mean() < 1e-3
-
-
-def test_mixture_steps_are_equal():
-    squares = np.linspace(0, 60, 500)
-    out = wp.zeros((500, 2), dtype=wp.float64, device="cpu")
-    wp.launch(mix_all, dim=500, inputs=[wp.array(squares, device="cpu"), out], device="cpu")
-    expected = [
-        (labeling.dynamic_responsibility(q, 0.2, 1.1, 4.3), labeling.bounded_sigma(q, 7.0, 0.5, 3.0)) for q in squares
-    ]
-    np.testing.assert_allclose(out.numpy(), expected, rtol=1e-14)
 
 
 def test_interpolations_are_equal():

@@ -3,8 +3,7 @@
 import statistics
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -15,27 +14,15 @@ from dudmap.benchmark.interleaved import median_ms, run_open3d, save_frames
 from dudmap.benchmark.table import grid
 from dudmap.benchmark.timing import WARM_UP
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DudmapError, MapError
-from dudmap.gpu import faults
+from dudmap.errors import ConfigError, DeviceError, DudmapError, MapError
 from dudmap.gpu.device import obstacle, resolve
 from dudmap.sequences import Sequence, open_sequence
 from dudmap.synthetic import sequence as synthetic_sequence
 from dudmap.synthetic.recording import DEFAULT_CAMERA
 
-BYTES_PER_THREAD = {
-    "limit_depth": 8, "drop_mixed": 8, "fill_holes": 8, "bilateral_line": 8, "intensities": 7, "halve": 40,
-    "tile_ranges": 268, "reading_weights": 5, "pack_pixels": 16, "integrate": 8, "linearize": 288,
-    "linearize_trial": 288, "sample": 17,
-    "first_spins": 8, "mean_field_sweep": 20, "probabilities": 8, "trace": 19, "classify": 9, "find_vertices": 10,
-    "trace_levels": 19, "prolong": 8, "scatter": 8, "gather": 8,
-}  # fmt: skip
-"""Bytes that each thread of a kernel must read and write at least: its elements of each image and each sum once, and
-the words of the voxels that belong to it alone; not those of the map that neighbouring pixels share."""
 KERNELS_EVERY = 4
-"""Every so many frames the kernels are measured, launched one by one, and in the others the frames and their stages:
-events around each kernel take time, and kernels in a graph have none."""
-COPY_BYTES = 1 << 28
-"""Size of the array whose copy measures the bandwidth of the device."""
+"""Every so many frames the kernels are measured, and in the others the frames and their stages: events around each
+kernel take time."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +39,6 @@ class DeviceRun:
         triangles: Of that mesh.
         map_mb, device_mb: Size of the map, and peak memory of the device where it is known.
         kernels: Milliseconds per frame of each kernel, by the device's events; empty on the CPU.
-        shares: Share of the device's bandwidth that each memory-bound kernel reaches.
         error: Why there are no figures.
     """
 
@@ -67,7 +53,6 @@ class DeviceRun:
     map_mb: float = float("nan")
     device_mb: float = float("nan")
     kernels: dict[str, float] = field(default_factory=dict)
-    shares: dict[str, float] = field(default_factory=dict)
     error: str = ""
 
 
@@ -106,46 +91,37 @@ def devices(wanted: str) -> list[str]:
 
 def measure(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
     """Process the first ``frames`` frames; a device that cannot do all of it gives a row that says so."""
-    if faults.is_lost(device):
-        return DeviceRun(name, voxel, device, error=f"{device} has failed before")
-    failures: list[str] = []
-    with faults.told_to(failures.append):
-        row = _measured(name, recording, frames, voxel, device)
-    return DeviceRun(name, voxel, device, error=failures[0]) if failures else row
+    try:
+        return _measured(name, recording, frames, voxel, device)
+    except (DeviceError, MapError) as error:
+        return DeviceRun(name, voxel, device, error=str(error))
 
 
 def _measured(name: str, recording: Sequence, frames: int, voxel: float, device: str) -> DeviceRun:
     from dudmap.slam import Slam
 
     assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
-    try:
-        slam = Slam(recording.camera, Config().override(assignments))
-        times, stages, kernels, moved = [], [], [], []
-        for index in range(min(frames, len(recording))):
-            frame = recording[index]
-            if device.startswith("cuda") and index % KERNELS_EVERY == 0:
-                with _kernel_times(device) as (measured, threads):
-                    slam.process(frame)
-                kernels.append(measured)
-                moved.append({key: count * BYTES_PER_THREAD.get(key, 0) for key, count in threads.items()})
-            else:
-                start = time.perf_counter()
-                result = slam.process(frame)
-                times.append(1000 * (time.perf_counter() - start))
-                stages.append(result.timings)
-        pose = slam.trajectory.Ts_world_camera[-1]
-        slam.volume.extract_mesh(1)
-        mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
-        slam.volume.raycast(pose)
-        view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
-    except MapError as error:
-        return DeviceRun(name, voxel, device, error=str(error))
+    slam = Slam(recording.camera, Config().override(assignments))
+    times, stages, kernels = [], [], []
+    for index in range(min(frames, len(recording))):
+        frame = recording[index]
+        if device.startswith("cuda") and index % KERNELS_EVERY == 0:
+            kernels.append(_kernel_times(lambda frame=frame: slam.process(frame)))
+            continue
+        start = time.perf_counter()
+        result = slam.process(frame)
+        times.append(1000 * (time.perf_counter() - start))
+        stages.append(result.timings)
+    pose = slam.trajectory.Ts_world_camera[-1]
+    slam.volume.extract_mesh(1)
+    mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
+    slam.volume.raycast(pose)
+    view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
     warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
-    per_kernel = _medians(kernels[-len(kernels) // 2 :])  # the first frames load the kernels
-    shares = _shares(per_kernel, _medians(moved[-len(moved) // 2 :]), device)
     return DeviceRun(
         name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
-        slam.volume.num_bytes / 1e6, _peak_megabytes(device), per_kernel, shares,
+        slam.volume.num_bytes / 1e6, _peak_megabytes(device),
+        _medians(kernels[-len(kernels) // 2 :]),  # the first frames load the kernels
     )  # fmt: skip
 
 
@@ -160,61 +136,19 @@ def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
     return {key: statistics.median(row.get(key, 0.0) for row in rows) for key in keys}
 
 
-@contextmanager
-def _kernel_times(device: str) -> Iterator[tuple[dict[str, float], dict[str, int]]]:
-    """Milliseconds that each kernel takes within the block, by events of the device, and its number of threads."""
-    times, threads = {}, {}
-    if not device.startswith("cuda"):
-        yield times, threads
-        return
+def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
+    """Milliseconds that each kernel of an action takes, by events of the GPU; names lose Warp's prefix and hash."""
     import warp as wp  # pyright: ignore[reportMissingImports]
-
-    from dudmap.gpu.sequence import one_by_one
 
     wp.timing_begin(cuda_filter=wp.TIMING_KERNEL)
-    with counted_launches(threads), one_by_one():
-        yield times, threads
-    add_up(wp.timing_end(), times)
-
-
-@contextmanager
-def counted_launches(threads: dict[str, int]) -> Iterator[None]:
-    """Add the threads of every launch within the block to those of its kernel."""
-    import warp as wp  # pyright: ignore[reportMissingImports]
-
-    launch, repeat = wp.launch, wp.Launch.launch
-
-    def counted(kernel: Any, dim: Any, *arguments: Any, **named: Any) -> Any:  # noqa: ANN401
-        if not named.get("record_cmd"):
-            threads[kernel.key] = threads.get(kernel.key, 0) + int(np.prod(dim))
-        return launch(kernel, dim, *arguments, **named)
-
-    def repeated(command: Any, *arguments: Any, **named: Any) -> None:  # noqa: ANN401
-        threads[command.kernel.key] = threads.get(command.kernel.key, 0) + command.bounds.size
-        repeat(command, *arguments, **named)
-
-    wp.launch, wp.Launch.launch = counted, repeated  # pyright: ignore[reportAttributeAccessIssue]
-    try:
-        yield
-    finally:
-        wp.launch, wp.Launch.launch = launch, repeat
-
-
-def add_up(results: Iterable[Any], times: dict[str, float]) -> None:
-    """Add the milliseconds of Warp's timing results to those of each kernel; names lose Warp's prefix and hash."""
-    for result in results:
+    action()
+    times: dict[str, float] = {}
+    for result in wp.timing_end():
         name = result.name.removeprefix("forward kernel ")
         base, _, tail = name.rpartition("_")
         name = base if len(tail) == 8 and base else name
         times[name] = times.get(name, 0.0) + result.elapsed
-
-
-def _shares(kernels: dict[str, float], moved: dict[str, float], device: str) -> dict[str, float]:
-    """Share of the measured bandwidth that each kernel reaches with the bytes that it must move per frame."""
-    if not device.startswith("cuda"):
-        return {}
-    bandwidth = measured_bandwidth(device)
-    return {name: moved[name] / (1e-3 * ms) / bandwidth for name, ms in kernels.items() if moved.get(name) and ms > 0}
+    return times
 
 
 def measure_open3d(
@@ -242,22 +176,6 @@ def measure_open3d(
     return rows
 
 
-def measured_bandwidth(device: str) -> float:
-    """Bytes per second that a copy of a large array reads and writes."""
-    import warp as wp  # pyright: ignore[reportMissingImports]
-
-    source = wp.zeros(COPY_BYTES, dtype=wp.uint8, device=device)
-    target = wp.empty_like(source)
-    best = float("inf")
-    for _ in range(6):
-        wp.synchronize_device(device)
-        start = time.perf_counter()
-        wp.copy(target, source)
-        wp.synchronize_device(device)
-        best = min(best, time.perf_counter() - start)
-    return 2 * COPY_BYTES / best
-
-
 def _peak_megabytes(device: str) -> float:
     if not device.startswith("cuda"):
         return float("nan")
@@ -279,11 +197,8 @@ def table(rows: list[DeviceRun]) -> str:
             text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: {row.error}\n"
         if row.kernels:
             text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: kernels per frame\n\n"
-            lines = [
-                [name, f"{ms:.3f}", f"{100 * row.shares[name]:.0f}" if name in row.shares else ""]
-                for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])
-            ]
-            text += grid(["kernel", "ms", "bandwidth, %"], lines)
+            lines = [[name, f"{ms:.3f}"] for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])]
+            text += grid(["kernel", "ms"], lines)
     return text
 
 

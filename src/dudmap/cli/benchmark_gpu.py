@@ -1,4 +1,4 @@
-"""``dudmap benchmark gpu``: time, memory and bandwidth of a GPU and of the CPU beside it."""
+"""``dudmap benchmark gpu``: time and memory of a GPU and of the CPU beside it."""
 
 import json
 from dataclasses import asdict
@@ -36,7 +36,7 @@ def gpu(
     quick: Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")] = False,
     as_json: JsonOption = False,
 ) -> None:
-    """Measure a GPU and the CPU beside it: time by stage and kernel, memory, and share of the memory bandwidth.
+    """Measure a GPU and the CPU beside it: time by stage and kernel, and memory.
 
     Without a GPU, only the CPU is measured, and the table says why.
     """

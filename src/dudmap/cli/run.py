@@ -176,7 +176,7 @@ def run(
     if saved is not None and config is None and preset is None and (saved / "config.toml").is_file():
         config = saved / "config.toml"
     parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
-    resolve(parameters.device)  # refused before anything takes time
+    resolve(parameters.device, adaptive=parameters.volume.adaptive)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
     for warning in inspect(recording).warnings:

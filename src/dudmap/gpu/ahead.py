@@ -5,23 +5,7 @@ from pathlib import Path
 
 import warp as wp  # pyright: ignore[reportMissingImports]
 
-MODULES = tuple(
-    f"dudmap.gpu.kernels.{name}"
-    for name in (
-        "images",
-        "fusion",
-        "blocks",
-        "surface",
-        "raycasting",
-        "labels",
-        "components",
-        "descent",
-        "cubes",
-        "levels",
-        "links",
-        "rows",
-    )
-)
+MODULES = tuple(f"dudmap.gpu.kernels.{name}" for name in ("images", "fusion", "surface", "raycasting", "rows"))
 """Modules that hold kernels."""
 
 

@@ -7,16 +7,16 @@ import ctypes
 import importlib.util
 import os
 import sys
+import warnings
 from contextlib import contextmanager
 from functools import cache
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
 from dudmap.errors import ConfigError
 from dudmap.extras import need
 from dudmap.gpu import faults
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
-from dudmap.stage_timer import Clock
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -33,52 +33,52 @@ MISMATCH = 803
 """Error of the driver where its parts are of different versions."""
 
 
+class DeviceWarning(RuntimeWarning):
+    """The CPU computes what a GPU was to compute."""
+
+
 def make_backend(device: str) -> Backend:
     """A new back end on a device, or on the CPU if the device has failed in this process.
 
     Args:
-        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
-            the CPU; "warp-cpu" for the kernels of the GPU on the CPU, for tests.
+        device: As of ``resolve``.
 
     Raises:
         ConfigError: There is no such device, or it does not work.
     """
     name = resolve(device)
-    in_warp = "cpu" if name == "warp-cpu" else name
-    if name == "cpu" or faults.is_lost(in_warp):
+    if name == "cpu":
         return CpuBackend()
-    _load_warp()
-    if failure := start_failure(in_warp):
-        if device != "auto":
-            raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
-        faults.lose(RuntimeError(failure), in_warp)
-        return CpuBackend()
-    from dudmap.gpu.fallback import FallbackBackend
+    if failure := start_failure(name):
+        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
+    from dudmap.gpu.backend import WarpBackend
 
-    return cast("Backend", FallbackBackend(in_warp))
+    return WarpBackend(name)
 
 
-def make_clock(device: str) -> Clock | None:
-    """What measures the stages of the processing on a device: the events of a GPU; None for the program's clock.
+def resolve(device: str, *, adaptive: bool = False) -> str:
+    """Name of the device that is meant, "cpu", "warp-cpu" or "cuda:N"; "cpu" for one that has failed in this process.
 
     Args:
-        device: As of ``make_backend``, which has been called.
-    """
-    name = resolve(device)
-    if not name.startswith("cuda") or faults.is_lost(name):
-        return None
-    from dudmap.gpu.clock import DeviceClock
+        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
+            the CPU; "warp-cpu" for the kernels of the GPU on the CPU, for tests.
+        adaptive: Whether it is for a map with several voxel sizes, which the CPU alone computes.
 
-    return DeviceClock(name)
+    Raises:
+        ConfigError: There is no such device, or it does not work, or not with such a map.
+    """
+    if adaptive and device not in ("cpu", "auto"):
+        raise ConfigError(
+            f"found device {device} and volume.adaptive=true; smaller voxels are computed on the CPU only: take "
+            "--device cpu, or volume.adaptive=false"
+        )
+    name = "cpu" if adaptive else _resolved(device)
+    return "cpu" if faults.is_lost(name) else name
 
 
 @cache
-def resolve(device: str) -> str:
-    """Name of the device that is meant: "cpu", "warp-cpu" or "cuda:N".
-
-    Raises:
-        ConfigError: There is no such device, or it does not work.
-    """
+def _resolved(device: str) -> str:
+    """Name of the device that is meant."""
     if device == "cpu":
         return device
     if device == "warp-cpu":
@@ -86,7 +86,7 @@ def resolve(device: str) -> str:
         return device
     found = obstacle()
     if device == "auto":
-        return "cpu" if found else f"cuda:{supported_gpus()[0]}"
+        return "cpu" if found else _first_that_starts()
     if device.partition(":")[0] != "cuda":
         raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
     _need_warp(device)
@@ -98,6 +98,15 @@ def resolve(device: str) -> str:
         lack = f"there is no device {device}" if number >= num_gpus() else f"device {device} is too old for Warp"
         raise ConfigError(f"{lack}; this machine has {known}")
     return f"cuda:{number}"
+
+
+def _first_that_starts() -> str:
+    """The first GPU, or the CPU where that does nothing, with a warning."""
+    name = f"cuda:{supported_gpus()[0]}"
+    if failure := start_failure(name):
+        warnings.warn(f"{name} cannot be used ({failure}); the CPU is", DeviceWarning, stacklevel=5)
+        return "cpu"
+    return name
 
 
 def obstacle() -> str:
@@ -125,12 +134,12 @@ def obstacle() -> str:
 
 @cache
 def start_failure(device: str) -> str:
-    """Why a device, by its name in Warp, does nothing, such as one whose memory other programs fill; empty where it
-    does."""
+    """Why a device does nothing, such as one whose memory other programs fill; empty where it works."""
+    _load_warp()
     import warp as wp  # pyright: ignore[reportMissingImports]
 
     try:
-        wp.zeros(1, dtype=wp.int32, device=device).numpy()
+        wp.zeros(1, dtype=wp.int32, device="cpu" if device == "warp-cpu" else device).numpy()
     except (RuntimeError, OSError) as error:
         return " ".join(str(error).split())
     return ""

@@ -1,10 +1,11 @@
 """A map with several voxel sizes seen from a pose: sphere tracing as in ``raycasting.py``, by the finest voxels."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.finest import corners_at, finest_at, least_weight
-from dudmap.kernels.level_backend import FinerLevels
 from dudmap.kernels.parameters import RaycastParameters, RaycastResult, VoxelGrid
 from dudmap.kernels.pixel import ray
 from dudmap.kernels.raycasting import (
@@ -24,6 +25,24 @@ from dudmap.kernels.threads import bands, kernel, run_bands
 from dudmap.kernels.voxel import sdf_steps
 
 f32 = np.float32
+
+
+class FinerLevels(NamedTuple):
+    """Two finer levels of a map, as views read them; one that the map does not have holds no children.
+
+    Attributes:
+        children1, children2: (slots of the next coarser level, 8) int32: slot of the block with half the voxel size in
+            each octant of a block, -1 = none. There may be fewer rows than slots: those have no children.
+        geometry1, geometry2: (slots, 512) int32 packed voxels of the levels.
+        colors1, colors2: (slots, 512) int32 packed colours.
+    """
+
+    children1: NDArray[np.int32]
+    children2: NDArray[np.int32]
+    geometry1: NDArray[np.int32]
+    geometry2: NDArray[np.int32]
+    colors1: NDArray[np.int32]
+    colors2: NDArray[np.int32]
 
 
 @kernel
@@ -182,8 +201,8 @@ def raycast(
     size: tuple[int, int],
     parameters: RaycastParameters,
 ) -> RaycastResult:
-    """See ``LevelBackend.raycast_levels``."""
-    grid, levels = grid.on_host(), levels.on_host()
+    """View of a map by its finest voxels; ``grid`` is the coarsest level, other arguments as of ``Backend.raycast``."""
+    grid = grid.on_host()
     tree = levels.children1, levels.children2
     low, high = f32(parameters.depth_min), f32(parameters.depth_max)
     near, far = tile_depths(grid, T_world_camera, intrinsics, size, low, high)

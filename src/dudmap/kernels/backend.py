@@ -5,22 +5,15 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.block_index import IndexBackend
+from dudmap.kernels.descent import Descent, DescentRules
 from dudmap.kernels.label_backend import LabelBackend
-from dudmap.kernels.level_backend import LevelBackend
-from dudmap.kernels.links import Neighbours
-from dudmap.kernels.mirror import Mirror
 from dudmap.kernels.parameters import (
     ColorProjection,
-    Damping,
     DepthView,
-    Descent,
     FilterParameters,
     FusedBlocks,
     FusionParameters,
     MapSample,
-    MeshArrays,
-    MeshParameters,
     NormalEquations,
     RaycastParameters,
     RaycastResult,
@@ -30,9 +23,8 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
-    """Operations of a compute device, with those on the label image, on maps with several voxel sizes, and those that
-    number blocks.
+class Backend(LabelBackend, Protocol):
+    """Operations of a compute device, with those on the label image.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -220,7 +212,7 @@ class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
         """
         ...
 
-    def descend(
+    def register(
         self,
         grid: VoxelGrid,
         depth: NDArray[np.float32],
@@ -228,16 +220,12 @@ class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
         weights: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         T_world_camera: NDArray[np.float64],
-        damping: Damping,
+        first: NormalEquations,
+        rules: DescentRules,
         parameters: RegistrationParameters,
-    ) -> Descent | None:
-        """Levenberg-Marquardt steps from a pose (4, 4) on, without the host between them.
-
-        Images and parameters as of ``linearize``; the steps are those of ``Tracker``.
-
-        Returns:
-            None where a device does not run the loop: then the caller does, with ``linearize``.
-        """
+    ) -> Descent:
+        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations; see
+        ``kernels/descent.py``. Images and parameters as of ``linearize``."""
         ...
 
     def sample(
@@ -268,50 +256,7 @@ class Backend(LabelBackend, IndexBackend, LevelBackend, Protocol):
         """
         ...
 
-    def extract_mesh(
-        self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: Neighbours,
-        parameters: MeshParameters,
-    ) -> MeshArrays:
-        """Triangles of the zero level of the given blocks by marching cubes.
 
-        Args:
-            geometry, colors: (num_slots, 512) int32, packed voxels and colours.
-            slots: (n,) int32, blocks to mesh; each once.
-            coords: (num_slots, 3) int, block coordinates by slot.
-            neighbours: (n, 8) int32; column 4 dx + 2 dy + dz holds the slot of the block at +(dx, dy, dz), -1 = none.
-                It follows from the coordinates: a device does not read it.
-            parameters: Of the extraction.
-
-        Returns:
-            The mesh; no vertex occurs twice or without a triangle.
-        """
-        ...
-
-    def extract_chunks(
-        self,
-        geometry: Mirror | NDArray[np.int32],
-        colors: Mirror | NDArray[np.int32],
-        slots: NDArray[np.int32],
-        coords: NDArray[np.integer],
-        neighbours: Neighbours,
-        parameters: MeshParameters,
-        chunks: NDArray[np.integer],
-    ) -> list[MeshArrays]:
-        """Meshes of groups of blocks that share no vertices, so that each can be replaced when its blocks change.
-
-        Args:
-            geometry, colors, slots, coords, neighbours, parameters: As of ``extract_mesh``.
-            chunks: (n,) int64 chunk of each block, counted from 0; -1 for blocks that only lend their voxels. A mesh is
-                complete if the up to seven blocks at +(dx, dy, dz) from each of its blocks are among ``slots``.
-        """
-        ...
-
-
-_PROTOCOLS = Backend, LabelBackend, IndexBackend, LevelBackend
+_PROTOCOLS = Backend, LabelBackend
 OPERATIONS = tuple(name for protocol in _PROTOCOLS for name in vars(protocol) if not name.startswith("_"))
 """Names of all operations."""

@@ -3,27 +3,26 @@
 Bands do not depend on the number of threads, and sums are added in their order (``threads.py``).
 """
 
-from typing import Any
+from collections.abc import Callable
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import (
-    adaptive_raycasting,
     antialiasing,
     color_registration,
     evidence,
     filtering,
     integration,
     labeling,
-    meshing,
     raycasting,
-    refinement,
     registration,
     sampling,
     segmentation,
     visibility,
 )
+from dudmap.kernels.descent import Descent, DescentRules, descend
+from dudmap.kernels.mirror import Mirror, on_host
 from dudmap.kernels.parameters import (
     BLOCK,
     ColorProjection,
@@ -38,6 +37,7 @@ from dudmap.kernels.parameters import (
     SensorNoise,
     VoxelGrid,
     single,
+    to_lattice,
 )
 from dudmap.kernels.threads import bands, run_bands
 
@@ -62,11 +62,7 @@ MAX_FOUND = 1 << 16
 class CpuBackend:
     """``Backend`` on the CPU."""
 
-    extract_mesh = staticmethod(meshing.extract)
-    extract_chunks = staticmethod(meshing.extract_chunks)
     raycast = staticmethod(raycasting.raycast)
-    raycast_levels = staticmethod(adaptive_raycasting.raycast)
-    examine, prolong = staticmethod(refinement.examine), staticmethod(refinement.prolong)
     segment_surface = staticmethod(segmentation.segment_surface)
     reading_noise = staticmethod(evidence.reading_noise)
     residual_counts = staticmethod(evidence.residual_counts)
@@ -210,7 +206,7 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> NDArray[np.int32]:
         """See ``Backend.touched_cells``."""
-        grid = grid.on_host()
+        window = on_host(grid.window)
         p, depth = single(parameters), view.depth
         T_blocks_camera = view.T_grid_camera / np.float32(BLOCK)
         ranges = bands(-(-depth.shape[0] // stride), TILE_ROWS)
@@ -218,7 +214,7 @@ class CpuBackend:
         counts = run_bands(
             lambda start, stop, out: visibility.mark_blocks(
                 stride * start, min(stride * stop, depth.shape[0]), stride, depth, view.intrinsics, T_blocks_camera,
-                grid.shape, grid.window, grid.free_count, free_after, frame_number, stamps, p.band,
+                grid.shape, window, grid.free_count, free_after, frame_number, stamps, p.band,
                 np.float32(BLOCK) * p.voxel_size, out,
             ),
             ranges, found,
@@ -238,10 +234,9 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> FusedBlocks:
         """See ``Backend.fuse``."""
+        p, depth, mirrors = single(parameters), view.depth, (grid.geometry, grid.colors)
         grid = grid.on_host()
-        p, depth = single(parameters), view.depth
-        slots, repeats = self._visible(grid, view, candidates, fused, turn, p)
-        repeats *= count
+        slots, repeats = self._visible(grid, view, candidates, fused, turn, count, p)
         pixels, rgb = self._pixel_buffer(depth.size + 1), np.ascontiguousarray(color)
         run_bands(
             lambda start, stop: integration.pack_pixels(start, stop, depth, rgb, weights, p, pixels),
@@ -256,6 +251,9 @@ class CpuBackend:
             ),
             bands(len(slots), BLOCKS_PER_BAND),
         )  # fmt: skip
+        for mirror in mirrors:
+            if isinstance(mirror, Mirror):
+                mirror.wrote(slots)
         return FusedBlocks(slots, occupied)
 
     def _visible(
@@ -265,6 +263,7 @@ class CpuBackend:
         candidates: NDArray[np.int32],
         fused: NDArray[np.uint8],
         turn: int,
+        count: int,
         p: FusionParameters,
     ) -> tuple[NDArray[np.int32], NDArray[np.float32]]:
         """Slots (n,) of the blocks to update, and the number of frames that this one stands for in each of them."""
@@ -281,7 +280,8 @@ class CpuBackend:
         )  # fmt: skip
         starts = [start for start, _ in ranges]
         written = [np.s_[start : start + n] for start, n in zip(starts, counts, strict=True)]
-        return np.concatenate([slots[part] for part in written]), np.concatenate([repeats[part] for part in written])
+        counts = count * np.concatenate([repeats[part] for part in written])
+        return np.concatenate([slots[part] for part in written]), counts
 
     def _pixel_buffer(self, size: int) -> NDArray[np.int32]:
         """Words (size, 2) of the pixels; the last row, of a voxel without a pixel, is 0."""
@@ -299,7 +299,7 @@ class CpuBackend:
         parameters: FusionParameters,
     ) -> NDArray[np.int32]:
         """See ``Backend.observe_free``."""
-        grid = grid.on_host()
+        window = on_host(grid.window)
         p, size = single(parameters), np.array(view.depth.shape, dtype=np.int64)
         nearest = view.tiles.nearest[np.isfinite(view.tiles.nearest)]
         far = min(p.depth_max, nearest.max(initial=0))  # nothing farther lies in front of all readings
@@ -307,19 +307,13 @@ class CpuBackend:
         found = [np.empty(MAX_FOUND, dtype=np.int32) for _ in ranges]
         counts = run_bands(
             lambda start, stop, out: visibility.observe_free(
-                2 * start + parity, 2 * stop + parity, 2, grid.window, grid.shape, grid.origin, view.T_camera_world,
+                2 * start + parity, 2 * stop + parity, 2, window, grid.shape, grid.origin, view.T_camera_world,
                 view.intrinsics, size, np.float32(BLOCK) * p.voxel_size, view.tiles.nearest, view.tiles.valid, p.band,
                 far, grid.free_count, count, free_after, out,
             ),
             ranges, found,
         )  # fmt: skip
         return _concatenated(found, counts)
-
-    def allocate_touched(self, *_: Any, **__: Any) -> bool:
-        """See ``IndexBackend``: the host numbers the blocks, by the operations above."""
-        return False
-
-    fuse_near = record_free = place_window = allocate_touched
 
     # -- read the map ------------------------------------------------------------------------------------------------
 
@@ -334,24 +328,52 @@ class CpuBackend:
         parameters: RegistrationParameters,
     ) -> NormalEquations:
         """See ``Backend.linearize``."""
-        grid = grid.on_host()
-        height, width = depth.shape
-        ranges = bands(height, -(-PIXELS_PER_BAND // width))
-        sums = np.zeros((len(ranges), registration.NUM_SUMS))
-        residuals = np.empty((2, height, width), dtype=np.float32)
-        p, geometry = single(parameters), grid.geometry.reshape(-1)
-        voxel_size, sdf_unit = np.float32(grid.voxel_size), np.float32(grid.sdf_unit)
-        run_bands(
-            lambda start, stop, out: registration.linearize_rows(
-                start, stop, depth, intensity, weights, intrinsics, T_grid_camera, grid.window, grid.shape, geometry,
-                voxel_size, sdf_unit, p, residuals, out,
-            ),
-            ranges, list(sums),
-        )  # fmt: skip
-        return registration.normal_equations(sums.sum(axis=0), residuals)
+        return self._linearization(grid, depth, intensity, weights, intrinsics, parameters)(T_grid_camera)
 
-    def descend(self, *_: Any, **__: Any) -> None:
-        """See ``Backend.descend``: the loop is the caller's."""
+    def register(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_world_camera: NDArray[np.float64],
+        first: NormalEquations,
+        rules: DescentRules,
+        parameters: RegistrationParameters,
+    ) -> Descent:
+        """See ``Backend.register``."""
+        at = self._linearization(grid, depth, intensity, weights, intrinsics, parameters)
+        return descend(lambda T: at(to_lattice(T, grid.voxel_size, grid.origin)), T_world_camera, first, rules)
+
+    def _linearization(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        parameters: RegistrationParameters,
+    ) -> Callable[[NDArray[np.float32]], NormalEquations]:
+        """Normal equations of an image as a function of its pose; see ``Backend.linearize``."""
+        window, geometry = on_host(grid.window), on_host(grid.geometry).reshape(-1)
+        height, width = depth.shape
+        ranges, p = bands(height, -(-PIXELS_PER_BAND // width)), single(parameters)
+        voxel_size, sdf_unit = np.float32(grid.voxel_size), np.float32(grid.sdf_unit)
+
+        def at(T_grid_camera: NDArray[np.float32]) -> NormalEquations:
+            sums = np.zeros((len(ranges), registration.NUM_SUMS))
+            residuals = np.empty((2, height, width), dtype=np.float32)
+            run_bands(
+                lambda start, stop, out: registration.linearize_rows(
+                    start, stop, depth, intensity, weights, intrinsics, T_grid_camera, window, grid.shape, geometry,
+                    voxel_size, sdf_unit, p, residuals, out,
+                ),
+                ranges, list(sums),
+            )  # fmt: skip
+            return registration.normal_equations(sums.sum(axis=0), residuals)
+
+        return at
 
     def sample(
         self,

@@ -1,29 +1,9 @@
 """Which blocks of a list touch one another."""
 
-from collections.abc import Callable
-
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import NDArray
 
 from dudmap.kernels.threads import kernel
-
-
-class Lazy:
-    """An array that is computed when it is read.
-
-    Args:
-        compute: Gives it.
-    """
-
-    def __init__(self, compute: Callable[[], NDArray[np.int32]]) -> None:
-        self._compute = compute
-
-    def __array__(self, dtype: DTypeLike = None, copy: bool | None = None) -> NDArray:
-        return np.asarray(self._compute(), dtype)
-
-
-Neighbours = NDArray[np.int32] | Lazy
-"""Slots (n, 8) of the blocks around blocks, or what computes them."""
 
 
 @kernel
@@ -41,7 +21,7 @@ def _link(slots, near, row_of, behind):
 
 
 def links(
-    slots: NDArray[np.int32], neighbours: Neighbours, num_slots: int
+    slots: NDArray[np.int32], neighbours: NDArray[np.int32], num_slots: int
 ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
     """Slots (n,), slots of the neighbours (n, 8) that are among them, rows (n, 8) of the blocks behind, and the row of
     each slot; -1 = none. Blocks that are not among the slots count as absent."""

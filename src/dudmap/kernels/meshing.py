@@ -9,8 +9,7 @@ global array is frozen into the compiled code, and numba's cache does not notice
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.links import Neighbours, links
-from dudmap.kernels.mirror import Mirror, on_host
+from dudmap.kernels.links import links
 from dudmap.kernels.parameters import MeshArrays, MeshParameters
 from dudmap.kernels.surface import crossing, mixed_channel, slope
 from dudmap.kernels.tables import TRIANGLE_COUNT, TRIANGLES
@@ -295,11 +294,11 @@ def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
 
 
 def extract(
-    geometry: Mirror | NDArray[np.int32],
-    colors: Mirror | NDArray[np.int32],
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: Neighbours,
+    neighbours: NDArray[np.int32],
     parameters: MeshParameters,
 ) -> MeshArrays:
     """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
@@ -310,11 +309,11 @@ def extract(
 
 
 def extract_chunks(
-    geometry: Mirror | NDArray[np.int32],
-    colors: Mirror | NDArray[np.int32],
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: Neighbours,
+    neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     chunks: NDArray[np.integer],
 ) -> list[MeshArrays]:
@@ -323,7 +322,7 @@ def extract_chunks(
     order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
     per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
     vertices, faces, vertex_colors, normals, first_face = extract_surface(
-        geometry, colors, slots[order], coords, np.asarray(neighbours)[order], parameters, int(per_chunk.sum())
+        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
     )
     begin = first_face[_offsets([per_chunk])]
     ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
@@ -340,17 +339,17 @@ def extract_chunks(
 
 
 def extract_surface(
-    geometry: Mirror | NDArray[np.int32],
-    colors: Mirror | NDArray[np.int32],
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
     slots: NDArray[np.int32],
     coords: NDArray[np.integer],
-    neighbours: Neighbours,
+    neighbours: NDArray[np.int32],
     parameters: MeshParameters,
     num_meshed: int,
 ) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
     """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
     face (n + 1,) of each block."""
-    geometry, colors, n = on_host(geometry), on_host(colors), len(slots)
+    n = len(slots)
     slots, near, behind, row_of = links(slots, neighbours, len(geometry))
     ranges = bands(n, BAND)
     cases = np.zeros((n, 512), dtype=np.uint8)

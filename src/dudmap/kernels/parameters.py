@@ -10,7 +10,6 @@ from typing import NamedTuple, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.block_index import BlockIndex
 from dudmap.kernels.mirror import Mirror, on_host
 
 BLOCK = 8
@@ -207,13 +206,11 @@ class VoxelGrid(NamedTuple):
     free_count: NDArray[np.uint8]
     voxel_size: float
     sdf_unit: float
-    index: BlockIndex | None = None
 
     def on_host(self) -> "VoxelGrid":
         """The grid with plain arrays, up to date."""
-        grid = self if self.index is None else self.index.refreshed(self)
-        window, geometry, colors = on_host(grid.window), on_host(grid.geometry), on_host(grid.colors)
-        return grid._replace(window=window, geometry=geometry, colors=colors)
+        window, geometry, colors = on_host(self.window), on_host(self.geometry), on_host(self.colors)
+        return self._replace(window=window, geometry=geometry, colors=colors)
 
 
 def to_lattice(
@@ -298,46 +295,6 @@ class NormalEquations(NamedTuple):
     weight: float
     chi_square: float
     residuals: ImageStack
-
-
-class Damping(NamedTuple):
-    """Where the Levenberg-Marquardt steps of a registration begin, and when they end (``kernels/damping.py``).
-
-    Attributes:
-        H, b, cost: Normal equations at the first pose, as of ``NormalEquations``.
-        basis: (6, m) directions along which the pose may move.
-        damping: First damping.
-        limit: Largest number of steps that are tried.
-        stop: Norm of a step (m, rad) below which it is the last one.
-        stop_gain: Relative change of the cost below which a short step is.
-        taken: Norm of a step below which it is made whatever it costs.
-    """
-
-    H: NDArray[np.float64]
-    b: NDArray[np.float64]
-    cost: float
-    basis: NDArray[np.float64]
-    damping: float
-    limit: int
-    stop: float
-    stop_gain: float
-    taken: float
-
-
-class Descent(NamedTuple):
-    """Result of the Levenberg-Marquardt steps of a registration.
-
-    Attributes:
-        T_world_camera: (4, 4) the last accepted pose.
-        equations: Normal equations of the last accepted step; None where they are the first ones.
-        iterations: Number of linearisations.
-        settled: Whether a stop criterion was met.
-    """
-
-    T_world_camera: NDArray[np.float64]
-    equations: NormalEquations | None
-    iterations: int
-    settled: bool
 
 
 class MapSample(NamedTuple):

@@ -6,7 +6,6 @@ A block is read with two voxels around it, from its 27 neighbours (``mapping/fin
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.mirror import Mirror, on_host
 from dudmap.kernels.threads import bands, kernel, run_bands, scalar
 from dudmap.kernels.voxel import intensity_of, pack_color, pack_voxel, sdf_steps
 
@@ -202,31 +201,46 @@ def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geom
 
 
 def examine(
-    geometry: Mirror | NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
+    geometry: NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
-    """See ``LevelBackend.examine``."""
+    """How much the distance and the intensity bend near the surface in each octant of blocks.
+
+    Args:
+        geometry: (slots, 512) int32 voxels of one level.
+        near: (n, 27) int32 slots of the blocks and their neighbours (``mapping/fine_blocks.py``), -1 = none.
+        by_voxel: Voxels per step of the stored distance.
+        saturated: Distance from which on it may be cut off, voxels.
+
+    Returns:
+        (n, 8) each: bend of the distance, per voxel, and of the intensity (0..1), float32, and whether the surface
+        touches the octant, uint8; see ``examine_range``.
+    """
     bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
     surface = np.empty((len(near), 8), dtype=np.uint8)
-    words, by, limit = on_host(geometry), np.float32(by_voxel), np.float32(saturated)
+    by, limit = np.float32(by_voxel), np.float32(saturated)
     run_bands(
-        lambda start, stop: examine_range(start, stop, words, near, by, limit, bend, texture, surface),
+        lambda start, stop: examine_range(start, stop, geometry, near, by, limit, bend, texture, surface),
         bands(len(near), BAND),
     )
     return bend, texture, surface
 
 
 def prolong(
-    geometry: Mirror | NDArray[np.int32],
-    colors: Mirror | NDArray[np.int32],
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
     near: NDArray[np.int32],
     octants: NDArray[np.int64],
     slots: NDArray[np.int32],
-    fine_geometry: Mirror | NDArray[np.int32],
-    fine_colors: Mirror | NDArray[np.int32],
+    fine_geometry: NDArray[np.int32],
+    fine_colors: NDArray[np.int32],
 ) -> None:
-    """See ``LevelBackend.prolong``."""
-    coarse, fine = (on_host(geometry), on_host(colors)), (on_host(fine_geometry), on_host(fine_colors))
-    prolong_range(0, len(slots), *coarse, near, octants, slots, *fine)
-    for array in (fine_geometry, fine_colors):
-        if isinstance(array, Mirror):
-            array.wrote(slots)
+    """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
+
+    Args:
+        geometry, colors: (coarse slots, 512) int32.
+        near: (n, 27) int32 coarse slots around the parent of each block, -1 = none.
+        octants: (n,) octant of the parent.
+        slots: (n,) int32 slots of the blocks.
+        fine_geometry, fine_colors: (fine slots, 512) int32, changed here.
+    """
+    prolong_range(0, len(slots), geometry, colors, near, octants, slots, fine_geometry, fine_colors)

@@ -65,7 +65,7 @@ def _contours(
     row_of = np.full(len(blocks.entry_of) + 1, -1, dtype=np.int32)
     row_of[slots] = np.arange(len(slots), dtype=np.int32)
     rows = row_of[near]  # -1 is the last element
-    finer = two_levels(levels).on_host()
+    finer = two_levels(levels)
     coords, geometry, colors = np.ascontiguousarray(blocks.slot_coords[slots]), blocks.geometry, blocks.colors
     least = max(int(parameters.min_weight), 1)
     parts = run_bands(

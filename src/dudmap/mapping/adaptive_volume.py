@@ -14,6 +14,7 @@ from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.errors import MapError
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh, joined
+from dudmap.kernels import adaptive_raycasting
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.parameters import DepthView, RaycastParameters, RaycastResult
 from dudmap.mapping.adaptive_mesh import extract_groups
@@ -73,7 +74,6 @@ class AdaptiveVolume(TsdfVolume):
     """
 
     levels: Sequence[FineBlocks]
-    _numbered_on_host = True  # the finer levels refer to the slots of the coarser ones
 
     def __init__(
         self,
@@ -95,7 +95,7 @@ class AdaptiveVolume(TsdfVolume):
             integrator.parameters = integrator.parameters._replace(band=band, sdf_unit=self.sdf_unit)
             self._integrators.append(integrator)
             parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
-            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit, self.backend))
+            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
 
     def _halved(self, voxel_size: float) -> VolumeConfig:
         return self.config.model_copy(update={"voxel_size": voxel_size})
@@ -147,7 +147,6 @@ class AdaptiveVolume(TsdfVolume):
     ) -> NDArray[np.int32]:
         weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
         fused = super()._fuse(depth, color, weights, T_world_camera, count)
-        assert fused is not None
         number = self._frame_number
         view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
         slots, updated = self.window.near, fused
@@ -244,7 +243,7 @@ class AdaptiveVolume(TsdfVolume):
         camera = camera or self.camera
         self.look_at(T_world_camera)
         parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
-        return self.backend.raycast_levels(
+        return adaptive_raycasting.raycast(
             self.grid, two_levels(self.levels), T_world_camera, camera.intrinsics, camera.shape, parameters
         )
 

@@ -54,31 +54,13 @@ class BlockWindow:
 
     def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
         """Place the window at an origin (3,)."""
-        self.near = np.sort(self.fill_cells(origin, blocks))
-        self.mirror.wrote()
-
-    def follow(self, near: NDArray[np.int32], blocks: VoxelBlocks) -> None:
-        """Take over what a device has made of the window: the slots (n,) in it, and cells that it has already."""
-        if self.origin is not None:
-            self.fill_cells(self.origin, blocks)
-        self.near = near
-
-    def fill_cells(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> NDArray[np.int32]:
-        """Place the window at an origin (3,), in the host's memory; slots (n,) in it."""
         self.origin = origin
         self.cells.fill(-1)  # the stamps may stay: no frame has the number of an earlier one
         cells = self.cells.reshape(tuple(self.shape))
         inside = np.empty(blocks.num_entries, dtype=np.int32)
         count = hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
-        return inside[:count]
-
-    def cells_at(self, coords: NDArray[np.int32]) -> NDArray[np.int64]:
-        """Cells (n,) of the blocks at coordinates (n, 3); -1 outside."""
-        assert self.origin is not None
-        offsets = coords - self.origin
-        inside = np.all((offsets >= 0) & (offsets < self.shape), axis=1)
-        cells = (offsets[:, 0] * self.shape[1] + offsets[:, 1]) * self.shape[2] + offsets[:, 2]
-        return np.where(inside, cells, -1)
+        self.near = np.sort(inside[:count])
+        self.mirror.wrote()
 
     @property
     def local_origin(self) -> NDArray[np.int64]:

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.kernels.level_backend import FinerLevels
+from dudmap.kernels.adaptive_raycasting import FinerLevels
 from dudmap.kernels.mirror import grown
 from dudmap.kernels.parameters import VoxelGrid
 from dudmap.mapping.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
@@ -145,7 +145,7 @@ class FineBlocks:
         coords = coords if not origin.any() else (coords - origin).astype(coords.dtype)
         nothing = np.empty(0, dtype=np.int32)
         return VoxelGrid(
-            nothing, np.zeros(3, np.int64), origin, self.blocks.geometry_mirror, self.blocks.colors_mirror,
+            nothing, np.zeros(3, np.int64), origin, self.blocks.geometry, self.blocks.colors,
             coords, self.blocks.free_count, self.voxel_size, sdf_unit,
         )  # fmt: skip
 
@@ -157,8 +157,8 @@ def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.i
 
 
 def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
-    """The finer levels of a map, at most two, as back ends take them."""
+    """The finer levels of a map, at most two, as views and meshes read them."""
     missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
-    arrays = [(level.children, level.blocks.geometry_mirror, level.blocks.colors_mirror) for level in levels]
+    arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels]
     (children1, geometry1, colors1), (children2, geometry2, colors2) = arrays + missing
     return FinerLevels(children1, children2, geometry1, geometry2, colors1, colors2)

@@ -10,7 +10,6 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.parameters import DepthView, FusionParameters, SensorNoise, TruncationBand, VoxelGrid
-from dudmap.mapping.block_index import BlockIndex
 from dudmap.mapping.block_window import BlockWindow
 from dudmap.mapping.voxel_blocks import VoxelBlocks
 
@@ -77,7 +76,8 @@ class Integrator:
 
     def integrate(
         self,
-        index: BlockIndex,
+        blocks: VoxelBlocks,
+        window: BlockWindow,
         camera: Camera,
         depth: NDArray[np.float32],
         color: NDArray[np.uint8],
@@ -85,11 +85,12 @@ class Integrator:
         T_world_camera: NDArray[np.float64],
         frame_number: int,
         count: int,
-    ) -> NDArray[np.int32] | None:
+    ) -> NDArray[np.int32]:
         """Fuse an image.
 
         Args:
-            index: Blocks of the map, and the window of those around the view, to which it has been moved; changed here.
+            blocks, window: Blocks of the map, and the window of those around the view, to which it has been moved;
+                changed here.
             camera: Camera of the image.
             depth: (H, W) float32, metres, 0 where nothing is to be fused.
             color: (H, W, 3) uint8.
@@ -99,15 +100,14 @@ class Integrator:
             count: Number of equal frames that it stands for.
 
         Returns:
-            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released. None where
-            a device keeps their list.
+            (n,) int32 slots that it was averaged into; those that it shows to be empty have been released.
         """
-        view = self.view(index.place, camera, depth, T_world_camera)
-        self._allocate(index, view, frame_number)
+        view = self.view(window, camera, depth, T_world_camera)
+        self._allocate(blocks, window, view, frame_number)
         weights = self.reading_weights(depth, camera) if weights is None else weights
-        slots = self._average(index, view, color, weights, frame_number, count)
+        slots = self._average(blocks, window, view, color, weights, frame_number, count)
         if self.config.carving:
-            self._observe_free(index, view, frame_number, count)
+            self._observe_free(blocks, window, view, frame_number, count)
         return slots
 
     def view(
@@ -119,13 +119,8 @@ class Integrator:
         T_camera_local = T_camera_local[:3].astype(np.float32)
         return self.backend.view(depth, camera.intrinsics, window.T_grid_camera(T_world_camera), T_camera_local)
 
-    def grid(self, index: BlockIndex) -> VoxelGrid:
-        """The blocks around the view as a back end takes them, which a device may number; valid until blocks are
-        added."""
-        return self._grid(index.held, index.place)._replace(index=index)
-
-    def _grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
-        """The same of blocks that are up to date in the host's memory."""
+    def grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
+        """The blocks around the view as a back end takes them; valid until blocks are added."""
         assert window.origin is not None
         return VoxelGrid(
             window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
@@ -134,25 +129,19 @@ class Integrator:
 
     def _local_grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
         """The same with coordinates from the window's local origin, for 32-bit arithmetic far from that of the map."""
-        grid, origin = self._grid(blocks, window), window.local_origin
+        grid, origin = self.grid(blocks, window), window.local_origin
         if not origin.any():
             return grid
         coords = (grid.slot_coords - origin).astype(grid.slot_coords.dtype)
         return grid._replace(origin=grid.origin - origin, slot_coords=coords)
 
-    def _allocate(self, index: BlockIndex, view: DepthView, frame_number: int) -> None:
+    def _allocate(self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int) -> None:
         """Allocate voxels for the blocks that the truncation band of the image touches."""
         farthest, free_after = max(float(view.depth.max()), 0.05), self.config.free_after
-        size = index.place.block_size
-        half_block = 0.5 * size * float(view.intrinsics[0]) / farthest  # pixels, at the farthest reading
+        half_block = 0.5 * window.block_size * float(view.intrinsics[0]) / farthest  # pixels, at the farthest reading
         stride = int(np.clip(half_block, 1, 8))
-        if index.may_lead and self.backend.allocate_touched(
-            self.grid(index), view, stride, free_after, frame_number, self.parameters
-        ):
-            return
-        blocks, window = index.blocks, index.window
         cells = self.backend.touched_cells(
-            self._grid(blocks, window), view, window.stamps, stride, free_after, frame_number, self.parameters
+            self.grid(blocks, window), view, window.stamps, stride, free_after, frame_number, self.parameters
         )
         if len(cells):
             window.allocate(cells, blocks, frame_number)
@@ -165,26 +154,20 @@ class Integrator:
 
     def _average(
         self,
-        index: BlockIndex,
+        blocks: VoxelBlocks,
+        window: BlockWindow,
         view: DepthView,
         color: NDArray[np.uint8],
         weights: NDArray[np.uint8],
         frame_number: int,
         count: int,
-    ) -> NDArray[np.int32] | None:
+    ) -> NDArray[np.int32]:
         """Average distances and colours into the voxels in view; release the blocks that are seen to be empty."""
-        if index.num_near == 0:
-            return index.window.near
+        if len(window.near) == 0:
+            return window.near
         turn = frame_number if self.config.take_turns else -1
         if self.config.antialias:
             color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
-        release_as = self.config.free_after if self.config.carving else -1
-        if index.may_lead and self.backend.fuse_near(
-            self.grid(index), view, color, weights, index.place.local_origin, turn, count, frame_number, release_as,
-            self.parameters,
-        ):  # fmt: skip
-            return None
-        blocks, window = index.blocks, index.window
         grid = self._local_grid(blocks, window)
         slots, occupied = self.backend.fuse(
             grid, view, color, weights, window.near, blocks.fused, turn, count, self.parameters
@@ -195,16 +178,14 @@ class Integrator:
             window.release(slots[occupied == 0], blocks, self.config.free_after)
         return slots
 
-    def _observe_free(self, index: BlockIndex, view: DepthView, frame_number: int, count: int) -> None:
+    def _observe_free(
+        self, blocks: VoxelBlocks, window: BlockWindow, view: DepthView, frame_number: int, count: int
+    ) -> None:
         """Count ``count`` more observations of emptiness for blocks without voxels in front of the image.
 
         Each call visits every second plane of the window, so that the cost is spread over two frames.
         """
-        times = frame_number % 2, count, self.config.free_after
-        if index.may_lead and self.backend.record_free(
-            self.grid(index), view, index.place.local_origin, *times, self.parameters
-        ):
-            return
-        blocks, window = index.blocks, index.window
-        cells = self.backend.observe_free(self._local_grid(blocks, window), view, *times, self.parameters)
+        cells = self.backend.observe_free(
+            self._local_grid(blocks, window), view, frame_number % 2, count, self.config.free_after, self.parameters
+        )
         window.set_free(cells, blocks, count)

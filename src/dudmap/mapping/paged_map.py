@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from dudmap.config import VolumeConfig
 from dudmap.kernels.backend import Backend
-from dudmap.mapping.block_index import BlockIndex
 from dudmap.mapping.block_pager import REGION, BlockPager, regions_of
 from dudmap.mapping.block_tree import BlockTree
 from dudmap.mapping.block_window import BlockWindow
@@ -24,32 +23,12 @@ class PagedMap:
     levels: Sequence[FineBlocks]
     pager: BlockPager | None
     block_size: float
-    _index: BlockIndex
+    blocks: VoxelBlocks
+    window: BlockWindow
     _integrator: Integrator
     _window_cells: int
     _frame_number: int
     _left: NDArray[np.int64] | None  # where the window was when all blocks left the memory
-
-    _numbered_on_host = False
-    """Whether the host needs the index in every frame, so that no device may be ahead of it."""
-
-    @property
-    def blocks(self) -> VoxelBlocks:
-        """The blocks of the map that are in memory, up to date."""
-        return self._index.blocks
-
-    @blocks.setter
-    def blocks(self, blocks: VoxelBlocks) -> None:
-        self._hold(blocks, self._index.place)
-
-    @property
-    def window(self) -> BlockWindow:
-        """The blocks around the view, up to date."""
-        return self._index.window
-
-    def _hold(self, blocks: VoxelBlocks, window: BlockWindow) -> None:
-        on_host = self._numbered_on_host or self.pager is not None
-        self._index = BlockIndex(blocks, window, on_host=on_host)
 
     @property
     def all_blocks(self) -> VoxelBlocks | BlockTree:
@@ -59,12 +38,12 @@ class PagedMap:
     @property
     def num_blocks(self) -> int:
         """Blocks that own voxels, also those that are not in memory."""
-        return self._index.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
+        return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
 
     @property
     def view_bytes(self) -> int:
         """Memory of the voxels around the view."""
-        return self._index.num_near * self._index.held.slot_bytes
+        return len(self.window.near) * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
         """Empty blocks, with room for as many as will be in memory."""
@@ -72,7 +51,7 @@ class PagedMap:
 
     def _empty(self) -> None:
         """Have no blocks and no window in memory."""
-        self._hold(self._new_blocks(), BlockWindow(self.block_size, self._window_cells))
+        self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
 
     def page_out(self) -> None:
         """Have all blocks wait on disk, where the map may do so, until they are needed again."""
@@ -82,19 +61,11 @@ class PagedMap:
             self._empty()
 
     def _place_window(self, origin: NDArray[np.int64]) -> None:
-        index = self._index
-        self._bring(origin, origin + index.place.shape)
-        leads = index.copy is not None and index.may_lead
-        if leads and self.backend.place_window(self._integrator.grid(index), origin):
-            index.place.origin = origin
-        else:
-            self.window.fill(origin, self.blocks)
+        self._bring(origin, origin + self.window.shape)
+        self.window.fill(origin, self.blocks)
 
     def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
         """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
-        finer = [level.blocks.colors_mirror for level in self.levels]
-        if self.pager is None and (room := self._index.held.colors_mirror.max_rows(finer)):
-            self.pager, self._index.on_host = BlockPager(room), True
         if self.pager is not None:
             self.pager.focus(self.all_blocks, low, high, self._frame_number)
 

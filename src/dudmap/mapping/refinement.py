@@ -4,9 +4,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.kernels.backend import Backend
 from dudmap.kernels.parameters import TruncationBand
-from dudmap.kernels.refinement import SATURATED, prolong
+from dudmap.kernels.refinement import SATURATED, examine, prolong
 from dudmap.mapping.fine_blocks import FineBlocks, neighbourhood
 from dudmap.mapping.voxel_blocks import BLOCK, VoxelBlocks
 
@@ -36,7 +35,6 @@ class Refinement:
         band: Truncation band of the coarser level.
         voxel_size: Of the coarser level, metres.
         sdf_unit: Metres per step of a stored distance.
-        backend: Compute device of the map.
     """
 
     def __init__(
@@ -46,9 +44,8 @@ class Refinement:
         band: TruncationBand,
         voxel_size: float,
         sdf_unit: float,
-        backend: Backend,
     ) -> None:
-        self.config, self.sensor, self.backend = config, sensor, backend
+        self.config, self.sensor = config, sensor
         self.voxel_size = voxel_size
         self._by_voxel, self._saturated = sdf_unit / voxel_size, float(SATURATED * band.front / voxel_size)
 
@@ -80,7 +77,7 @@ class Refinement:
         if len(slots) == 0:
             return slots
         near = neighbourhood(parents, slots)
-        bend, texture, found = self.backend.examine(parents.geometry_mirror, near, self._by_voxel, self._saturated)
+        bend, texture, found = examine(parents.geometry, near, self._by_voxel, self._saturated)
         surface = found.astype(bool)
         noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (self.voxel_size * np.sqrt(np.minimum(fused, 64)))
         needed = np.maximum(
@@ -90,10 +87,8 @@ class Refinement:
         rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
         if len(rows):
             opened = level.open(parents, slots[rows], octants, number)
-            self.backend.prolong(
-                parents.geometry_mirror, parents.colors_mirror, near[rows], octants, opened,
-                level.blocks.geometry_mirror, level.blocks.colors_mirror,
-            )  # fmt: skip
+            blocks = level.blocks
+            prolong(parents.geometry, parents.colors, near[rows], octants, opened, blocks.geometry, blocks.colors)
         dropped = self._drop_calm(level, children, surface, needed)
         changed = np.zeros(len(slots), dtype=bool)
         changed[rows] = True

@@ -12,10 +12,10 @@ from dudmap.errors import MapError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.mesh import Mesh, joined
+from dudmap.kernels import meshing
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.kernels.integration import used_readings
-from dudmap.kernels.links import Lazy
 from dudmap.kernels.parameters import (
     FREE,
     SURFACE,
@@ -125,7 +125,7 @@ class TsdfVolume(PagedMap):
     @property
     def num_free_blocks(self) -> int:
         """Blocks in memory known to be free space; they own no voxels."""
-        return self._index.to_read.num_free(self.config.free_after)
+        return self.blocks.num_free(self.config.free_after)
 
     @property
     def num_bytes(self) -> int:
@@ -135,17 +135,17 @@ class TsdfVolume(PagedMap):
         The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
         is the window, whose size depends on the view and the voxels, not on the map.
         """
-        return self._index.to_read.num_bytes
+        return self.blocks.num_bytes
 
     @property
     def entry_bytes(self) -> float:
         """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
-        return self._index.to_read.entry_bytes
+        return self.blocks.entry_bytes
 
     @property
     def active_slots(self) -> NDArray[np.int32]:
         """Slots (n,) int32 of all blocks that own voxels, ascending."""
-        return self._index.to_read.active_slots
+        return self.blocks.active_slots
 
     # -- writing -----------------------------------------------------------------------------------------------------
 
@@ -189,16 +189,16 @@ class TsdfVolume(PagedMap):
         weights: NDArray[np.uint8] | None,
         T_world_camera: NDArray[np.float64],
         count: int,
-    ) -> NDArray[np.int32] | None:
+    ) -> NDArray[np.int32]:
         """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
         return self._integrator.integrate(
-            self._index, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
         )
 
     def take_over(self, other: "TsdfVolume") -> None:
         """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
-        self._index, self.pager = other._index, other.pager
+        self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
 
     def for_camera(
@@ -214,7 +214,7 @@ class TsdfVolume(PagedMap):
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
         """Move the window so that it covers what a camera at this pose can see."""
         middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
-        origin = self._index.place.moved(middle, self._left)
+        origin = self.window.moved(middle, self._left)
         if origin is not None:
             self._left = None
             self._place_window(origin)
@@ -224,11 +224,11 @@ class TsdfVolume(PagedMap):
     @property
     def grid(self) -> VoxelGrid:
         """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
-        return self._integrator.grid(self._index)
+        return self._integrator.grid(self.blocks, self.window)
 
     def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
-        return self._index.place.T_grid_camera(T_world_camera)
+        return self.window.T_grid_camera(T_world_camera)
 
     def sample(
         self,
@@ -259,9 +259,9 @@ class TsdfVolume(PagedMap):
         rows, columns = np.nonzero(depth)
         points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
         voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
-        slots, local = self._index.slots_at(voxels // BLOCK), voxels % BLOCK
+        slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
         numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
-        words = self._index.held.geometry_mirror.take(np.maximum(slots, 0), numbers)
+        words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
         gains = np.asarray(self._integrator.reading_weights(depth, camera))
@@ -285,11 +285,11 @@ class TsdfVolume(PagedMap):
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
             return joined(list(self.extract_pieces(min_weight)))
-        slots, blocks = self.active_slots, self._index.to_read
+        slots, blocks = self.active_slots, self.blocks
         return Mesh(
-            *self.backend.extract_mesh(
-                blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
-                Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight),
+            *meshing.extract(
+                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+                self._mesh_parameters(min_weight),
             )
         )  # fmt: skip
 
@@ -321,10 +321,10 @@ class TsdfVolume(PagedMap):
             chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
             min_weight: As of ``extract_mesh``.
         """
-        blocks = self._index.to_read
-        meshes = self.backend.extract_chunks(
-            blocks.geometry_mirror, blocks.colors_mirror, slots, blocks.slot_coords,
-            Lazy(lambda: blocks.neighbours(slots)), self._mesh_parameters(min_weight), chunks,
+        blocks = self.blocks
+        meshes = meshing.extract_chunks(
+            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+            self._mesh_parameters(min_weight), chunks,
         )  # fmt: skip
         return [Mesh(*mesh) for mesh in meshes]
 
@@ -338,13 +338,13 @@ class TsdfVolume(PagedMap):
 
         A slot that was released is among them, with the coordinates of the block that had it or of the next one.
         """
-        blocks = self._index.to_read
+        blocks = self.blocks
         slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
         return slots, blocks.slot_coords[slots].astype(np.int32)
 
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
-        return self._index.to_read.slots_at(coords)
+        return self.blocks.slots_at(coords)
 
     # -- files -------------------------------------------------------------------------------------------------------
 

@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels import hashing
-from dudmap.kernels.block_index import IndexArrays
 from dudmap.kernels.mirror import Mirror, grown
 from dudmap.kernels.parameters import BLOCK
 
@@ -137,9 +136,8 @@ class VoxelBlocks:
     @property
     def slot_bytes(self) -> int:
         """Bytes of a slot."""
-        voxels = self.geometry_mirror.stale, self.colors_mirror.stale
-        slots = (*voxels, self.slot_coords, self.entry_of, self.written, self.fused)
-        return sum(_row_bytes(array) for array in slots)
+        slots = (self.slot_coords, self.entry_of, self.written, self.fused)
+        return 2 * 4 * BLOCK**3 + sum(_row_bytes(array) for array in slots)
 
     @property
     def entry_bytes(self) -> float:
@@ -177,8 +175,8 @@ class VoxelBlocks:
         """Have room for so many slots."""
         if needed > len(self.entry_of):
             capacity = max(needed, len(self.entry_of) * 3 // 2)
-            self.geometry_mirror.grow(capacity, 0)
-            self.colors_mirror.grow(capacity, 0)
+            self.geometry_mirror.grow(capacity)
+            self.colors_mirror.grow(capacity)
             self.entry_of = grown(self.entry_of, capacity, -1)
             self.slot_coords = grown(self.slot_coords, capacity, 0)
             self.written = grown(self.written, capacity, 0)
@@ -199,36 +197,10 @@ class VoxelBlocks:
         self.slot_of[entries] = slots
         return slots
 
-    def arrays(self, near: NDArray[np.int32]) -> IndexArrays:
-        """All but the voxels, as a device takes it over; with the slots (n,) of a window."""
-        n, m = self.num_entries, self.num_slots
-        return IndexArrays(
-            self.coords[:n], self.slot_of[:n], self.free_count[:n], self.entry_of[:m], self.slot_coords[:m],
-            self.written[:m], self.fused[:m], self._released, near,
-        )  # fmt: skip
-
-    def follow(self, index: IndexArrays) -> None:
-        """Take over what a device has made of ``arrays``; entries that it did not have are new ones.
-
-        Voxels of a slot that another block had are removed until those of the device come down.
-        """
-        n, m, known = len(index.coords), len(index.entry_of), self.num_entries
-        self.reserve_entries(n)
-        self.reserve_slots(m)
-        _, self.num_entries = hashing.insert_all(self.table, self.coords, known, index.coords[known:])
-        moved = (index.entry_of < 0) | np.any(index.slot_coords != self.slot_coords[:m], axis=1)
-        moved &= self.entry_of[:m] >= 0
-        self.geometry_mirror.stale[:m][moved], self.colors_mirror.stale[:m][moved] = 0, 0
-        self.slot_of[:n], self.free_count[:n] = index.slot_of, index.free_count
-        self.entry_of[:m], self.slot_coords[:m] = index.entry_of, index.slot_coords
-        self.written[:m], self.fused[:m], self._released = index.written, index.fused, index.released
-        self.use_slots(m)
-
     def use_slots(self, num_slots: int) -> None:
         """Take the slots below a number for used, on a device, too."""
         self.num_slots = num_slots
-        self.geometry_mirror.use(num_slots)
-        self.colors_mirror.use(num_slots)
+        self.geometry_mirror.used = self.colors_mirror.used = num_slots
 
     def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
         """Release and empty slots; their entries (n,) int32 get at least so many observations of emptiness."""

@@ -8,8 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DatasetError, DudmapError, FrameError
-from dudmap.gpu import faults
+from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, FrameError
 from dudmap.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
@@ -179,14 +178,19 @@ class Job:
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
         out, display, stopped, defect = self.out, self.display, "", False
-        with ExitStack() as files, display, faults.told_to(display.note):
+        with ExitStack() as files, display:
             try:
                 if self.live:
                     display.working("loading kernels")
                     load_kernels(self._system(state, None), self.sequence, self.count)
-                while not self._process(state, store):
-                    assert store is not None
+                try:
+                    self._process(state, store)
+                except DeviceError as error:
+                    if store is None:
+                        raise
+                    display.note(f"{error}; the run goes on on the CPU")
                     state, store = files.enter_context(self._from_checkpoint(state, store))
+                    self._process(state, store)
                 if len(state.slam.maps) > 1:
                     display.note(_unmerged_submaps(state.slam))
                 if state.record.repeated:
@@ -213,13 +217,8 @@ class Job:
             raise DatasetError(f"none of the {self.count} frames could be read; the first: {record.unreadable[0]}")
         return report
 
-    def _process(self, state: RunState, store: RunStore | None) -> bool:
-        """Process the frames of all passes that are left.
-
-        Returns:
-            Whether all of them were processed; else a device failed, and the state lacks what it had not given back.
-        """
-        lost = faults.lost_devices()
+    def _process(self, state: RunState, store: RunStore | None) -> None:
+        """Process the frames of all passes that are left."""
         for number in range(state.number, self.passes):
             if number > state.number:
                 state.finished = state.slam, state.record
@@ -249,12 +248,9 @@ class Job:
                     )
                     state.next = frame.number + 1
                     if store is not None:
-                        if faults.lost_devices() != lost:
-                            return False
                         store.frame(state, frame.read.frame)
         if store is not None:
             store.end(state)
-        return True
 
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:

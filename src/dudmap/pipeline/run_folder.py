@@ -19,7 +19,6 @@ from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.geometry.mesh_pieces import save_pieces
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.gpu.device import resolve
 from dudmap.own_folder import OwnFolder, make_folder, remove_files
 from dudmap.pipeline.environment import machine, versions
 from dudmap.pipeline.metrics import RunRecord
@@ -173,7 +172,7 @@ def write_run_folder(
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
-        metrics["device"] = resolve(config.device)
+        metrics["device"] = slam.device
         metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 

@@ -10,7 +10,6 @@ from typing import Any
 
 from dudmap.atomic_file import bring_to_disk
 from dudmap.errors import StateError
-from dudmap.gpu import faults
 from dudmap.state.database import StateDatabase
 from dudmap.state.system import take_snapshot
 from dudmap.state.tree import NotSettledError, Snapshot
@@ -48,7 +47,6 @@ class Checkpoints:
         self._cost, self._last_cost = 0.0, 0.0  # seconds, of all checkpoints and of the last
         self._files: list[Path] = []
         self._failing = False
-        self._lost = faults.lost_devices()
 
     @property
     def is_due(self) -> bool:
@@ -89,8 +87,6 @@ class Checkpoints:
         except StateError as error:  # a defect of this program, which is no reason to end the run
             self._last = start
             self._warn(error)
-            return
-        if faults.lost_devices() != self._lost:  # the snapshot may lack what the device wrote
             return
         files, self._files = self._files, []
         self._last_cost, self._last = time.thread_time() - busy, start

@@ -32,17 +32,17 @@ REBUILT = {
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
     "Observation": ("_halvings", "_recorded_halvings"),  # computed once per image, from it alone
-    "StageTimer": ("_clock", "_marks", "_inner"),  # of a device, and only until the frame is done
     "SimilarityTest": ("_sift",),
     "Slam": ("device",),  # a run may be continued on another one
     "TsdfVolume": (
-        "_index",
+        "blocks",
+        "window",
         "levels",
         "map_id",
     ),  # the blocks have a table; the number is one of this process
 }
 """Attributes by class that a new object makes itself, so that they are not part of the state."""
-BACKENDS = frozenset({"CpuBackend", "FallbackBackend"})
+BACKENDS = frozenset({"CpuBackend", "WarpBackend"})
 """Classes of back ends, which hold nothing that is part of the state: a new one may be of another device."""
 EVALUATED = {"FrameView": ("segmentation",)}
 """Attributes that are functions without arguments, of which the result is stored."""

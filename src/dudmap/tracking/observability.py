@@ -52,14 +52,6 @@ class Observability:
         more = np.kron(np.eye(2), R_world_camera) @ self.unobservable[shown].T
         return Observability(np.hstack([self.observable, more]), self.unobservable[~shown])
 
-    def step(self, H: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Solution (6,) of ``H step = -b`` that does not move along directions that are not determined (the solution
-        remapping of Zhang et al., with the directions orthogonal under the noise of H)."""
-        if self.is_complete:
-            return np.asarray(-np.linalg.solve(H, b), dtype=np.float64)
-        basis = self.observable
-        return basis @ np.linalg.solve(basis.T @ H @ basis, -basis.T @ b)
-
 
 COMPLETE = Observability(np.eye(6), np.empty((0, 6)))
 """Every direction is determined."""

@@ -9,9 +9,9 @@ from dudmap.config import SensorConfig, TrackerConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels.damping import SHORT_STEP, added, is_accepted, is_settled, relaxed, tightened
+from dudmap.kernels.descent import SHORT_STEP, Descent, DescentRules
 from dudmap.kernels.median import median
-from dudmap.kernels.parameters import Damping, NormalEquations, RegistrationParameters
+from dudmap.kernels.parameters import NormalEquations, RegistrationParameters
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.checks import REGISTRATION, Limits, first_failure
 from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
@@ -170,10 +170,9 @@ class Tracker:
             finest = first_level + index == len(self.config.iterations) - 1
             if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
                 seen = self._observability(volume, lit, T, weights, system, color_weight)
-            T, system, used, settled = self._optimize(
-                volume, lit, T, weights, system, limit, finest, color_weight, seen
-            )
-            iterations += used
+            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, seen), color_weight)
+            T, system, settled = found.T_world_camera, found.equations, found.settled
+            iterations += found.iterations
         if system is None:  # all levels are skipped: the initial pose is judged
             system = self.linearize(volume, lit, T, weights, color_weight)
         return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
@@ -211,79 +210,34 @@ class Tracker:
             shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
         return seen.with_shown(np.array(shown), R)
 
-    def _optimize(
+    def _descend(
         self,
         volume: TsdfVolume,
         level: Level,
-        T: NDArray[np.float64],
+        T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
         system: NormalEquations,
-        limit: int,
-        finest: bool,
+        rules: DescentRules,
         color_weight: float | None,
-        seen: Observability,
-    ) -> tuple[NDArray[np.float64], NormalEquations, int, bool]:
-        """Levenberg-Marquardt on one level (Marquardt 1963): the damping is scaled by the diagonal of H, and a step is
-        accepted if it decreases the cost. It moves only along the directions that are ``seen``.
+    ) -> Descent:
+        """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds."""
+        return volume.backend.register(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
+            self._parameters(volume, color_weight),
+        )  # fmt: skip
+
+    def _rules(self, limit: int, finest: bool, seen: Observability) -> DescentRules:
+        """Rules of the steps of a level, which move only along the directions that are ``seen``.
 
         A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
         and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
         decide which are, and where the registration ends.
-
-        Returns:
-            Pose, its normal equations, number of linearisations, whether a stop criterion was met.
         """
-        rules = self._damping(system, limit, finest, seen)
-        found = self._descended(volume, level, T, weights, system, rules, color_weight)
-        if found is not None:
-            return found
-        damping, used = rules.damping, 0
-        for _ in range(limit):
-            diagonal = np.diag(system.H)
-            if not diagonal.max() > 0:
-                break
-            damped = system.H + np.diag(added(diagonal, diagonal.max(), damping))
-            step = seen.step(damped, system.b)
-            T_trial, length = se3.retract(T, step), np.linalg.norm(step)
-            if length < rules.stop:  # too short to need another linearisation
-                return T_trial, system, used, True
-            trial = self.linearize(volume, level, T_trial, weights, color_weight)
-            used += 1
-            settled = is_settled(length, system.cost, trial.cost, rules.stop, rules.stop_gain)
-            if is_accepted(length, system.cost, trial.cost, rules.taken):
-                T, system, damping = T_trial, trial, relaxed(damping)
-            else:
-                damping = tightened(damping)
-            if settled:
-                return T, system, used, True
-        return T, system, used, False
-
-    def _damping(self, system: NormalEquations, limit: int, finest: bool, seen: Observability) -> Damping:
-        """Beginning and rules of the steps of a level."""
-        config, first = self.config, (system.H, system.b, system.cost, seen.observable)
+        config, basis = self.config, seen.observable
         if finest:
             damping = min(config.damping, FINEST_DAMPING)
-            return Damping(*first, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
-        return Damping(*first, config.damping, limit, config.stop_coarse, config.stop_gain, taken=0.0)
-
-    def _descended(
-        self,
-        volume: TsdfVolume,
-        level: Level,
-        T: NDArray[np.float64],
-        weights: NDArray[np.float32],
-        system: NormalEquations,
-        rules: Damping,
-        color_weight: float | None,
-    ) -> tuple[NDArray[np.float64], NormalEquations, int, bool] | None:
-        """What ``_optimize`` returns, found by the compute device alone; None where it does not run the loop."""
-        found = volume.backend.descend(
-            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T, rules,
-            self._parameters(volume, color_weight),
-        )  # fmt: skip
-        if found is None:
-            return None
-        return found.T_world_camera, found.equations or system, found.iterations, found.settled
+            return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
+        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain, taken=0.0)
 
     def linearize(
         self,

@@ -14,20 +14,7 @@ import numpy as np
 import warp as wp
 from numba.core.dispatcher import Dispatcher
 
-from dudmap.kernels import (
-    evidence,
-    filtering,
-    finest,
-    labeling,
-    pixel,
-    raycasting,
-    refinement,
-    residual,
-    sampling,
-    segmentation,
-    voxel,
-)
-from dudmap.kernels import surface as vertex
+from dudmap.kernels import filtering, pixel, raycasting, residual, sampling, voxel
 
 wp.set_module_options({"enable_backward": False})
 
@@ -119,9 +106,8 @@ def _counterpart(value: object) -> object:
 
 
 rotate, transform = warp_function(pixel.rotate), warp_function(pixel.transform)
-ray, project, sigma = warp_function(pixel.ray), warp_function(pixel.project), warp_function(pixel.sigma)
-band_front, band_behind = warp_function(pixel.band_front), warp_function(pixel.band_behind)
-free_depth, reading_weight = warp_function(pixel.free_depth), warp_function(pixel.reading_weight)
+ray, project = warp_function(pixel.ray), warp_function(pixel.project)
+free_depth = warp_function(pixel.free_depth)
 sdf_steps, intensity_of = warp_function(voxel.sdf_steps), warp_function(voxel.intensity_of)
 pack_reading, pack_pixel_color = warp_function(voxel.pack_reading), warp_function(voxel.pack_pixel_color)
 fuse_voxel, fuse_color = warp_function(voxel.fuse_voxel), warp_function(voxel.fuse_color)
@@ -129,22 +115,7 @@ is_occupied = warp_function(voxel.is_occupied)
 trilinear, weigh = warp_function(residual.trilinear), warp_function(residual.weigh)
 normal_terms = warp_function(residual.normal_terms)
 corner_weight = warp_function(sampling.corner_weight)
-mean_spin, same_surface = warp_function(labeling.mean_spin), warp_function(labeling.same_surface)
-dynamic_responsibility = warp_function(labeling.dynamic_responsibility)
-bounded_sigma = warp_function(labeling.bounded_sigma)
-residual_bin, noise_limit = warp_function(evidence.residual_bin), warp_function(evidence.noise_limit)
-static_sigma, edge_tolerance = warp_function(evidence.static_sigma), warp_function(evidence.edge_tolerance)
-surface_log_odds = warp_function(evidence.surface_log_odds)
-normal_of_gradient, is_concave = warp_function(segmentation.normal_of_gradient), warp_function(segmentation.is_concave)
-plane_distance = warp_function(segmentation.plane_distance)
 range_weight, between = warp_function(filtering.range_weight), warp_function(filtering.between)
 foreground_mean = warp_function(filtering.foreground_mean)
 step_length, corner_gradient = warp_function(raycasting.step_length), warp_function(raycasting.corner_gradient)
 to_block_boundary = warp_function(raycasting.to_block_boundary)
-crossing, mixed_channel = warp_function(vertex.crossing), warp_function(vertex.mixed_channel)
-slope = warp_function(vertex.slope)
-half_word, quarter_word = warp_function(finest.half_word), warp_function(finest.quarter_word)
-finest_at = warp_function(finest.finest_at)
-distance_bend, intensity_bend = warp_function(refinement.distance_bend), warp_function(refinement.intensity_bend)
-root_mean = warp_function(refinement.root_mean)
-mean_voxel, mean_color = warp_function(refinement.mean_voxel), warp_function(refinement.mean_color)

@@ -1,12 +1,12 @@
-"""Loops over one image: depth limits, hole filling, depth-adaptive filter, intensities, halving, mean field.
+"""Loops over one image: depth limits, hole filling, depth-adaptive filter, intensities, halving.
 
-One thread per pixel; the loops over the window are those of ``kernels/filtering.py`` and ``kernels/labeling.py``.
+One thread per pixel; the loops over the window are those of ``kernels/filtering.py``.
 """
 
 import warp as wp
 
-from dudmap.gpu.kernels.formulas import between, foreground_mean, mean_spin, range_weight, same_surface
-from dudmap.kernels import antialiasing, filtering
+from dudmap.gpu.kernels.formulas import between, foreground_mean, range_weight
+from dudmap.kernels import filtering
 
 wp.set_module_options({"enable_backward": False})
 
@@ -14,7 +14,6 @@ ABSENT = wp.constant(wp.float32(float(filtering.ABSENT)))
 OUTSIDE = wp.constant(wp.float32(float(filtering.OUTSIDE)))
 LONGEST_RUN = wp.constant(filtering.LONGEST_RUN)
 MIN_NEIGHBOURS = wp.constant(filtering.MIN_NEIGHBOURS)
-LARGEST_RADIUS = wp.constant(antialiasing.LARGEST_RADIUS)
 Image = wp.array2d(dtype=wp.float32)
 
 
@@ -145,53 +144,6 @@ def intensities(rgb: wp.array3d(dtype=wp.uint8), red: wp.float32, green: wp.floa
     out[v, u] = fused_sum(blue, b, fused_sum(green, g, red * r))
 
 
-@wp.func
-def is_flat(depth: Image, v: int, u: int, radius: int, tolerance: wp.float32):
-    """Whether the corners of a window lie on the surface of its middle."""
-    z = depth[v, u]
-    a, b = depth[v - radius, u - radius] - z, depth[v - radius, u + radius] - z
-    c, d = depth[v + radius, u - radius] - z, depth[v + radius, u + radius] - z
-    return max(max(abs(a), abs(b)), max(abs(c), abs(d))) < tolerance
-
-
-@wp.kernel
-def footprint_means(
-    depth: Image, rgb: wp.array3d(dtype=wp.uint8), by_depth: wp.float32, tolerance: wp.float32,
-    out: wp.array3d(dtype=wp.uint8),
-):  # fmt: skip
-    """Mean colour of each pixel's window: see ``antialiasing.footprint_means``, with sums of the pixels themselves."""
-    v, u = wp.tid()
-    h, w = depth.shape[0], depth.shape[1]
-    z = depth[v, u]
-    half = wp.float32(0.5)
-    radius = int(0)
-    if z > wp.float32(0.0):
-        wanted = min(half * by_depth / max(z, wp.float32(1.0e-3)) + wp.float32(0.25), wp.float32(LARGEST_RADIUS))
-        radius = min(min(wp.int32(wanted), min(v, h - 1 - v)), min(u, w - 1 - u))
-    shrinks = bool(radius > 0)
-    while shrinks:
-        if is_flat(depth, v, u, radius, tolerance):
-            shrinks = False
-        else:
-            radius -= 1
-            shrinks = radius > 0
-    if radius == 0:
-        for channel in range(3):
-            out[v, u, channel] = rgb[v, u, channel]
-        return
-    red, green, blue = int(0), int(0), int(0)
-    for y in range(v - radius, v + radius + 1):
-        for x in range(u - radius, u + radius + 1):
-            red += wp.int32(rgb[y, x, 0])
-            green += wp.int32(rgb[y, x, 1])
-            blue += wp.int32(rgb[y, x, 2])
-    side = wp.float32(2 * radius + 1)
-    share = wp.float32(1.0) / (side * side)
-    out[v, u, 0] = wp.uint8(wp.float32(red) * share + half)
-    out[v, u, 1] = wp.uint8(wp.float32(green) * share + half)
-    out[v, u, 2] = wp.uint8(wp.float32(blue) * share + half)
-
-
 @wp.kernel
 def halve(depth: Image, intensity: Image, tolerance: wp.float32, small_depth: Image, small_intensity: Image):
     """Depth and intensity of the next level of the pyramid."""
@@ -201,34 +153,3 @@ def halve(depth: Image, intensity: Image, tolerance: wp.float32, small_depth: Im
     upper = intensity[y, x] + intensity[y, x + 1]
     lower = intensity[y + 1, x] + intensity[y + 1, x + 1]
     small_intensity[v, u] = wp.float32(0.25) * (upper + lower)
-
-
-@wp.kernel
-def first_spins(evidence: Image, spin: Image):
-    """Expectation of each spin without its neighbours."""
-    v, u = wp.tid()
-    spin[v, u] = mean_spin(evidence[v, u])
-
-
-@wp.kernel
-def mean_field_sweep(
-    evidence: Image, depth: Image, tolerance: Image, per_neighbour: wp.float32, spin: Image, out: Image
-):
-    """One sweep of the mean field: see ``labeling.mean_field``."""
-    v, u = wp.tid()
-    z = depth[v, u]
-    total = float(0.0)
-    for k in range(9):
-        y = v + k // 3 - 1
-        x = u + k % 3 - 1
-        if k != 4 and y >= 0 and x >= 0 and y < depth.shape[0] and x < depth.shape[1]:
-            if same_surface(z, depth[y, x], tolerance[v, u]):
-                total += spin[y, x]
-    out[v, u] = mean_spin(evidence[v, u] + per_neighbour * total)
-
-
-@wp.kernel
-def probabilities(spin: Image, out: Image):
-    """Static probability of each spin."""
-    v, u = wp.tid()
-    out[v, u] = wp.float32(0.5) + wp.float32(0.5) * spin[v, u]

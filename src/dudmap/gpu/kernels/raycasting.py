@@ -1,4 +1,4 @@
-"""Sphere tracing: views of a map whose voxels have one size, and what those of several sizes share with it."""
+"""Sphere tracing: views of the map (thesis eq. 4.12)."""
 
 import warp as wp
 

@@ -1,4 +1,4 @@
-"""Copies of single rows and elements between an array and a buffer."""
+"""Copies of single rows between an array and a buffer."""
 
 import warp as wp
 
@@ -19,10 +19,3 @@ def gather(rows: wp.array(dtype=wp.int32), source: Rows, target: Rows):
     """Row ``rows[n]`` of ``source`` to row n of ``target``."""
     n, k = wp.tid()
     target[n, k] = source[rows[n], k]
-
-
-@wp.kernel
-def take(places: Rows, source: Rows, out: wp.array(dtype=wp.int32)):
-    """Element n of ``out`` is that at the row and column ``places[n]`` of ``source``."""
-    n = wp.tid()
-    out[n] = source[places[n, 0], places[n, 1]]

@@ -6,7 +6,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from dudmap.kernels import evidence, parameters
+from dudmap.kernels import parameters
 
 _STRUCTS: dict[type, Any] = {}
 
@@ -22,8 +22,6 @@ SensorNoise = _struct_of(parameters.SensorNoise)
 TruncationBand = _struct_of(parameters.TruncationBand)
 FusionParameters = _struct_of(parameters.FusionParameters)
 RegistrationParameters = _struct_of(parameters.RegistrationParameters)
-EvidenceParameters = _struct_of(evidence.EvidenceParameters)
-NoiseParameters = _struct_of(evidence.NoiseParameters)
 
 
 @wp.struct
@@ -51,21 +49,6 @@ class Lattice:
     nx: wp.int32
     ny: wp.int32
     nz: wp.int32
-
-
-@wp.struct
-class Index:
-    """Entries and slots of a map: see ``block_index.IndexArrays``."""
-
-    coords: wp.array2d(dtype=wp.int32)
-    slot_of: wp.array(dtype=wp.int32)
-    free_count: wp.array(dtype=wp.uint8)
-    entry_of: wp.array(dtype=wp.int32)
-    slot_coords: wp.array2d(dtype=wp.int32)
-    written: wp.array(dtype=wp.int32)
-    fused: wp.array(dtype=wp.uint8)
-    released: wp.array(dtype=wp.int32)
-    near: wp.array(dtype=wp.int32)
 
 
 def struct(values: tuple) -> Any:

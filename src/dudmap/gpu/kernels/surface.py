@@ -54,14 +54,14 @@ def corners_at(lattice: Lattice, x: int, y: int, z: int):
     )  # fmt: skip
 
 
-@wp.func
-def pixel_sums(
-    thread: int, depth: Image, intensity: Image, weights: Image, camera: Camera, t: Motion, lattice: Lattice,
+@wp.kernel
+def linearize(
+    depth: Image, intensity: Image, weights: Image, camera: Camera, t: Motion, lattice: Lattice,
     voxel_size: wp.float32, sdf_unit: wp.float32, p: RegistrationParameters, per_thread: int,
-    first: int, residuals: wp.array3d(dtype=wp.float32),
+    residuals: wp.array3d(dtype=wp.float32), partial: wp.array2d(dtype=wp.float32),
 ):  # fmt: skip
-    """Sums of the normal equations over the pixels of a thread; their residuals go to the images from ``first`` on: see
-    ``registration.linearize_rows``."""
+    """Partial sums of the normal equations, and the residuals: see ``registration.linearize_rows``."""
+    thread = wp.tid()
     h, w = depth.shape[0], depth.shape[1]
     one, zero = wp.float32(1.0), wp.float32(0.0)
     by_unit, by_voxel, by_255 = sdf_unit / voxel_size, one / voxel_size, wp.float32(1.0 / 255.0)
@@ -100,8 +100,8 @@ def pixel_sums(
             scale = by_255 * by_voxel
             static = weights[v, u]
             valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, static, known, p)
-            residuals[first, v, u] = wp.where(known, r, wp.nan)
-            residuals[first + 1, v, u] = wp.where(valid, rc, wp.nan)
+            residuals[0, v, u] = wp.where(known, r, wp.nan)
+            residuals[1, v, u] = wp.where(valid, rc, wp.nan)
             (
                 a00, a01, a02, a11, a12, a22, m00, m01, m02, m10, m11, m12, m20, m21, m22,
                 n00, n01, n02, n11, n12, n22, b0, b1, b2, b3, b4, b5,
@@ -114,20 +114,6 @@ def pixel_sums(
                 n00, n01, n02, n11, n12, n22, b0, b1, b2, b3, b4, b5, paid + forfeit,
                 wp.where(valid, one, zero), wp.where(z > zero, static, zero), used, square,
             )  # fmt: skip
-    return s
-
-
-@wp.kernel
-def linearize(
-    depth: Image, intensity: Image, weights: Image, camera: Camera, t: Motion, lattice: Lattice,
-    voxel_size: wp.float32, sdf_unit: wp.float32, p: RegistrationParameters, per_thread: int,
-    residuals: wp.array3d(dtype=wp.float32), partial: wp.array2d(dtype=wp.float32),
-):  # fmt: skip
-    """Partial sums of the normal equations, and the residuals."""
-    thread = wp.tid()
-    s = pixel_sums(
-        thread, depth, intensity, weights, camera, t, lattice, voxel_size, sdf_unit, p, per_thread, 0, residuals
-    )
     for k in range(NUM_SUMS):
         partial[k, thread] = s[k]
 
