@@ -252,7 +252,7 @@ class Slam(SlamResults):
         prediction can be trusted.
         """
         repeats, time = self.stream.repeats, view.timestamp
-        result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.times())
+        result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
         if last.T_world_camera is not None and self.motion.drift(time) > MAX_DRIFT:
             what = "the depth image has" if repeats == "depth" else "both images have"
             reason = f"{what} repeated for {time - self.motion.timestamp:.2f} s: the sensor hangs"
