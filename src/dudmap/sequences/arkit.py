@@ -21,7 +21,7 @@ from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import read_json, read_text
 from dudmap.sequences import images
 from dudmap.sequences.camera_json import values_of
-from dudmap.sequences.image_folder import ImageFolder, numbered_files, pair_numbered, size
+from dudmap.sequences.image_folder import ImageFolder, numbered_files, size
 from dudmap.sequences.intrinsics import KEYS, Intrinsics
 from dudmap.sequences.nerfstudio import OPENGL_AXES, one_view
 from dudmap.sequences.poses import read_matrix, rigid_trajectory
@@ -183,7 +183,7 @@ class PolycamSequence(ArkitFolder):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         colors = numbered_files(self.path.glob(f"{self._kind}images/*"), r"(\d+)\.jpg")
         depths = numbered_files(self.path.glob("depth/*"), r"(\d+)\.png")
-        return pair_numbered(self.path, colors, depths, rate=1e6)
+        return self._pair_numbered(colors, depths, per_second=1e6)
 
     def _find_intrinsics(self) -> Intrinsics:
         found = [values for tree in self._cameras.values() if (values := values_of(tree)) is not None]

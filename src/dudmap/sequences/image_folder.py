@@ -120,8 +120,11 @@ class ImageFolder(ABC):
         """True camera poses."""
         return None
 
-    def _pair_numbered(self, colors: dict[int, Path], depths: dict[int, Path]) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files of equal numbers; the time of a frame is its number over ``FRAME_RATE``.
+    def _pair_numbered(
+        self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
+    ) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``, or, where the
+        numbers only count the frames, over ``FRAME_RATE``.
 
         Raises:
             DatasetError: No number occurs in both.
@@ -132,8 +135,9 @@ class ImageFolder(ABC):
                 f"{self.path} has {len(colors)} colour and {len(depths)} depth images, but none of them has the same "
                 "number"
             )
-        self.timed = False
-        return [(TimedFile(n / FRAME_RATE, colors[n]), TimedFile(n / FRAME_RATE, depths[n])) for n in numbers]
+        self.timed = per_second is not None
+        rate = per_second or FRAME_RATE
+        return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         """Depth image (H, W) in metres."""
