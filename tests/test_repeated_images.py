@@ -74,6 +74,16 @@ def test_a_sensor_that_hangs_is_not_believed_for_long(recording, what):
     assert slam.process(frames[12]).state == "tracked"
 
 
+def test_a_frame_that_arrives_twice_with_one_stamp_has_one_pose(recording):
+    frames, _ = recording
+    slam = Slam(CAMERA, CONFIG)
+    results = [slam.process(frame) for frame in (frames[0], frames[1], frames[1])]
+    results.append(slam.process(replace(frames[1], timestamp=frames[1].timestamp + 1 / 30)))
+    assert [result.rejected for result in results] == ["", "", "duplicate", ""]
+    assert [result.state for result in results] == ["tracked", "tracked", "lost", "repeated"]
+    assert len(slam.trajectory) == 3
+
+
 def test_a_frame_that_repeats_a_lost_one_is_lost(recording):
     frames, _ = recording
     slam = Slam(CAMERA, CONFIG)

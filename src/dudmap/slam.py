@@ -242,7 +242,7 @@ class Slam(SlamResults):
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""
         mask = np.zeros(view.observation.depth.shape, dtype=bool)
-        return replace(self._result(view, None, mask, reason=rejection.reason), rejected=rejection.kind)
+        return self._result(view, None, mask, reason=rejection.reason, rejected=rejection.kind)
 
     def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
         """Result of a frame that repeats the one before, or its depth.
@@ -400,6 +400,7 @@ class Slam(SlamResults):
         balance: TermBalance | None = None,
         calibrated: bool = False,
         checks: Mapping[str, float] | None = None,
+        rejected: str = "",
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
         labels = None if estimate is None else estimate.labels
@@ -415,12 +416,13 @@ class Slam(SlamResults):
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
             uncertain=uncertain, balance=balance, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
-            repeats=self.stream.repeats,
+            repeats=self.stream.repeats, rejected=rejected,
         )  # fmt: skip
-        self._last = replace(
-            result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, movers=(),
-            corrected=False, blind=False, balance=None, calibrated=False, uncertain="", checks={},
-        )  # fmt: skip
+        if not rejected:
+            self._last = replace(
+                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, movers=(),
+                corrected=False, blind=False, balance=None, calibrated=False, uncertain="", checks={},
+            )  # fmt: skip
         return result
 
     def _make_volume(self) -> TsdfVolume:
