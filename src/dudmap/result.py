@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 
 from dudmap.dynamics.masks import Labels
 from dudmap.objects.object_tracker import Mover
-from dudmap.tracking.term_balance import TermBalance
 from dudmap.tracking.tracker import TrackingResult
 
 
@@ -41,8 +40,6 @@ class FrameResult:
         uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
         unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
             predicted one; see ``tracking/observability.py``. The frame is ``uncertain`` then.
-        balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
-            frame, else None.
     """
 
     timestamp: float
@@ -63,7 +60,6 @@ class FrameResult:
     corrected: bool = False
     blind: bool = False
     uncertain: str = ""
-    balance: TermBalance | None = None
     calibrated: bool = False
     rejected: str = ""
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))

@@ -40,6 +40,7 @@ from dudmap.result import FrameResult
 from dudmap.slam_results import SlamResults
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.color_motion import ColorMotion
+from dudmap.tracking.depth_noise import INTERVAL as NOISE_INTERVAL
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
@@ -48,7 +49,6 @@ from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.observability import sentence as unobserved
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
 from dudmap.tracking.tracker import Tracker
 
 
@@ -119,7 +119,6 @@ class Slam(SlamResults):
         self.redundancy = RedundantViews(config)
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
-        self.balance = BalanceEstimator(config.sensor, config.preprocess)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
@@ -209,14 +208,14 @@ class Slam(SlamResults):
             fuse = not (view.blind or uncertain or self.localize)
             fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
-        balance = self._learn_noise(view, estimate, mask)
+        self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
+            corrected=corrected, movers=movers, uncertain=uncertain, calibrated=calibrated,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
@@ -307,13 +306,11 @@ class Slam(SlamResults):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _learn_noise(
-        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
-    ) -> TermBalance | None:
-        """Compare the static readings with the map for the noise of the sensor and for what the pose rests on."""
-        with view.timer("noise"):
-            self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
-            return self.balance.update(self.tracker, self.reference, view.pyramid, estimate, self.motion.velocity)
+    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Compare the static readings of some frames with the map for the noise of the sensor, which is reported."""
+        if len(self.atlas.poses) % NOISE_INTERVAL == 0:
+            with view.timer("noise"):
+                self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
@@ -365,7 +362,6 @@ class Slam(SlamResults):
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
         uncertain: str = "",
-        balance: TermBalance | None = None,
         calibrated: bool = False,
     ) -> FrameResult:
         """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
@@ -380,7 +376,7 @@ class Slam(SlamResults):
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.times(),
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
-            uncertain=uncertain, balance=balance, calibrated=calibrated,
+            uncertain=uncertain, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable,
         )  # fmt: skip
 
