@@ -38,7 +38,10 @@ VOXEL_SIZE = 0.02
 
 
 def calibrate_start(
-    sequence: "Sequence", config: Config, max_frames: int | None = None, notice: "Callable[[str], None] | None" = None
+    sequence: "Sequence",
+    config: Config,
+    max_frames: int | None = None,
+    notice: "Callable[[str], None]" = lambda text: None,
 ) -> Calibration | None:
     """Calibration estimated from the start of a recording; None where none was made.
 
@@ -48,16 +51,15 @@ def calibrate_start(
         sequence: The recording.
         config: All parameters.
         max_frames: Number of frames that will be processed; None for all.
-        notice: Receives one sentence before and one after the estimation.
+        notice: Receives sentences on what is being done and what was found.
     """
-    notice = notice or (lambda text: None)
     count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
     if config.preset == "thesis" or count < MIN_FRAMES:
         return None
     notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
     given = sequence.calibration or Calibration.registered(sequence.camera)
     try:
-        found = calibrate_sequence(sequence, config, given, count).calibration
+        found = calibrate_sequence(sequence, config, given, count, notice).calibration
     except DatasetError as error:
         notice(f"the colour camera is taken as given: {error}")
         return None
@@ -67,7 +69,11 @@ def calibrate_start(
 
 
 def calibrate_sequence(
-    sequence: "Sequence", config: Config, given: Calibration, max_frames: int | None = None
+    sequence: "Sequence",
+    config: Config,
+    given: Calibration,
+    max_frames: int | None = None,
+    notice: "Callable[[str], None]" = lambda text: None,
 ) -> Estimate:
     """Track a recording quickly with the calibration as given, and estimate a better one.
 
@@ -78,6 +84,7 @@ def calibrate_sequence(
         config: All parameters.
         given: The calibration to start from.
         max_frames: Use only so many frames.
+        notice: Receives a sentence on what is being done.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -87,6 +94,7 @@ def calibrate_sequence(
     halvings = halvings_to(WIDTH, sequence.camera)
     small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
     slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration)
+    notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
     collector, submap = KeyframeCollector(small.calibration.camera), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
         for read in frames:
@@ -103,6 +111,7 @@ def calibrate_sequence(
                 collector.add(read.prepared.observation, result.T_world_camera, mask)
     if len(collector.keyframes) < 2:
         raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
+    notice(f"calibration: comparing {len(collector.keyframes)} of them with each other")
     estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(collector.keyframes)
     return replace(estimate, calibration=_enlarged(estimate.calibration, given.camera, halvings))
 
@@ -128,7 +137,7 @@ class _Excerpt:
     """
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
-        usual = float(np.median(np.diff(sequence.timestamps[:count])))
+        usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
         self._sequence, self._halvings, self._count = sequence, halvings, count
         self._step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
         self.camera = sequence.camera.scaled(halvings)
