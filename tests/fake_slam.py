@@ -33,7 +33,6 @@ class FakeResult:
     blind: bool = False
     submap: int = 0
     uncertain: str = ""
-    balance: None = None
     calibrated: bool = False
     rejected: str = ""
     unobservable: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))

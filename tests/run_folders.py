@@ -41,10 +41,6 @@ def write_run(folder, **metrics):
         "dynamic_share_mean": 0.05, "mesh_triangles": len(wall().faces), "lost_frames": [lost],
         "unreadable_frames": ["frame 7: the image is cut off"], "camera": CAMERA | {"distortion": []},
         "versions": {"dudmap": __version__},
-        "balance": {
-            "frames": 2, "pose_sigma_mm": [1.0, 2.0, 3.0], "pose_sigma_deg": [0.1, 0.2, 0.3],
-            "color_share": [0.9, 0.8, 0.2, 0.5, 0.5, 0.9],
-        },
     } | metrics  # fmt: skip
     (folder / "metrics.json").write_text(json.dumps(tree))
     (folder / "config.toml").write_text('preset = "default"\n')

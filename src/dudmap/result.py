@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from dudmap.dynamics.masks import Labels
 from dudmap.frames.stream_check import Repeats
 from dudmap.objects.object_tracker import Mover
-from dudmap.tracking.term_balance import TermBalance
 from dudmap.tracking.tracker import TrackingResult
 
 
@@ -49,8 +48,6 @@ class FrameResult:
             frame whose colour repeats is tracked by its distances alone (``blind``).
         checks: Figures of all checks of the frame (``tracking/checks.py``), NaN where one is not known; empty for a
             frame that was not registered.
-        balance: Uncertainty of the pose, and how it is shared between distances and intensities; of every tenth tracked
-            frame, else None.
     """
 
     timestamp: float
@@ -71,7 +68,6 @@ class FrameResult:
     corrected: bool = False
     blind: bool = False
     uncertain: str = ""
-    balance: TermBalance | None = None
     calibrated: bool = False
     rejected: str = ""
     repeats: Repeats = ""

@@ -42,6 +42,7 @@ from dudmap.slam_results import SlamResults
 from dudmap.stage_timer import StageTimer
 from dudmap.tracking.checks import MAX_DRIFT
 from dudmap.tracking.color_motion import ColorMotion
+from dudmap.tracking.depth_noise import INTERVAL as NOISE_INTERVAL
 from dudmap.tracking.depth_noise import DepthNoise
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
@@ -50,7 +51,6 @@ from dudmap.tracking.motion_model import MotionModel
 from dudmap.tracking.observability import sentence as unobserved
 from dudmap.tracking.pose_prediction import PosePrediction, PosePredictor
 from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.term_balance import BalanceEstimator, TermBalance
 from dudmap.tracking.tracker import Tracker
 
 
@@ -126,7 +126,6 @@ class Slam(SlamResults):
         self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
-        self.balance = BalanceEstimator(config.sensor, config.preprocess)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
@@ -220,14 +219,14 @@ class Slam(SlamResults):
             fuse = not (view.blind or uncertain or self.localize)
             fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
-        balance = self._learn_noise(view, estimate, mask)
+        self._learn_noise(view, estimate, mask)
         movers = self.objects.update(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain, balance=balance, calibrated=calibrated,
+            corrected=corrected, movers=movers, uncertain=uncertain, calibrated=calibrated,
             checks=verdict.figures,
         )  # fmt: skip
 
@@ -339,13 +338,11 @@ class Slam(SlamResults):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _learn_noise(
-        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
-    ) -> TermBalance | None:
-        """Compare the static readings with the map for the noise of the sensor and for what the pose rests on."""
-        with view.timer("noise"):
-            self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
-            return self.balance.update(self.tracker, self.reference, view.pyramid, estimate, self.motion.velocity)
+    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Compare the static readings of some frames with the map for the noise of the sensor, which is reported."""
+        if len(self.atlas.poses) % NOISE_INTERVAL == 0:
+            with view.timer("noise"):
+                self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
@@ -397,7 +394,6 @@ class Slam(SlamResults):
         corrected: bool = False,
         movers: tuple[Mover, ...] = (),
         uncertain: str = "",
-        balance: TermBalance | None = None,
         calibrated: bool = False,
         checks: Mapping[str, float] | None = None,
         rejected: str = "",
@@ -414,14 +410,14 @@ class Slam(SlamResults):
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
             relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
-            uncertain=uncertain, balance=balance, calibrated=calibrated,
+            uncertain=uncertain, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
             repeats=self.stream.repeats, rejected=rejected,
         )  # fmt: skip
         if not rejected:
             self._last = replace(
                 result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, movers=(),
-                corrected=False, blind=False, balance=None, calibrated=False, uncertain="", checks={},
+                corrected=False, blind=False, calibrated=False, uncertain="", checks={},
             )  # fmt: skip
         return result
 

@@ -153,7 +153,7 @@ def test_lines_of_the_file(tmp_path):
         record.add(
             SimpleNamespace(
                 timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
-                blind=False, uncertain="", movers=found, dynamic_share=0.1, timings={}, labels=None, balance=None,
+                blind=False, uncertain="", movers=found, dynamic_share=0.1, timings={}, labels=None,
                 unobservable=(), rejected="",
             ), 1.0, 1.0, None,
         )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Live frames: the newest is taken, the rest dropped and counted; a clock made of numbers instead of waiting."""
+"""Live frames: a few wait, the rest is dropped and counted; a clock made of numbers instead of waiting."""
 
 import csv
 import json
@@ -10,7 +10,7 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.pipeline.replay import Arrival, LatestSlot, live, replay
+from dudmap.pipeline.replay import WAITING, Arrival, WaitingRoom, live, replay
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from fake_slam import FakeSlam
@@ -50,9 +50,9 @@ def test_frames_arrive_when_their_times_tell():
     np.testing.assert_allclose(times, [0, 0.1, 0.2, 2.0], atol=1e-9)
 
 
-def test_a_reader_that_is_too_slow_goes_on_with_the_newest_frame():
+def test_a_reader_that_is_too_slow_leaves_frames_out():
     indices, times = replayed(3 + 0.1 * np.arange(10), 0.25)
-    assert indices == [0, 2, 5, 7, 9]  # free again at 0.25, 0.5, 0.75, 1.0
+    assert indices == [0, 1, 3, 5, 7, 8, 9]  # free again at 0.25, 0.5, ...: the latest three that are due are left
     np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
 
 
@@ -62,25 +62,29 @@ def test_a_replay_ends_when_told():
     assert [arrival.number for arrival in offered] == [0]
 
 
-def test_only_the_newest_is_held():
-    newest = LatestSlot()
-    for number in range(5):
-        newest.put(number)
-    assert newest.take() == 4
-    newest.put(5)
-    newest.close()
-    assert newest.take() == 5
-    assert newest.take() is None
-    assert newest.take() is None
+def test_a_few_frames_wait_and_the_newest_replaces_the_last_of_them():
+    room = WaitingRoom()
+    for number in range(6):
+        room.put(number)
+    room.close()
+    assert [room.take() for _ in range(WAITING + 2)] == [0, 1, 5, None, None]
 
 
 def test_a_consumer_waits_for_the_next():
-    newest, taken = LatestSlot(), []
-    thread = threading.Thread(target=lambda: taken.append(newest.take()))
+    room, taken = WaitingRoom(), []
+    thread = threading.Thread(target=lambda: taken.append(room.take()))
     thread.start()
-    newest.put("late")
+    room.put("late")
     thread.join(timeout=5)
     assert taken == ["late"]
+
+
+def test_a_frame_that_takes_twice_as_long_drops_none():
+    numbers = []
+    for arrival in live(0.05 * np.arange(8), str):
+        numbers.append(arrival.number)
+        time.sleep(0.1 if arrival.number == 3 else 0)
+    assert numbers == list(range(8))
 
 
 def test_a_slow_consumer_skips_frames_and_gets_the_last_one():

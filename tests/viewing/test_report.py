@@ -120,8 +120,8 @@ def test_figures_configuration_plots_and_losses_are_there(page, text):
     assert 'preset = "default"' in said
     assert "ms_per_frame_median" in said
     assert "41.2" in said
-    assert text.count("<svg") == 4
-    for title in ("Time per stage", "Share of the readings", "Residuals", "Uncertainty of the pose"):
+    assert text.count("<svg") == 3
+    for title in ("Time per stage", "Share of the readings", "Residuals"):
         assert title in said
 
 

@@ -36,8 +36,9 @@ ITERATIONS = 8
 """Largest number of Gauss-Newton steps per image size."""
 FIT_ITERATIONS = 3
 """Steps per image size by which poses are fitted to a known calibration."""
-SETTLED = 0.01
-"""A step below this many prior standard deviations in every parameter ends an image size."""
+SETTLED, SETTLED_COARSE = 0.01, 0.1
+"""A step below this many prior standard deviations in every parameter ends the largest image size; the smaller ones
+only lead to the next."""
 POSE = 6
 
 
@@ -141,13 +142,15 @@ class Adjustment:
         """Calibration from coarse to fine over the free parameters (13,) bool, and the covariance (13, 13) that all
         would have."""
         state, scales, system = _State(pairs, start), FIRST_SCALES, None
-        for level in levels or self.levels:
+        levels = levels or self.levels
+        for level in levels:
+            settled = (SETTLED if level == levels[-1] else SETTLED_COARSE) * np.sqrt(CORRELATED / self.prior)
             for _ in range(ITERATIONS):
                 system = self._linearize(pairs, state, level, scales)
                 step = system.step(free)
                 state.move(step, system.parts)
                 scales = system.scales
-                if np.all(np.abs(step[:NUM_PARAMETERS]) * np.sqrt(self.prior / CORRELATED) < SETTLED):
+                if np.all(np.abs(step[:NUM_PARAMETERS]) < settled):
                     break
         assert system is not None
         return state.calibration, self._covariance(system, state, int(np.count_nonzero(free)))

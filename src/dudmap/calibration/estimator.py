@@ -1,6 +1,7 @@
 """Estimation of the calibration from pairs of frames."""
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -97,10 +98,12 @@ class CalibrationEstimator:
     Args:
         given: The calibration as given.
         sensor: Noise of the depth readings.
+        workers: Threads; 2 do both halves of the time at once.
     """
 
-    def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
+    def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
         self.given = given
+        self.workers = workers
         self.adjustment = Adjustment(given, sensor)
 
     def estimate(self, keyframes: Sequence[ColorKeyframe], count: int = PAIRS) -> Estimate:
@@ -183,5 +186,11 @@ class CalibrationEstimator:
     def _freed(self, halves: list[list[Pair]], before: "_Trial", free: NDArray[np.bool_]) -> "_Trial":
         # only the geometry can displace the colours by so much that the smallest images have to begin
         levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
-        known = [self.adjustment.solve(halves[n], before.known[n], free, levels)[0] for n in (0, 1)]
-        return _Trial(free, known, [self.adjustment.costs(halves[1 - n], known[n]) for n in (0, 1)])
+
+        def fitted(n: int) -> tuple[Calibration, NDArray[np.float64]]:
+            known, _ = self.adjustment.solve(halves[n], before.known[n], free, levels)
+            return known, self.adjustment.costs(halves[1 - n], known)
+
+        with ThreadPoolExecutor(self.workers) as pool:
+            (one, other), (cost, other_cost) = zip(*pool.map(fitted, (0, 1)), strict=True)
+        return _Trial(free, [one, other], [cost, other_cost])

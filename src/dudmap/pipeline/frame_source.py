@@ -87,12 +87,15 @@ def in_order(
         yield SourceFrame(index, read)
 
 
-def in_real_time(sequence: "Sequence", count: int, masks: "MaskFolder | None") -> "Generator[SourceFrame]":
-    """Frames of a recording at the rate of the sensor; always the latest that has arrived."""
+def in_real_time(
+    sequence: "Sequence", count: int, masks: "MaskFolder | None", slam: "Slam"
+) -> "Generator[SourceFrame]":
+    """Frames of a recording at the rate of the sensor, prepared by the thread that reads them; dropped where there is
+    no time."""
     from dudmap.pipeline.replay import live
 
     last = -1
-    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks))) as arrivals:
+    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks, slam))) as arrivals:
         for arrival in arrivals:
             yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
             last = arrival.number
@@ -106,19 +109,24 @@ def load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
             slam.process(frame)
 
 
+def prepared(frame: Frame | FrameError, slam: "Slam | None", ms: float = 0.0) -> FrameRead:
+    """A frame that took ``ms`` milliseconds to read, prepared for processing where there is a system."""
+    try:
+        view = None if slam is None or isinstance(frame, FrameError) else slam.prepare(frame)
+    except FrameError as error:
+        return FrameRead(error, None, ms)
+    return FrameRead(frame, None, ms, prepared=view)
+
+
 def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> FrameRead:
     start = time.perf_counter()
     try:
         frame: Frame | FrameError = sequence[index]
     except FrameError as error:
         return FrameRead(error, None, 1000 * (time.perf_counter() - start))
-    ms = 1000 * (time.perf_counter() - start)
-    try:
-        prepared = None if slam is None else slam.prepare(frame)
-    except FrameError as error:
-        return FrameRead(error, None, ms)
-    return FrameRead(
-        frame, _or_error(sequence.mask, index), ms, masks and _or_error(masks.__getitem__, index), prepared
+    read = prepared(frame, slam, 1000 * (time.perf_counter() - start))
+    return read._replace(
+        true_mask=_or_error(sequence.mask, index), given_mask=masks and _or_error(masks.__getitem__, index)
     )
 
 

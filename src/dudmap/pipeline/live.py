@@ -1,4 +1,4 @@
-"""A live run: the newest frame of a camera is processed, the others are counted, and all are recorded if wanted."""
+"""A live run: frames of a camera are processed as they arrive, those dropped are counted, all are recorded if wanted."""
 
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dudmap.cameras import CameraFrame, LiveCamera
+from dudmap.cameras import LiveCamera
 from dudmap.cameras.recorder import Recorder
 from dudmap.config import Config
 from dudmap.errors import CameraError, DudmapError, FrameError
-from dudmap.pipeline.frame_source import FrameRead, SourceFrame
+from dudmap.pipeline.frame_source import FrameRead, SourceFrame, prepared
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.pipeline.progress import RunProgress
-from dudmap.pipeline.replay import Arrival, newest
+from dudmap.pipeline.replay import Arrival, arrivals
 from dudmap.pipeline.run import process_source
 from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
 
@@ -41,8 +41,8 @@ def run_live(
 ) -> RunReport:
     """Run the system on a camera until the stream ends, ``max_frames`` are processed, or Ctrl-C; write a run folder.
 
-    Of the frames that arrive while one is processed, only the newest is processed next; the others are counted as
-    ``dropped`` in metrics.json and timings.csv. The folder is that of ``dudmap.pipeline.run.run``. The camera is closed
+    Up to three of the frames that arrive while one is processed wait; others are counted as ``dropped`` in metrics.json
+    and timings.csv. The folder is that of ``dudmap.pipeline.run.run``. The camera is closed
     at the end.
 
     Args:
@@ -76,7 +76,7 @@ def run_live(
                 first.process(frame)
             for observer in observers:
                 observer.start(slam, out, None)
-            with closing(_newest_frames(camera, recorder)) as frames:
+            with closing(_arriving_frames(camera, recorder, slam)) as frames:
                 for source in frames:
                     process_source(source, slam, metrics, display, out if save_masks else None, None, observers)
                     if max_frames is not None and len(metrics.rows) >= max_frames:
@@ -107,10 +107,11 @@ def run_live(
     return report
 
 
-def _newest_frames(camera: LiveCamera, recorder: Recorder | None) -> Generator[SourceFrame]:
-    """Newest frame of the camera at each step; all that arrive are recorded."""
+def _arriving_frames(camera: LiveCamera, recorder: Recorder | None, slam: "Slam") -> Generator[SourceFrame]:
+    """Frames of the camera, prepared by the thread that takes them; all that arrive are recorded, those for which there
+    is no time are dropped."""
 
-    def deliver(put: Callable[[Arrival[CameraFrame]], None], wait: Callable[[float], bool]) -> None:
+    def deliver(put: Callable[[Arrival[FrameRead]], None], wait: Callable[[float], bool]) -> None:
         start, latest = None, -np.inf
         while not wait(0) and (arrived := camera.read()) is not None:
             start = arrived.number if start is None else start
@@ -120,13 +121,12 @@ def _newest_frames(camera: LiveCamera, recorder: Recorder | None) -> Generator[S
                 latest = arrived.frame.timestamp
                 if recorder is not None:
                     recorder.put(arrived.frame)
-            put(Arrival(arrived.number - start, arrived, arrived.time))
+            put(Arrival(arrived.number - start, prepared(arrived.frame, slam), arrived.time))
 
     last = -1
-    with closing(newest(deliver, camera.close)) as arrivals:
-        for arrival in arrivals:
-            read = FrameRead(arrival.item.frame, None, 0.0)
-            yield SourceFrame(arrival.number, read, arrival.number - last - 1, arrival.time)
+    with closing(arrivals(deliver, camera.close)) as delivered:
+        for arrival in delivered:
+            yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
             last = arrival.number
 
 

@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from dudmap.errors import FrameError
     from dudmap.objects.object_tracker import Mover
     from dudmap.result import FrameResult
-    from dudmap.tracking.term_balance import TermBalance
 
 
 @dataclass
@@ -37,7 +36,6 @@ class RunRecord:
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
-        balances: Uncertainties of poses, of every tenth tracked frame.
         fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
         degenerate: Number of tracked frames with unobservable directions of motion.
         masked: Number of frames with an external mask, None without external masks.
@@ -53,7 +51,6 @@ class RunRecord:
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
-    balances: "list[TermBalance]" = field(default_factory=list)
     fused: int = 0
     skipped_similar: int = 0
     relocalized: int = 0
@@ -125,8 +122,6 @@ class RunRecord:
             self.movers.append(json.dumps(line))
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
-        if result.balance is not None:
-            self.balances.append(result.balance)
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
 
@@ -202,8 +197,6 @@ class RunRecord:
             out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
         if self.mask_ious:
             out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
-        if self.balances:
-            out["balance"] = _balance(self.balances)
         if self.dropped is not None:
             latencies = np.array([row["latency"] for row in self.rows] or [np.nan])
             out |= {
@@ -233,20 +226,6 @@ def _row(mover: "Mover") -> dict[str, Any]:
         "speed": round(mover.speed, 4),
         "age": round(mover.age, 4),
         "pixels": int(np.count_nonzero(mover.mask)),
-    }
-
-
-def _balance(balances: "list[TermBalance]") -> dict[str, Any]:
-    """JSON object of the uncertainties of the poses: medians over the frames, the errors as estimated last."""
-    sigma = np.median([balance.sigma for balance in balances], axis=0)
-    return {
-        "frames": len(balances),
-        "pose_sigma_mm": (1000 * sigma[:3]).round(3).tolist(),
-        "pose_sigma_deg": np.degrees(sigma[3:]).round(4).tolist(),
-        "color_share": np.median([balance.color_share for balance in balances], axis=0).round(3).tolist(),
-        "disagreement_ratio": _number(np.median([balance.disagreement_ratio for balance in balances])),
-        "depth_error": _number(balances[-1].depth_error, 5),
-        "color_shift_px": _number(balances[-1].color_shift),
     }
 
 

@@ -26,11 +26,14 @@ class Arrival(NamedTuple, Generic[T]):
     time: float
 
 
-class LatestSlot(Generic[T]):
-    """Thread-safe slot for one item between a sensor and its consumer; a new item replaces one not yet taken.
+WAITING = 3
+"""Frames that may wait for their processing, 0.1 s at 30 Hz: one that takes twice as long as usual delays the next ones
+and drops none."""
 
-    Since nothing queues, the consumer is never more than one item behind.
-    """
+
+class WaitingRoom(Generic[T]):
+    """Thread-safe queue of ``WAITING`` items between a sensor and its consumer; where it is full, a new item replaces
+    the last one."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -40,17 +43,17 @@ class LatestSlot(Generic[T]):
     def put(self, item: T) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
-            self._held = [item]
+            self._held = [*self._held[: WAITING - 1], item]
             self._changed.notify()
 
     def take(self) -> T | None:
-        """Latest item; waits for one that was not taken yet. None once the slot is closed and empty."""
+        """Oldest item; waits for one that was not taken yet. None once the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._held or self._closed)
-            return self._held.pop() if self._held else None
+            return self._held.pop(0) if self._held else None
 
     def close(self) -> None:
-        """Declare the end of the stream; a stored item can still be taken."""
+        """Declare the end of the stream; stored items can still be taken."""
         with self._changed:
             self._closed = True
             self._changed.notify()
@@ -65,7 +68,7 @@ def replay(
 ) -> None:
     """Deliver the frames of a recording in real time: the first one now, the others at their timestamps.
 
-    Of the frames that become due while an earlier one is read, only the latest is read; the others are dropped.
+    Of the frames that become due while an earlier one is read, the latest ``WAITING`` are read; others are dropped.
 
     Args:
         timestamps: (N,) increasing timestamps, seconds.
@@ -80,44 +83,44 @@ def replay(
         while (early := start + timestamps[index] - now()) > 0:
             if wait(early):
                 return
-        index = max(index, int(np.searchsorted(timestamps, now() - start, side="right")) - 1)
+        index = max(index, int(np.searchsorted(timestamps, now() - start, side="right")) - WAITING)
         put(Arrival(index, read(index), start + timestamps[index]))
         index += 1
 
 
 def live(timestamps: NDArray[np.float64], read: Callable[[int], T]) -> Generator[Arrival[T]]:
-    """Replay a recording in real time; each step yields the latest frame that has arrived.
+    """Replay a recording in real time; each step yields the next frame that has arrived.
 
-    A frame that is not consumed before the next one has been read is dropped, which leaves a gap in
-    ``Arrival.number``. The last frame is always yielded.
+    Frames for which the consumer leaves no room are dropped, which leaves a gap in ``Arrival.number``. The last frame
+    is always yielded.
     """
-    return newest(lambda put, wait: replay(timestamps, read, put, wait))
+    return arrivals(lambda put, wait: replay(timestamps, read, put, wait))
 
 
-def newest(
+def arrivals(
     deliver: Callable[[Callable[[Arrival[T]], None], Callable[[float], bool]], None],
     stop: Callable[[], None] | None = None,
 ) -> Generator[Arrival[T]]:
-    """Latest item that a sensor has delivered, at each step; older ones that were not consumed are dropped.
+    """Items that a sensor delivers; those for which the consumer leaves no room (``WaitingRoom``) are dropped.
 
     Args:
         deliver: Runs in a thread of its own and passes every item to its first argument. Its second argument waits for
             at most the given number of seconds and returns True to stop.
         stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
     """
-    latest: LatestSlot[Arrival[T]] = LatestSlot()
+    waiting: WaitingRoom[Arrival[T]] = WaitingRoom()
     stopping = threading.Event()
 
     def sensor() -> None:
         try:
-            deliver(latest.put, stopping.wait)
+            deliver(waiting.put, stopping.wait)
         finally:
-            latest.close()
+            waiting.close()
 
     with ThreadPoolExecutor(1, thread_name_prefix="dudmap-sensor") as thread:
         future = thread.submit(sensor)
         try:
-            while (arrival := latest.take()) is not None:
+            while (arrival := waiting.take()) is not None:
                 yield arrival
             future.result()
         finally:

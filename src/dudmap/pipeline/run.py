@@ -75,8 +75,8 @@ def run(
         progress: Show a progress bar on a terminal.
         ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
             would distort the times. The result does not depend on it.
-        live: Replay the recording in real time once the kernels are loaded: the latest frame that has arrived is
-            processed; frames for which there is no time are dropped and counted.
+        live: Replay the recording in real time once the kernels are loaded; frames for which there is no time are
+            dropped and counted.
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
@@ -232,7 +232,7 @@ class Job:
                 else:
                     observer.start(state.slam, self.out, self.count)
             with closing(
-                in_real_time(self.sequence, self.count, self.masks)
+                in_real_time(self.sequence, self.count, self.masks, state.slam)
                 if self.live
                 else in_order(self.sequence, self.count, self.ahead, self.masks, state.slam, state.next)
             ) as frames:

@@ -50,7 +50,7 @@ CONSTANT = frozenset({"PlacedFeatures", "Preprocessor"})
 """Classes whose arrays never change once they are made: they need not be copied for a snapshot."""
 RECORDS = {"RunRecord": ("rows", "lost", "movers", "unreadable", "checks")}
 """Attributes that are lists of plain values which only grow; they are stored as lines of JSON."""
-COLUMNS = frozenset({"TimedPose", "TermBalance"})
+COLUMNS = frozenset({"TimedPose"})
 """Classes of which many objects stand in one list and nowhere else; they are stored attribute by attribute."""
 
 

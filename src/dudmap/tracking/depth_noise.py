@@ -20,8 +20,10 @@ STEPS, LARGEST = 200, 4.0
 edges and moving objects, which the median tolerates."""
 PRIOR_READINGS = 20.0
 """Weight of the configured noise in each depth interval, independent readings."""
-MEMORY = 300.0
-"""Frames after which the weight of a frame has fallen to 1/e."""
+INTERVAL = 10
+"""Every so many tracked frames are compared: the readings of a surface err alike from frame to frame."""
+MEMORY = 30.0
+"""Compared frames after which the weight of one has fallen to 1/e."""
 SMALLEST = 1e-6
 """Smallest base (m) and scale (1/m): a tenth of a step of the distances that a map stores."""
 MEDIAN_OF_NORMAL = 0.6745

@@ -14,19 +14,16 @@ from dudmap.evaluation.plots import draw_residuals
 from dudmap.viewing.run_files import RunFiles
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 POINTS = 400
 """Points of a curve over time: a plot is about this many pixels wide."""
 MAX_STAGES = 9
 """Stages with a colour of their own; the shortest ones are added up."""
-DIRECTIONS = ("x", "y", "z", "about x", "about y", "about z")
-"""Directions of the pose's uncertainty, camera frame."""
 
 
 def plots(run: RunFiles) -> dict[str, str]:
-    """SVG text by title: time per stage, share that moves, residuals, uncertainty of the pose; those with data."""
+    """SVG text by title: time per stage, share that moves, residuals; those with data."""
     out: dict[str, str] = {}
     if run.frames and run.stages:
         out["Time per stage"] = _times(run)
@@ -38,8 +35,6 @@ def plots(run: RunFiles) -> dict[str, str]:
             draw_residuals(axes, run.folder / "residuals.npz")
             axes.set_title("")
         out["Residuals"] = picture[0]
-    if run.metrics.get("balance"):
-        out["Uncertainty of the pose"] = _balance(run)
     return out
 
 
@@ -76,29 +71,6 @@ def _dynamic_share(run: RunFiles) -> str:
             axes.legend(frameon=False)
         axes.set(xlabel="time, s", ylabel="%", xlim=_limits(t), ylim=(0, None))
     return picture[0]
-
-
-def _balance(run: RunFiles) -> str:
-    balance = run.metrics["balance"]
-    at = np.arange(3)
-    with _drawing("balance") as (figure, picture):
-        first, second, third = figure.subplots(1, 3, width_ratios=(1, 1, 2))
-        first.bar(at, balance["pose_sigma_mm"], color="#4c78a8")
-        first.set(ylabel="sigma, mm", xticks=at, xticklabels=DIRECTIONS[:3])
-        second.bar(at, balance["pose_sigma_deg"], color="#4c78a8")
-        second.set(ylabel="sigma, degrees", xticks=at, xticklabels=DIRECTIONS[:3])
-        _shares(third, 100 * np.array(balance["color_share"], dtype=float))
-    return picture[0]
-
-
-def _shares(axes: "Axes", color: NDArray[np.float64]) -> None:
-    """Bars of how much of each direction rests on colour and how much on distances."""
-    at = np.arange(len(color))
-    axes.barh(at, color, color="#e45756", label="colour")
-    axes.barh(at, 100 - color, left=color, color="#b9c4d0", label="distances")
-    axes.set(xlabel="rests on, %", yticks=at, yticklabels=DIRECTIONS[: len(color)], xlim=(0, 100))
-    axes.invert_yaxis()
-    axes.legend(ncols=2, loc="lower center", bbox_to_anchor=(0.5, 1), frameon=False)
 
 
 def _seconds(run: RunFiles) -> NDArray[np.float64]:
