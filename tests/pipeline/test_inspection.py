@@ -53,7 +53,7 @@ def test_a_wrong_depth_scale(recording, scale, proposal):
     said = warnings(open_sequence(recording, f"60,60,31.5,23.5,{WIDTH},{HEIGHT},{scale}"))
     assert "the depth scale looks wrong" in said
     assert proposal in said
-    assert "--camera fx,fy,cx,cy,w,h,depth_scale" in said
+    assert "give --depth-unit 0.001, which is 1000 per metre" in said
 
 
 @pytest.mark.parametrize(

@@ -40,8 +40,8 @@ class RunContent:
         folder = Path(folder)
         if not (folder / "trajectory.txt").is_file():
             raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
-        metrics = _metrics(folder)
-        written = str(metrics.get("versions", {}).get("dudmap", "0"))
+        versions = _metrics(folder).get("versions")
+        written = str(versions.get("dudmap", "0")) if isinstance(versions, dict) else "0"
         if _numbers(written) > _numbers(__version__):
             raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
         return cls(folder)

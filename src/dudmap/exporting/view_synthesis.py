@@ -19,6 +19,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.lens import Lens
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.other_view import OtherView
+from dudmap.input_files import damaged
 from dudmap.sequences.images import read_mask
 
 if TYPE_CHECKING:
@@ -144,7 +145,8 @@ def _open(run: RunContent, options: ExportOptions) -> "Sequence":
     from dudmap.sequences import open_sequence
 
     try:
-        sequence = open_sequence(**opened)
+        with damaged(DatasetError, f"{run.folder}/metrics.json"):
+            sequence = open_sequence(**opened)
     except DatasetError as error:
         if options.sequence is not None:
             raise

@@ -172,10 +172,10 @@ def _depth_warnings(found: Inspection) -> list[str]:
         units = found.median_depth * found.depth_scale
         fitting = [f"{scale:g}" for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1]]
         proposal = f"; {' or '.join(fitting)} would be plausible" if fitting else ""
-        options = " or ".join(f"--depth-unit {1 / float(scale):.4g}" for scale in fitting) or "--depth-unit METRES"
+        unit = f"{1 / float(fitting[0]):.4g}, which is {fitting[0]} per metre" if fitting else "METRES"
         out.append(
             f"the depth scale looks wrong: with {found.depth_scale:g} units per metre the median depth is "
-            f"{found.median_depth:.3g} m{proposal}: give {options}"
+            f"{found.median_depth:.3g} m{proposal}: give --depth-unit {unit}"
         )
     if found.valid_depth < FEW_READINGS:
         out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")

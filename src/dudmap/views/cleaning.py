@@ -265,7 +265,7 @@ def clean_recording(
         if progress is not None:
             progress(done, len(indices))
     _write_lists(out, run, sequence, lines, masks)
-    replaced, unknown = np.mean(shares, axis=0)
+    replaced, unknown = np.mean(shares, axis=0) if shares else (0.0, 0.0)
     return CleanReport(len(lines), tuple(sorted(left_out)), float(replaced), float(unknown))
 
 
