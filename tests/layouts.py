@@ -179,7 +179,50 @@ def seven_scenes(folder):
         [0.0078819942130445332, 0.0081718328771890631, 0.99993554558014031],
     ]
     T[:3, 3] = [-0.025558943178152542, 0.00010109636268061706, 0.0020318321729487039]
-    return Layout("7-Scenes", (585, 585, 320, 240), (480, 640), color=(525, 525, 320, 240, (480, 640)), T_color_depth=T)
+    return Layout(
+        "7-Scenes",
+        (585, 585, 320, 240),
+        (480, 640),
+        name="7-scenes-chess",
+        color=(525, 525, 320, 240, (480, 640)),
+        T_color_depth=T,
+    )
+
+
+def tsdf_fusion(folder):
+    """The sample of andyzeng/tsdf-fusion: registered images and one matrix."""
+    for k in range(3):
+        write_color(folder / f"frame-{15 + 2 * k:06d}.color.png", k)
+        write_depth(folder / f"frame-{15 + 2 * k:06d}.depth.png", k, missing=65535)
+        (folder / f"frame-{15 + 2 * k:06d}.pose.txt").write_text(rows(pose(k)))
+    (folder / "intrinsics.K.txt").write_text("60.0 0 31.0\n0 61.0 23.0\n0 0 1\n")
+    return Layout("3DMatch or tsdf-fusion", (60, 61, 31, 23), stamps=[15 / 30, 17 / 30, 19 / 30])
+
+
+def with_matrices(folder):
+    """images/, depth/, K.txt and poses.txt with a matrix a line, of a HoloLens for example."""
+    for k in range(3):
+        write_color(folder / f"images/{k}.jpg", k)
+        write_depth(folder / f"depth/{k}.png", k)
+    (folder / "K.txt").write_text("60.0 0 31.0\n0 61.0 23.0\n0 0 1\n")
+    (folder / "poses.txt").write_text("".join(" ".join(f"{v:.9f}" for v in pose(k).ravel()) + "\n" for k in range(3)))
+    return Layout("numbered images", (60, 61, 31, 23))
+
+
+def bop(folder):
+    """As docs/bop_datasets_format.md of bop_toolkit has it: depth in tenths of a millimetre, poses world to camera."""
+    cameras = {}
+    for k in range(3):
+        write_color(folder / f"rgb/{k:06d}.png", k)
+        write_depth(folder / f"depth/{k:06d}.png", k, 10000.0)
+        T = np.linalg.inv(pose(k))
+        cameras[str(k)] = {
+            "cam_K": [60.0, 0.0, 31.0, 0.0, 61.0, 23.0, 0.0, 0.0, 1.0], "depth_scale": 0.1,
+            "cam_R_w2c": T[:3, :3].ravel().tolist(), "cam_t_w2c": (1000 * T[:3, 3]).tolist(),
+        }  # fmt: skip
+    (folder / "scene_camera.json").write_text(json.dumps(cameras))
+    (folder / "scene_gt.json").write_text("{}")
+    return Layout("BOP", (60, 61, 31, 23))
 
 
 def volume_deform(folder):
@@ -463,8 +506,9 @@ def timed(folder):
 
 
 LAYOUTS = (
-    tum, bonn, icl_nuim, icl_nuim_loop, corbs, seven_scenes, volume_deform, scannet, replica, redwood, redwood_object,
-    openloris, epfl, nerfstudio, stray_scanner, arkit_scenes, polycam, realsense, azure_kinect, zed, timed,
+    tum, bonn, icl_nuim, icl_nuim_loop, corbs, seven_scenes, tsdf_fusion, with_matrices, bop, volume_deform, scannet,
+    replica, redwood, redwood_object, openloris, epfl, nerfstudio, stray_scanner, arkit_scenes, polycam, realsense,
+    azure_kinect, zed, timed,
 )  # fmt: skip
 
 

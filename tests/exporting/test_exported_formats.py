@@ -307,6 +307,22 @@ def test_nerfstudio_folder(made, run, tmp_path):
         assert agrees(seen, depth, mask)
 
 
+def test_the_recording_is_the_one_that_the_run_names(made, run, tmp_path):
+    where, sequence, _ = made
+    metrics = run / "metrics.json"
+    before = metrics.read_text() if metrics.is_file() else None
+    try:
+        metrics.write_text(json.dumps({"recording": {"path": str(where / "recording"), "camera": "90,90,79,59"}}))
+        tree = json.loads(exported(run, tmp_path / "transforms.json", every=4).read_text())
+        assert len(tree["frames"]) == len(sequence[::4]) if isinstance(sequence, list) else len(tree["frames"]) == 2
+        assert tree["fl_x"] == 90  # opened as the run did
+        metrics.write_text(json.dumps({"recording": {"path": str(tmp_path / "moved")}}))
+        with pytest.raises(DatasetError, match=r"that the run names cannot be read; name it by --sequence: .*moved"):
+            exported(run, tmp_path / "transforms.json")
+    finally:
+        metrics.unlink() if before is None else metrics.write_text(before)
+
+
 def test_colmap_folder(made, run, tmp_path):
     where, sequence, _ = made
     exported(run, tmp_path / "cameras.txt", sequence=where / "recording", every=2)

@@ -33,7 +33,7 @@ def test_what_is_found(recording):
     assert (found.duration, found.rate, found.color_rate) == pytest.approx((0.5, 10, 10))
     assert found.camera["width"] == WIDTH
     assert found.color_camera == found.camera
-    assert found.intrinsics_source.endswith("intrinsics.txt")
+    assert found.sources["intrinsics"].endswith("intrinsics.txt")
     depths = np.concatenate([frame.depth.ravel() for frame in map(open_sequence(recording).__getitem__, range(6))])
     assert found.median_depth == pytest.approx(np.median(depths[depths > 0]))
     assert found.valid_depth == pytest.approx(np.mean(depths > 0))
@@ -53,7 +53,7 @@ def test_a_wrong_depth_scale(recording, scale, proposal):
     said = warnings(open_sequence(recording, f"60,60,31.5,23.5,{WIDTH},{HEIGHT},{scale}"))
     assert "the depth scale looks wrong" in said
     assert proposal in said
-    assert "--camera fx,fy,cx,cy,w,h,depth_scale" in said
+    assert "give --depth-unit 0.001, which is 1000 per metre" in said
 
 
 @pytest.mark.parametrize(

@@ -42,7 +42,7 @@ def test_registered_frames_of_every_kind(tmp_path, kind):
     assert sequence.calibration is None
     assert (sequence.camera.fx, sequence.camera.fy, sequence.camera.cx, sequence.camera.cy) == (60, 61, 31.5, 23.5)
     assert sequence.camera.shape == (HEIGHT, WIDTH)
-    assert sequence.intrinsics_source == "/camera/aligned_depth_to_color/camera_info"
+    assert sequence.sources["intrinsics"] == "/camera/aligned_depth_to_color/camera_info"
     assert sequence.ground_truth is None
     check_frames(sequence)
 
@@ -235,7 +235,7 @@ def test_topics_can_be_chosen(tmp_path):
     with pytest.raises(DatasetError, match="recognised as depth"):
         open_sequence(path)
     sequence = open_sequence(path, topics="depth=/other/thing,color=/camera/color/image_raw")
-    assert sequence.intrinsics_source == "/other/camera_info"
+    assert sequence.sources["intrinsics"] == "/other/camera_info"
     check_frames(sequence)
 
 

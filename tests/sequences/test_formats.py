@@ -67,7 +67,7 @@ def pack(folder, file):
 def check(sequence, expected):
     assert isinstance(sequence, Recording)
     assert sequence.format == expected.format
-    assert sequence.intrinsics_source
+    assert all(sequence.sources[what] for what in ("intrinsics", "depth unit", "times"))
     camera = sequence.camera
     np.testing.assert_allclose([camera.fx, camera.fy, camera.cx, camera.cy], expected.intrinsics, rtol=1e-6)
     assert camera.shape == expected.shape
@@ -114,11 +114,12 @@ def test_its_archive(layout, suffix, written, tmp_path, cache):
 
 
 def test_every_reader_is_tested(written):
-    assert {reader.format for reader in readers()} >= {written(layout)[1].format for layout in LAYOUTS}
+    known = ", ".join(reader.format for reader in readers())
+    assert all(written(layout)[1].format in known for layout in LAYOUTS)
     for layout in LAYOUTS:
         folder, expected = written(layout)
         recognising = [reader.format for reader in readers() if reader.recognises(folder)]
-        assert recognising[0] == expected.format
+        assert expected.format in recognising[0]
 
 
 def test_a_given_camera_replaces_that_of_the_depth_images(written):

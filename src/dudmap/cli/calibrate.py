@@ -8,7 +8,9 @@ import typer
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import (
     CameraOption,
+    ColorOption,
     ConfigOption,
+    DepthOption,
     DepthUnitOption,
     FpsOption,
     PresetOption,
@@ -36,6 +38,8 @@ def calibrate(
     camera: CameraOption = None,
     fps: FpsOption = None,
     depth_unit: DepthUnitOption = None,
+    color: ColorOption = None,
+    depth: DepthOption = None,
     topics: TopicsOption = None,
     calibration: Annotated[
         Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
@@ -53,7 +57,7 @@ def calibrate(
     from dudmap.sequences import open_sequence
     from dudmap.terminal import plain_console
 
-    recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
+    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
     estimate = calibrate_sequence(recording, read_config(config, preset, assignments or []), given, max_frames)

@@ -8,7 +8,9 @@ import typer
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import (
     CameraOption,
+    ColorOption,
     ConfigOption,
+    DepthOption,
     DepthUnitOption,
     FpsOption,
     PresetOption,
@@ -35,9 +37,12 @@ def clean(
     camera: CameraOption = None,
     fps: FpsOption = None,
     depth_unit: DepthUnitOption = None,
+    color: ColorOption = None,
+    depth: DepthOption = None,
     passes: Annotated[
         int, typer.Option("--passes", min=1, max=2, help="Passes of the run that is made; 2 finds more.")
     ] = 2,
+    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
     quiet: QuietOption = False,
     as_json: JsonOption = False,
 ) -> None:
@@ -50,17 +55,17 @@ def clean(
     from dudmap.sequences import open_sequence
     from dudmap.views.cleaning import clean_recording
 
-    recording = open_sequence(sequence, camera, fps, depth_unit)
+    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
         parameters = read_config(config, preset, assignments or [])
         run_sequence(
             recording, parameters, out / "run",
-            save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,
+            max_frames=max_frames, save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,
         )  # fmt: skip
     with counted("cleaning", quiet=quiet or as_json) as progress:
-        report = clean_recording(RunContent.load(run or out / "run"), recording, out, progress)
+        report = clean_recording(RunContent.load(run or out / "run"), recording, out, progress, max_frames)
     text = (
         f"{report.frames} frames written to {out}: {report.replaced:.1%} of the pixels replaced, of which "
         f"{report.unknown / max(report.replaced, 1e-9):.1%} were never seen; {len(report.left_out)} frames without "

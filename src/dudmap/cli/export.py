@@ -45,7 +45,8 @@ def export(
         str, typer.Option("--heights", help="Lower and upper end of the robot above the floor.", metavar="LOW,HIGH")
     ] = "0.1,1.8",
     sequence: Annotated[
-        Path | None, typer.Option("--sequence", help="The recording of the run, for images and masks.")
+        Path | None,
+        typer.Option("--sequence", help="The recording of the run, for images and masks; default: the one it names."),
     ] = None,
     camera: CameraOption = None,
     every: Annotated[int, typer.Option("--every", min=1, help="Every so many frames of the recording.")] = 1,

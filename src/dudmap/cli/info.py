@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, DepthUnitOption, FpsOption, TopicsOption
+from dudmap.cli.run import CameraOption, ColorOption, DepthOption, DepthUnitOption, FpsOption, TopicsOption
 
 if TYPE_CHECKING:
     from dudmap.pipeline.inspection import Inspection
@@ -23,6 +23,8 @@ def info(
     camera: CameraOption = None,
     fps: FpsOption = None,
     depth_unit: DepthUnitOption = None,
+    color: ColorOption = None,
+    depth: DepthOption = None,
     topics: TopicsOption = None,
     sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
     as_json: JsonOption = False,
@@ -39,7 +41,7 @@ def info(
     from dudmap.sequences import open_sequence
     from dudmap.terminal import plain_console
 
-    recording = open_sequence(path, camera, fps, depth_unit, topics=topics)
+    recording = open_sequence(path, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
     if sheet is not None:
@@ -71,7 +73,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         ("depth camera", _camera(found.camera)),
         ("colour camera", "the same, registered" if registered else _camera(found.color_camera)),
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
-        ("intrinsics from", found.intrinsics_source),
+        *((f"{what} from", source) for what, source in found.sources.items()),
         ("depth", _depth(found)),
         ("ground truth", f"{found.ground_truth} poses" if found.ground_truth else "none"),
         ("gaps", _gaps(found)),

@@ -33,6 +33,14 @@ DepthUnitOption = Annotated[
     float | None,
     typer.Option("--depth-unit", help="Metres per unit of 16-bit depth; 0.001 = millimetres.", metavar="METRES"),
 ]
+ColorOption = Annotated[
+    str | None,
+    typer.Option("--color", help="Colour images of a folder in no known layout, e.g. 'left/*.png'.", metavar="PATTERN"),
+]
+DepthOption = Annotated[
+    str | None,
+    typer.Option("--depth", help="Depth images of a folder in no known layout, e.g. 'range/*.png'.", metavar="PATTERN"),
+]
 ConfigOption = Annotated[Path | None, typer.Option("--config", help="TOML file of parameters.")]
 PresetOption = Annotated[
     str | None,
@@ -92,6 +100,8 @@ def run(
     camera: CameraOption = None,
     fps: FpsOption = None,
     depth_unit: DepthUnitOption = None,
+    color: ColorOption = None,
+    depth: DepthOption = None,
     topics: TopicsOption = None,
     calibration: CalibrationOption = "auto",
     max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
@@ -178,17 +188,14 @@ def run(
     parameters = read_config(config, preset, [*(assignments or []), *([f"device={device}"] if device else [])])
     resolve(parameters.device, adaptive=parameters.volume.adaptive)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
-    recording = open_sequence(sequence, camera, fps, depth_unit, topics=topics)
+    recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     for warning in inspect(recording).warnings:
         _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
     if calibration != "auto" or not live:  # what has been estimated beforehand is not estimated again
         parameters = parameters.override(["sensor.self_calibration=false"])
-    opened = {
-        "path": str(sequence.resolve()), "camera": camera, "fps": fps, "depth_unit": depth_unit, "topics": topics,
-    }  # fmt: skip
-    storing = None if live or checkpoint_every == 0 else Storing(opened, checkpoint_every, report)
+    storing = None if live or checkpoint_every == 0 else Storing(recording.opened, checkpoint_every, report)
     with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:
         done = run_sequence(
             recording, parameters, out,

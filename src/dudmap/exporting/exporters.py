@@ -79,7 +79,7 @@ def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None
     to, options = Path(to), options or ExportOptions()
     exporter = find_exporter(to.name)
     options.check(exporter.options, to.name)
-    if not to.parent.is_dir():
-        raise ConfigError(f"the folder {to.parent} of the export does not exist; create it")
-    exporter.write(RunContent.load(folder), to, options)
+    run = RunContent.load(folder)
+    to.parent.mkdir(parents=True, exist_ok=True)
+    exporter.write(run, to, options)
     return to

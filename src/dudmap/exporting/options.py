@@ -22,8 +22,8 @@ class ExportOptions:
         up: Direction against gravity in the world frame; None for the normal of the floor in the map.
         resolution: Edge of the cells of grids, metres.
         heights: Lower and upper end of the robot above the floor, metres.
-        sequence: Recording that the run was made from.
-        camera: Intrinsics of that recording, as ``--camera`` takes them.
+        sequence: Recording that the run was made from; None for the one that the run names.
+        camera: Intrinsics of that recording, as ``--camera`` takes them; None for those of the run.
         every: Every so many frames of the recording are exported.
     """
 

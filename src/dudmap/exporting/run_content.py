@@ -40,8 +40,17 @@ class RunContent:
         folder = Path(folder)
         if not (folder / "trajectory.txt").is_file():
             raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
-        _check_version(folder)
+        versions = _metrics(folder).get("versions")
+        written = str(versions.get("dudmap", "0")) if isinstance(versions, dict) else "0"
+        if _numbers(written) > _numbers(__version__):
+            raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
         return cls(folder)
+
+    @property
+    def recording(self) -> dict[str, Any]:
+        """Arguments of ``open_sequence`` for the recording of the run; empty if the run does not name it."""
+        found = _metrics(self.folder).get("recording")
+        return found if isinstance(found, dict) else {}
 
     @cached_property
     def trajectory(self) -> Trajectory:
@@ -136,21 +145,17 @@ class RunContent:
         return masks
 
 
-def _check_version(folder: Path) -> None:
-    """Refuse a folder that a newer version of dudmap wrote.
+def _metrics(folder: Path) -> dict[str, Any]:
+    """Content of metrics.json; empty without this file.
 
     Raises:
-        DatasetError: It did, or metrics.json is damaged.
+        DatasetError: It is damaged.
     """
     path = folder / "metrics.json"
-    if not path.is_file():
-        return
     try:
-        written = str(read_json(path).get("versions", {}).get("dudmap", "0"))
+        return dict(read_json(path)) if path.is_file() else {}
     except DAMAGE as error:
         raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
-    if _numbers(written) > _numbers(__version__):
-        raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
 
 
 def _numbers(version: str) -> list[int]:

@@ -19,6 +19,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.lens import Lens
 from dudmap.geometry.mesh import Mesh
 from dudmap.geometry.other_view import OtherView
+from dudmap.input_files import damaged
 from dudmap.sequences.images import read_mask
 
 if TYPE_CHECKING:
@@ -134,14 +135,24 @@ def index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
 
 
 def _open(run: RunContent, options: ExportOptions) -> "Sequence":
-    if options.sequence is None:
-        raise ConfigError("the images come from the recording; name it by --sequence")
+    given = {"path": options.sequence, "camera": options.camera}
+    opened = run.recording | {name: value for name, value in given.items() if value is not None}
+    if "path" not in opened:
+        raise ConfigError("the images come from the recording, which the run does not name; name it by --sequence")
     if options.every < 1:
         raise ConfigError(f"found --every {options.every}; expected 1 or more")
     run.mask_files()
     from dudmap.sequences import open_sequence
 
-    sequence = open_sequence(options.sequence, options.camera)
+    try:
+        with damaged(DatasetError, f"{run.folder}/metrics.json"):
+            sequence = open_sequence(**opened)
+    except DatasetError as error:
+        if options.sequence is not None:
+            raise
+        raise DatasetError(
+            f"the recording that the run names cannot be read; name it by --sequence: {error}"
+        ) from error
     if sequence.calibration is not None and run.calibration is None:
         raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
     return sequence

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 SAMPLES = 12
 """Number of evenly spread frames that are read."""
-NEAR, FAR = 0.1, 30.0
+NEAR, FAR = 0.1, 8.0
 """Plausible medians of the depth readings, metres: no depth camera measures nearer or farther most of the time."""
 FEW_READINGS = 0.2
 """Share of pixels with a reading below which the depth is called sparse."""
@@ -28,6 +28,8 @@ UNEQUAL_FOCAL = 0.1
 """Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
 GAP = 3.0
 """Time between frames that counts as a gap, as a multiple of the median."""
+LEFT_OVER = 0.02
+"""Share of the images without a partner that is worth a warning."""
 SLOW, FAST = 1.0, 0.001
 """Median time between frames, seconds, beyond which the times are in another unit, or not of one camera."""
 LATE = 0.015
@@ -51,7 +53,7 @@ class Inspection:
         gaps: (time of the last frame before it, length) of every gap, seconds.
         camera, color_camera: Intrinsics of the depth and of the colour camera; the same where they are registered.
         T_color_depth: 4x4 motion between them, row by row; None where they are registered.
-        intrinsics_source: Where the intrinsics come from.
+        sources: Where intrinsics, depth unit and times come from: a file, a name, an option, or that they are assumed.
         depth_scale: Units of a 16-bit depth image per metre.
         median_depth: Of all readings of the sampled frames, metres; None without any.
         valid_depth: Share of pixels with a reading.
@@ -70,7 +72,7 @@ class Inspection:
     camera: dict[str, Any]
     color_camera: dict[str, Any]
     T_color_depth: list[list[float]] | None
-    intrinsics_source: str
+    sources: dict[str, str]
     depth_scale: float
     median_depth: float | None
     valid_depth: float
@@ -123,7 +125,7 @@ def inspect(
         camera=_numbers(camera),
         color_camera=_numbers(camera if calibration is None else calibration.camera),
         T_color_depth=None if calibration is None else calibration.T_color_depth.tolist(),
-        intrinsics_source=getattr(sequence, "intrinsics_source", "the recording"),
+        sources=dict(getattr(sequence, "sources", {})),
         depth_scale=camera.depth_scale,
         median_depth=float(np.median(readings)) if len(readings) else None,
         valid_depth=len(readings) / pixels if pixels else 0.0,
@@ -136,6 +138,7 @@ def inspect(
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
         *_time_warnings(sequence.timestamps, colors),
         *_truth_warnings(sequence.timestamps, truth),
+        *_pairing_warnings(sequence),
     ]
     return found
 
@@ -169,9 +172,10 @@ def _depth_warnings(found: Inspection) -> list[str]:
         units = found.median_depth * found.depth_scale
         fitting = [f"{scale:g}" for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1]]
         proposal = f"; {' or '.join(fitting)} would be plausible" if fitting else ""
+        unit = f"{1 / float(fitting[0]):.4g}, which is {fitting[0]} per metre" if fitting else "METRES"
         out.append(
             f"the depth scale looks wrong: with {found.depth_scale:g} units per metre the median depth is "
-            f"{found.median_depth:.3g} m{proposal}: give it as the last number of --camera fx,fy,cx,cy,w,h,depth_scale"
+            f"{found.median_depth:.3g} m{proposal}: give --depth-unit {unit}"
         )
     if found.valid_depth < FEW_READINGS:
         out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")
@@ -207,6 +211,14 @@ def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | Non
     if np.any(np.diff(colors) < 0):
         out.append("the colour images are not in the order of the depth images: the times of the lists are mixed up")
     return out
+
+
+def _pairing_warnings(sequence: "Sequence") -> list[str]:
+    counts = getattr(sequence, "image_counts", None)
+    if counts is None or len(sequence) >= (1 - LEFT_OVER) * max(counts):
+        return []
+    how = getattr(sequence, "sources", {})["frames"]
+    return [f"only {len(sequence)} frames come of {how}; the other images are not used"]
 
 
 def _truth_warnings(times: NDArray[np.float64], truth: "Trajectory | None") -> list[str]:

@@ -150,6 +150,7 @@ def write_run_folder(
     foreseen = Exception if defect else (OSError, MapError)
     (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
+    metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
     metrics |= record.metrics()
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}

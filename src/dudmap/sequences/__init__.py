@@ -1,6 +1,6 @@
 """Readers of recordings: one small class per format, all with the interface ``Sequence``."""
 
-from dataclasses import replace
+from dataclasses import astuple, replace
 from functools import cache
 from importlib import import_module
 from math import isfinite
@@ -68,14 +68,18 @@ class Recording(Sequence, Protocol):
 
     Attributes:
         format: Name of its format, for people.
-        intrinsics_source: Where the intrinsics come from, e.g. ``intrinsics.txt`` or ``the --camera option``.
+        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
+            that they are assumed.
         timed: Whether the times were read or their rate was given; False where they are invented.
+        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
+
+    opened: dict[str, Any]
 
     @property
     def format(self) -> str: ...  # noqa: D102
     @property
-    def intrinsics_source(self) -> str: ...  # noqa: D102
+    def sources(self) -> dict[str, str]: ...  # noqa: D102
     @property
     def timed(self) -> bool: ...  # noqa: D102
 
@@ -111,7 +115,7 @@ READERS = (
     "tum:TumSequence",
     "nerfstudio:NerfstudioSequence",
     "frame_files:VolumeDeformSequence",
-    "frame_files:SevenScenesSequence",
+    "frame_files:SharedFrameFiles",
     "scannet:ScanNetSequence",
     "replica:ReplicaSequence",
     "arkit:StrayScannerSequence",
@@ -119,6 +123,7 @@ READERS = (
     "arkit:PolycamSequence",
     "redwood:RedwoodSequence",
     "epfl:EpflSequence",
+    "bop:BopSequence",
     "numbered:NumberedSequence",
     "sens:SensRecording",
     "klg:KlgRecording",
@@ -127,6 +132,7 @@ READERS = (
     "bag:RosBag",
 )
 """Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
+NUMBERED = READERS.index("numbered:NumberedSequence")
 DEPTH_OF_SEARCH = 3
 """Levels of folders below the given one in which a recording is looked for."""
 
@@ -181,7 +187,8 @@ def open_sequence(
     """
     path = Path(path)
     with damaged(DatasetError, f"the recording {path}"):
-        place, reader = _find(path)
+        patterned = path.is_dir() and (options.get("color") or options.get("depth"))
+        place, reader = (path, readers()[NUMBERED]) if patterned else _find(path)
     given = {name: value for name, value in options.items() if value is not None}
     numbers = {"fps": fps, "depth_unit": depth_unit}
     for name, number in numbers.items():
@@ -197,10 +204,13 @@ def open_sequence(
         recording: Any = reader(place, camera, **given)
         if depth_unit is not None:
             recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
+            recording.sources["depth unit"] = f"--depth-unit {depth_unit:g}"
         if fps is not None:
             recording.set_rate(fps)
-    recording.name = printable(recording.name)
-    return recording
+        recording.name = printable(recording.name)
+        again = camera if isinstance(camera, str | None) else ",".join(map(str, astuple(camera)[:7]))
+        recording.opened = {"path": str(path.resolve()), "camera": again, **numbers, **given}
+        return recording
 
 
 def _option(name: str) -> str:
@@ -263,6 +273,28 @@ def _unknown(path: Path) -> str:
             f"{path} is a video; recordings of an Azure Kinect are not read, since its library pyk4a has no wheel for "
             "Python 3.13: export images and intrinsics with Open3D's azure_kinect_mkv_reader and read that folder"
         )
-    kind = "folder" if path.is_dir() else "file"
     formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
+    if path.is_dir() and (images := _images_in(path)):
+        return images
+    kind = "folder" if path.is_dir() else "file"
     return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"
+
+
+def _images_in(path: Path) -> str:
+    """Sentence on a folder with images in it, in a layout that is not known; empty if there are none."""
+    from dudmap.sequences.camera_files import IMAGES, seen
+    from dudmap.sequences.numbered import kinds_of_images
+
+    places = [place for place in (path, *sorted(path.iterdir())) if place.is_dir()]
+    places = [place for place in places if any(file.suffix.lower() in IMAGES for file in place.iterdir())]
+    if not places:
+        return ""
+    kinds = kinds_of_images(path)
+    known = [f"{len(files)} {kind} images in {files[0].parent.name}/" for kind, files in kinds.items() if files]
+    missing = " and ".join(kind for kind, files in kinds.items() if not files)
+    there = "; ".join(f"{'.' if place == path else place.name}/ with {seen(place)}" for place in places[:5])
+    return (
+        f"{path} holds images in no known layout: recognised {' and '.join(known) or 'nothing'} by the names, missing "
+        f"numbered {missing} images; there are {there}; name the files with --color PATTERN and --depth PATTERN, such "
+        f"as --depth '{places[0].name}/*.png'"
+    )

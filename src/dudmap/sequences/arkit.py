@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry import se3
-from dudmap.geometry.association import TimedFile, associate
+from dudmap.geometry.association import TimedFile
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import read_json, read_text
@@ -110,13 +110,7 @@ class ArkitScenesSequence(ArkitFolder):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         colors, depths = (self._timed(kind, "png") for kind in ("lowres_wide", "lowres_depth"))
-        first, second = (np.array([file.timestamp for file in files]) for files in (colors, depths))
-        pairs = [(colors[i], depths[j]) for i, j in associate(first, second)]
-        if not pairs:
-            raise DatasetError(
-                f"{self.path}: by the times in the names no colour image lies within 20 ms of a depth image"
-            )
-        return pairs
+        return self._pair_timed(colors, depths)
 
     def _timed(self, folder: str, suffix: str) -> list[TimedFile]:
         matches = ((re.fullmatch(rf"\d+_(\d+\.\d+)\.{suffix}", f.name), f) for f in (self.path / folder).iterdir())

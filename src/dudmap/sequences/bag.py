@@ -163,15 +163,15 @@ class RosBag:
         color_lens = self._lens(topics.color_info, topics.color, color_size)
         one_size = depth_size == color_size
         if given is not None:
-            known = intrinsics.given(given, self._units())
-            depth_lens = Lens(known.camera(*depth_size))
-            self.intrinsics_source = known.source
+            known = intrinsics.given(given)
+            depth_lens = Lens(known.camera(*depth_size, self._units()))
+            source = known.source
         else:
             info, beside = topics.depth_info, topics.depth
             if info is None and one_size and topics.registered:
                 info, beside = topics.color_info, topics.color
             depth_lens = self._lens(info, beside, depth_size)
-            self.intrinsics_source = info.topic if info else ""
+            source = info.topic if info else ""
         if depth_lens is None:
             raise DatasetError(
                 f"{self.path} holds no camera_info beside {topics.depth.topic}; choose it with --topics "
@@ -184,6 +184,11 @@ class RosBag:
             )
         if color_lens is None or (given is not None and one_size):
             color_lens = depth_lens
+        self.sources = {
+            "intrinsics": source,
+            "depth unit": "the bag, or millimetres as ROS has them",
+            "times": "the bag",
+        }
         self.camera, self._depth_lens, self._color_lens = depth_lens.camera, depth_lens, color_lens
         together = color_lens is depth_lens
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)

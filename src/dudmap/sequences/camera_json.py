@@ -1,4 +1,4 @@
-"""Intrinsics of JSON files: Open3D and its recorders, NICE-SLAM, librealsense, ZED, and plain keys."""
+"""Intrinsics of JSON and YAML files: Open3D, NICE-SLAM, librealsense, ZED, ROS, Kalibr, and plain keys."""
 
 import math
 from collections.abc import Iterable, Iterator
@@ -12,6 +12,7 @@ from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.input_files import read_json
 from dudmap.sequences.intrinsics import KEYS, Intrinsics
+from dudmap.sequences.yaml_files import read_yaml
 
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"),
@@ -24,29 +25,33 @@ NAMES = {
     "k1": ("k1",), "k2": ("k2",), "p1": ("p1",), "p2": ("p2",), "k3": ("k3",),
 }  # fmt: skip
 """Our key and the names it has in files."""
+MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
+LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "D", "d")
+"""Names of the intrinsic matrix and of the coefficients of the lens: a list, or a ``data`` list as OpenCV writes it."""
+OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
 MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
 """Names of a 4x4 matrix that takes points of the depth camera to the colour camera."""
 
 
-def load(paths: Iterable[Path], depth_scale: float) -> Intrinsics:
-    """Intrinsics of JSON files: of one camera, or of a depth and a colour camera.
+def load(paths: Iterable[Path]) -> Intrinsics:
+    """Intrinsics of JSON and YAML files: of one camera, or of a depth and a colour camera.
 
     Every object that holds focal lengths and a principal point is a camera; it is a depth camera where a name on the
     way to it, the file's included, contains "depth". A depth scale below 1 is metres per unit.
 
     Args:
         paths: The files.
-        depth_scale: Depth units per metre where the files give none.
 
     Raises:
         DatasetError: A file cannot be read, or there is no camera or more than one of a kind.
     """
     cameras: list[tuple[str, dict[str, float]]] = []
-    scale, motion, files = depth_scale, np.eye(4), list(paths)
+    scale, motion, files = {}, np.eye(4), list(paths)
     for path in files:
         tree = _read(path)
         cameras += _cameras(tree, path.stem.lower())
-        scale = _depth_scale(tree) or scale
+        unit = _depth_scale(tree)
+        scale = {"depth_scale": unit} if unit else scale
         motion = _motion(tree, motion)
     source = " and ".join(path.name for path in files)
     depths = [values for name, values in cameras if "depth" in name]
@@ -57,14 +62,14 @@ def load(paths: Iterable[Path], depth_scale: float) -> Intrinsics:
             "give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
         )
     if not depths:
-        return Intrinsics(colors[0] | {"depth_scale": scale}, source)
+        return Intrinsics(colors[0] | scale, source)
     color = colors[0] if colors and colors[0] != depths[0] else {}
-    return Intrinsics(depths[0] | {"depth_scale": scale}, source, color, se3.inverse(motion))
+    return Intrinsics(depths[0] | scale, source, color, se3.inverse(motion))
 
 
 def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
     try:
-        return read_json(path)
+        return read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_json(path)
     except (OSError, ValueError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
 
@@ -86,22 +91,40 @@ def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  #
 def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     """Numbers by our keys of one JSON object; None if it is no camera.
 
-    ``intrinsic_matrix`` has 9 numbers column by column (Open3D) or 3 rows of 3; its last row is 0 0 1.
+    A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
+
+    Raises:
+        DatasetError: The lens model is another one than Brown and Conrady's with up to five coefficients.
     """
     values = {}
     for key, names in NAMES.items():
         found = next((tree[name] for name in names if _is_finite(tree.get(name))), None)
         if found is not None and key != "depth_scale":
             values[key] = float(found)
-    K = _numbers(tree.get("intrinsic_matrix", tree.get("K")), 9)
+    K = _numbers(_first(tree, MATRICES), 9)
     if K is not None:
         K = K.reshape(3, 3)
         K = K.T if K[2, 0] or K[2, 1] else K
         values |= {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
-    lens = tree.get("coeffs", tree.get("disto", tree.get("distortion")))
-    if isinstance(lens, list) and all(map(_is_finite, lens[:5])):
+    four = _numbers(tree.get("intrinsics"), 4)
+    if four is not None:
+        values |= dict(zip(KEYS[:4], four.tolist(), strict=True))
+    lens = _first(tree, LENSES)
+    if isinstance(lens, list) and lens and all(map(_is_finite, lens)):
+        model = str(tree.get("distortion_model", tree.get("model", "")))
+        if any(lens) and (any(lens[5:]) or model.lower() in OTHER_LENSES):
+            raise DatasetError(
+                f"the lens {lens} of the model {model or 'that is not named'} is not read; expected k1 k2 p1 p2 [k3]: "
+                "rectify the images, or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+            )
         values |= dict(zip(KEYS[7:], map(float, lens[:5]), strict=False))
     return values if all(key in values for key in KEYS[:4]) else None
+
+
+def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:  # noqa: ANN401
+    """Value of the first of some names, of a matrix in OpenCV's form its data."""
+    value = next((tree[name] for name in names if name in tree), None)
+    return value.get("data") if isinstance(value, dict) else value
 
 
 def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401

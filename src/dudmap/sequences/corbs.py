@@ -5,7 +5,6 @@ from pathlib import Path
 
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences import intrinsics
 from dudmap.sequences.archive import origin, unpack
 from dudmap.sequences.tum import TumSequence
 
@@ -21,6 +20,7 @@ class CorbsSequence(TumSequence):
     """
 
     format = "CoRBS"
+    published = "CoRBS", CAMERA
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -29,9 +29,6 @@ class CorbsSequence(TumSequence):
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         return [(_slashed(color), _slashed(depth)) for color, depth in super()._find_pairs()]
-
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        return intrinsics.own_or(self.path, CAMERA, "the CoRBS camera")
 
     def _find_ground_truth(self) -> Trajectory | None:
         truth = super()._find_ground_truth()

@@ -3,7 +3,6 @@
 from pathlib import Path
 
 from dudmap.geometry.association import TimedFile
-from dudmap.sequences import intrinsics
 from dudmap.sequences.image_folder import ImageFolder, numbered_files
 
 CAMERA = {
@@ -17,6 +16,7 @@ class EpflSequence(ImageFolder):
     """Folder such as ``epfl_lab/20140804_160621_00`` with ``rgb000033.png`` and ``depth000033.png`` in millimetres."""
 
     format = "EPFL RGB-D Pedestrian"
+    published = "EPFL", CAMERA
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -28,6 +28,3 @@ class EpflSequence(ImageFolder):
         return self._pair_numbered(
             numbered_files(files, r"rgb(\d{6})\.png"), numbered_files(files, r"depth(\d{6})\.png")
         )
-
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        return intrinsics.own_or(self.path, CAMERA, "the EPFL camera")

@@ -1,15 +1,15 @@
 """Folders of ``frame-000000.color.png``, ``.depth.png`` and ``.pose.txt``: 7-Scenes, VolumeDeform and others."""
 
+import re
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError
 from dudmap.geometry import se3
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences import images, intrinsics
+from dudmap.sequences import camera_files, images, intrinsics
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_matrices, read_matrix, rigid_trajectory
 
@@ -28,6 +28,8 @@ KINECT_COLOR_DEPTH = np.array(
 )
 """Points of the depth camera of one Kinect into its colour camera (LIRIS), which DSAC* takes for 7-Scenes. ``dudmap
 calibrate`` on 200 frames of a recording finds no better place, focal length or principal point than these."""
+SEVEN_SCENES = r"(7|seven)[-_ ]?scenes|/(chess|fire|heads|office|pumpkin|red_?kitchen|stairs)/seq-\d+$"
+"""Path of a recording of 7-Scenes: the name of the set, or of one of its scenes above ``seq-01``."""
 LOST = 65535
 """Value of a pixel without reading in 7-Scenes."""
 
@@ -45,14 +47,20 @@ class FrameFiles(ImageFolder):
         return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
 
 
-class SevenScenesSequence(FrameFiles):
-    """Folder of 7-Scenes (Shotton et al. 2013). Depth is not registered to colour; 65535 means no reading.
+class SharedFrameFiles(FrameFiles):
+    """Folder of such images with pose files: 7-Scenes (Shotton et al. 2013), 3DMatch, tsdf-fusion and others.
 
-    The cameras are those of the data set; a camera-intrinsics.txt (3x3 matrix) beside the images is the depth camera.
-    Depth that somebody has registered to colour needs an intrinsics.txt.
+    The intrinsics lie in the folder or the one above, and colour is registered to depth. Where the path names 7-Scenes,
+    the cameras are those of that data set, whose depth is not registered to colour, and camera-intrinsics.txt is its
+    depth camera; depth that somebody has registered needs an intrinsics.txt. 65535 means no reading.
     """
 
-    format = "7-Scenes"
+    format = "7-Scenes, 3DMatch or tsdf-fusion"
+
+    def __init__(self, path: str | Path, camera: intrinsics.Camera | str | None = None) -> None:
+        named = re.search(SEVEN_SCENES, Path(path).resolve().as_posix(), flags=re.IGNORECASE)
+        self.format = "7-Scenes" if named else "3DMatch or tsdf-fusion"
+        super().__init__(path, camera)
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -60,15 +68,17 @@ class SevenScenesSequence(FrameFiles):
         return path.is_dir() and any(path.glob("frame-*.depth.png")) and any(path.glob("frame-*.pose.txt"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        registered = intrinsics.own(self.path, self.depth_scale)
-        if registered is not None:
-            return registered
-        depth, source = SEVEN_SCENES_DEPTH, "the 7-Scenes cameras"
-        if (self.path / "camera-intrinsics.txt").is_file():
-            depth, source = _matrix(self.path / "camera-intrinsics.txt"), "camera-intrinsics.txt, colour of 7-Scenes"
-        return intrinsics.Intrinsics(
-            depth | {"depth_scale": self.depth_scale}, source, dict(SEVEN_SCENES_COLOR), se3.inverse(KINECT_COLOR_DEPTH)
-        )
+        known = camera_files.find(self.path)
+        if self.format != "7-Scenes" and known is None:
+            raise camera_files.unknown(
+                self.path, ", since 7-Scenes, 3DMatch and others share this layout and the path does not name 7-Scenes"
+            )
+        if known is not None and (self.format != "7-Scenes" or Path(known.source).name != "camera-intrinsics.txt"):
+            return known
+        depth = intrinsics.Intrinsics(SEVEN_SCENES_DEPTH, "7-Scenes, named in the path") if known is None else known
+        source = depth.source if known is None else f"{depth.source}; colour: 7-Scenes, named in the path"
+        motion = se3.inverse(KINECT_COLOR_DEPTH)
+        return intrinsics.Intrinsics(dict(depth.values), source, dict(SEVEN_SCENES_COLOR), motion)
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         depth = images.read_depth(path, depth_scale)
@@ -105,13 +115,13 @@ class VolumeDeformSequence(FrameFiles):
         )
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        depth = _matrix(self.path / "depthIntrinsics.txt") | {"depth_scale": self.depth_scale}
+        depth = intrinsics.from_file(self.path / "depthIntrinsics.txt").values
         file = self.path / "colorIntrinsics.txt"
-        color = _matrix(file) if file.is_file() else {key: depth[key] for key in intrinsics.KEYS[:4]}
-        if all(color[key] == depth[key] for key in color):
+        color = intrinsics.from_file(file).values if file.is_file() else depth
+        if color == depth:
             return intrinsics.Intrinsics(depth, "depthIntrinsics.txt")
         height, width = images.read_color(self._pairs[0][0].path).shape[:2]
-        color |= {"width": width, "height": height}
+        color = color | {"width": width, "height": height}
         return intrinsics.Intrinsics(depth, "depthIntrinsics.txt and colorIntrinsics.txt", color)
 
     def _find_ground_truth(self) -> Trajectory | None:
@@ -119,18 +129,4 @@ class VolumeDeformSequence(FrameFiles):
         file = self._top / "poses.txt"
         if per_frame is not None or not file.is_file():
             return per_frame
-        poses = read_matrices(file)
-        return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(poses))
-
-
-def _matrix(path: Path) -> dict[str, float]:
-    """fx, fy, cx, cy of a 3x3 or 4x4 intrinsic matrix.
-
-    Raises:
-        DatasetError: The file cannot be read or holds another count of numbers.
-    """
-    try:
-        K = read_matrix(path, 4, 4)
-    except DatasetError:
-        K = read_matrix(path, 3, 3)
-    return {"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}
+        return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(read_matrices(file)))

@@ -10,7 +10,6 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.geometry.association import TimedFile, read_rows
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import read_text
-from dudmap.sequences import intrinsics
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import rigid_trajectory
 
@@ -31,7 +30,8 @@ class IclNuimSequence(ImageFolder):
     """
 
     format = "ICL-NUIM"
-    depth_scale = 5000.0
+    depth_scale = CAMERA["depth_scale"]
+    published = "ICL-NUIM", CAMERA
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -48,9 +48,6 @@ class IclNuimSequence(ImageFolder):
         depths = numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png")
         return self._pair_numbered(colors, depths)
 
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        return intrinsics.own_or(self.path, CAMERA, "the ICL-NUIM camera")
-
     def _find_ground_truth(self) -> Trajectory | None:
         file = _truth_file(self.path)
         return None if file is None else _freiburg(file)
@@ -64,6 +61,7 @@ class IclNuimLoopSequence(ImageFolder):
     """
 
     format = "ICL-NUIM"
+    published = "ICL-NUIM", CAMERA
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -74,9 +72,6 @@ class IclNuimLoopSequence(ImageFolder):
         files = list(self.path.iterdir())
         colors = numbered_files(files, SCENE_FILE + r"\.png")
         return self._pair_numbered(colors, numbered_files(files, SCENE_FILE + r"\.depth"))
-
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        return intrinsics.own_or(self.path, CAMERA, "the ICL-NUIM camera")
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         try:

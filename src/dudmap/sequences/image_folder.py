@@ -2,7 +2,7 @@
 
 import re
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Sized
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.frame import Frame
-from dudmap.geometry.association import TimedFile
+from dudmap.geometry.association import TimedFile, associate
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import damaged
-from dudmap.sequences import images, intrinsics
+from dudmap.sequences import camera_files, images, intrinsics
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""
@@ -25,18 +25,19 @@ FRAME_RATE = 30.0
 class ImageFolder(ABC):
     """Base class of recordings whose frames are a colour file and a depth file each.
 
-    A format says how its files pair (``_find_pairs``), what its cameras are (``_find_intrinsics``), and optionally
-    where the truth is (``_find_ground_truth``) and how an image is stored (``_read_depth``, ``_read_color``).
+    A format says how its files pair (``_find_pairs``) and optionally what its cameras are where no file says so
+    (``_published``), where the truth is (``_find_ground_truth``) and how an image is stored (``_read_depth``).
 
     Args:
         path: The folder.
-        camera: Intrinsics that replace those of the depth camera, as a Camera or as
-            ``fx,fy,cx,cy[,w,h[,depth_scale]]``; a colour camera of its own stays as the recording gives it.
+        camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``;
+            colour images of another size than depth keep their own camera.
 
     Attributes:
         name: Name of the folder.
         camera: Intrinsics.
-        intrinsics_source: Where they come from.
+        sources: Where ``intrinsics``, ``depth unit``, ``times`` and ``frames`` come from: a file, a name, an option, or
+            that they are assumed.
         calibration: Of the colour camera, where it is another one; None for colour that is registered to depth.
         timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses, None if they are not known.
@@ -51,14 +52,23 @@ class ImageFolder(ABC):
     timed = True
     depth_scale = 1000.0
     """Depth units per metre where neither the recording nor the user says otherwise."""
+    published: tuple[str, dict[str, float]] | None = None
+    """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         self.path = Path(path)
         self.name = self.path.resolve().name
+        self._pairing, self.image_counts = "a list of pairs", None
         self._pairs = self._find_pairs()
         self.timestamps = np.array([depth.timestamp for _, depth in self._pairs], dtype=np.float64)
         known = self._find_intrinsics() if camera is None else self._replaced(camera)
-        self.intrinsics_source = known.source
+        unit = "depth_scale" in known.values
+        self.sources = {
+            "intrinsics": known.source,
+            "depth unit": known.source if unit else f"assumed, usual in the format {self.format}",
+            "times": "the recording" if self.timed else f"assumed, {FRAME_RATE:g} frames a second",
+            "frames": self._pairing,
+        }
         self.calibration = known.calibration()
         self.camera = self._probe(known)
         self.ground_truth = self._find_ground_truth()
@@ -102,7 +112,7 @@ class ImageFolder(ABC):
         self.timestamps = factor * self.timestamps
         if self.ground_truth is not None:
             self.ground_truth = Trajectory(factor * self.ground_truth.timestamps, self.ground_truth.Ts_world_camera)
-        self.timed = True
+        self.timed, self.sources["times"] = True, f"--fps {fps:g}"
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
         """True dynamic mask (H, W) of a frame; this layout has none."""
@@ -112,9 +122,23 @@ class ImageFolder(ABC):
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of all frames, by increasing time of the depth."""
 
-    @abstractmethod
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics as the recording or its data set gives them."""
+        """Intrinsics of a file that lies there, else those of the data set.
+
+        Raises:
+            DatasetError: There is neither, or the file cannot be understood.
+        """
+        known = camera_files.find(self.path) or self._published()
+        if known is None:
+            raise camera_files.unknown(self.path)
+        return known
+
+    def _published(self) -> intrinsics.Intrinsics | None:
+        """Intrinsics of the data set, where the layout or a name tells which one it is."""
+        if self.published is None:
+            return None
+        name, values = self.published
+        return intrinsics.Intrinsics(dict(values), f"the {name} camera, by the layout")
 
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""
@@ -137,7 +161,25 @@ class ImageFolder(ABC):
             )
         self.timed = per_second is not None
         rate = per_second or FRAME_RATE
+        self._pairing, self.image_counts = _counted("equal numbers", colors, depths), (len(colors), len(depths))
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
+
+    def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart.
+
+        Raises:
+            DatasetError: No colour image is so near a depth image.
+        """
+        pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
+        if not pairs:
+            raise DatasetError(
+                f"{self.path}: no colour image lies within 20 ms of a depth image; the colour images cover "
+                f"{colors[0].timestamp:.3f} to {colors[-1].timestamp:.3f} s and the depth images "
+                f"{depths[0].timestamp:.3f} to {depths[-1].timestamp:.3f} s"
+            )
+        how = "nearest in time, at most 20 ms apart"
+        self._pairing, self.image_counts = _counted(how, colors, depths), (len(colors), len(depths))
+        return [(colors[i], depths[j]) for i, j in pairs]
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         """Depth image (H, W) in metres."""
@@ -148,13 +190,17 @@ class ImageFolder(ABC):
         return images.read_color(path)
 
     def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
-        """The given intrinsics of the depth camera, with the colour camera that the recording gives, if any."""
-        given = intrinsics.given(camera, self.depth_scale)
+        """The given intrinsics; with the colour camera of the recording where colour has another size than depth."""
+        given = intrinsics.given(camera)
         try:
             own = self._find_intrinsics()
         except DatasetError:  # the recording does not give them, which is why the user does
             return given
-        return intrinsics.Intrinsics(given.values, given.source, own.color, own.T_depth_color)
+        shape = own.color and self._read_depth(self._pairs[0][1].path, 1.0).shape
+        if not own.color or (own.color["height"], own.color["width"]) == shape:
+            return given
+        source = f"{given.source}; colour: {own.source}"
+        return intrinsics.Intrinsics(given.values, source, own.color, own.T_depth_color)
 
     def _read(self, index: int, depth_scale: float) -> Frame:
         color_file, depth_file = self._pairs[index]
@@ -186,14 +232,18 @@ class ImageFolder(ABC):
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
-                frame = self._read(int(index), known.depth_scale)
+                frame = self._read(int(index), known.values.get("depth_scale", self.depth_scale))
             except FrameError as error:
                 problem = problem or str(error)
                 continue
             if frame.depth.any():
-                return known.camera(frame.depth.shape[1], frame.depth.shape[0])
+                return known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
             problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"
         raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+
+def _counted(how: str, colors: Sized, depths: Sized) -> str:
+    return f"{len(colors)} colour and {len(depths)} depth images, {how}"
 
 
 def size(image: NDArray) -> str:

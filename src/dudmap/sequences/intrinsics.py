@@ -2,7 +2,7 @@
 
 import math
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -31,7 +31,7 @@ class Intrinsics:
     """Intrinsics before the image size is known.
 
     Attributes:
-        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present.
+        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present, the others where they are known.
         source: Origin of the numbers, for error messages.
         color: Numbers by key of the camera of the colour images, empty if it is the same.
         T_depth_color: (4, 4) points of the colour camera to the depth camera.
@@ -41,11 +41,6 @@ class Intrinsics:
     source: str
     color: dict[str, float] = field(default_factory=dict)
     T_depth_color: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
-
-    @property
-    def depth_scale(self) -> float:
-        """Depth units per metre."""
-        return self.values.get("depth_scale", DEPTH_SCALE)
 
     def calibration(self) -> Calibration | None:
         """Calibration of the colour camera; None if it is the same as the depth camera.
@@ -57,8 +52,12 @@ class Intrinsics:
             return None
         return Calibration(_camera(self.color, 1000.0), se3.inverse(self.T_depth_color))
 
-    def camera(self, width: int, height: int) -> Camera:
+    def camera(self, width: int, height: int, depth_scale: float = DEPTH_SCALE) -> Camera:
         """Camera for images of the given size.
+
+        Args:
+            width, height: Size of the depth images.
+            depth_scale: Units per metre where they are not known.
 
         Raises:
             DatasetError: The intrinsics belong to another image size, or are invalid.
@@ -69,7 +68,7 @@ class Intrinsics:
                 f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's are "
                 f"{width}x{height}; give the right intrinsics with --camera fx,fy,cx,cy,w,h,depth_scale"
             )
-        return _camera(self.values | {"width": width, "height": height}, self.depth_scale)
+        return _camera(self.values | {"width": width, "height": height}, self.values.get("depth_scale", depth_scale))
 
 
 def _camera(values: dict[str, float], depth_scale: float) -> Camera:
@@ -99,56 +98,16 @@ KNOWN = (
 """Pattern of the folder name, name and published intrinsics of the data sets."""
 
 
-def of_folder(path: Path) -> Intrinsics:
-    """Intrinsics of a recording: its ``intrinsics.txt``, else those of the data set that the folder name matches.
-
-    Raises:
-        DatasetError: There is neither, or the file cannot be parsed.
-    """
-    file = path / "intrinsics.txt"
-    if file.is_file():
-        return from_file(file)
+def by_name(path: Path) -> Intrinsics | None:
+    """Published intrinsics of the data set that the folder name of a recording in TUM layout matches."""
     for pattern, name, values in KNOWN:
         if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
-            return Intrinsics(values, f"the {name} camera")
-    raise DatasetError(
-        f"the camera of {path} is not known: there is no intrinsics.txt and the folder is not named like a TUM or "
-        "Bonn recording; give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
-    )
+            return Intrinsics(values, f"the {name} camera, by the folder's name")
+    return None
 
 
-def own(path: Path, depth_scale: float) -> Intrinsics | None:
-    """Intrinsics of a folder's intrinsics.txt, None if there is no such file.
-
-    Args:
-        path: The folder.
-        depth_scale: Depth units per metre where the file gives none.
-
-    Raises:
-        DatasetError: The file cannot be parsed.
-    """
-    file = path / "intrinsics.txt"
-    if not file.is_file():
-        return None
-    found = from_file(file)
-    return replace(found, values={"depth_scale": depth_scale} | found.values)
-
-
-def own_or(path: Path, values: dict[str, float], source: str) -> Intrinsics:
-    """Intrinsics of a folder's intrinsics.txt, else the published ones of its data set.
-
-    Raises:
-        DatasetError: The file cannot be parsed.
-    """
-    return own(path, values["depth_scale"]) or Intrinsics(dict(values), source)
-
-
-def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
+def given(camera: Camera | str) -> Intrinsics:
     """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
-
-    Args:
-        camera: Camera or text.
-        depth_scale: Depth units per metre where the text gives none.
 
     Raises:
         DatasetError: The text does not hold 4, 6 or 7 numbers.
@@ -161,7 +120,7 @@ def given(camera: Camera | str, depth_scale: float = DEPTH_SCALE) -> Intrinsics:
         numbers = []
     if len(numbers) not in (4, 6, 7) or not all(map(math.isfinite, numbers)):
         raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
-    return Intrinsics({"depth_scale": depth_scale} | _by_key(*numbers), f"the camera {camera!r}")
+    return Intrinsics(_by_key(*numbers), f"--camera {camera}")
 
 
 def from_camera(camera: Camera) -> Intrinsics:
@@ -171,7 +130,7 @@ def from_camera(camera: Camera) -> Intrinsics:
 
 
 def from_file(path: Path) -> Intrinsics:
-    """Parse a text file: ``key value`` lines, a 3x3 matrix, or one line ``fx fy cx cy [w h [depth_scale]]``.
+    """Parse a text file: ``key value`` lines, a matrix of 9 or 16 numbers, or ``fx fy cx cy [w h [depth_scale]]``.
 
     Raises:
         DatasetError: The file has none of these forms, or a key is unknown or missing.
@@ -180,19 +139,40 @@ def from_file(path: Path) -> Intrinsics:
         lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
-    rows = [row for line in lines if (row := re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split())]
+    split = (re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split() for line in lines)
+    numbered = [(number, row) for number, row in enumerate(split, start=1) if row]
+    rows = [row for _, row in numbered]
     if rows and not _is_number(rows[0][0]):
         return _keyed(path, rows)
-    if rows and all(_is_number(field) for row in rows for field in row):
-        table = [[float(field) for field in row] for row in rows]
-        if [len(row) for row in table] == [3, 3, 3] and table[2] == [0, 0, 1]:
-            return Intrinsics(_by_key(table[0][0], table[1][1], table[0][2], table[1][2]), str(path))
-        if len(table) == 1 and len(table[0]) in (4, 6, 7):
-            return Intrinsics(_by_key(*table[0]), str(path))
+    if any(not _is_number(field) for row in rows for field in row):
+        raise DatasetError(
+            f"cannot understand {path}; expected lines such as 'fx 517.3' with fx, fy, cx, cy, width, height and "
+            "depth_scale, or a 3x3 matrix, or one line 'fx fy cx cy'"
+        )
+    numbers = np.array([float(field) for row in rows for field in row])
+    if numbers.size in (4, 6, 7, 9, 16):
+        return from_matrix(numbers, path)
+    line, row = next(((line, row) for line, row in numbered if len(row) != 3), (len(lines), rows[-1] if rows else []))
     raise DatasetError(
-        f"cannot understand {path}; expected lines such as 'fx 517.3' with fx, fy, cx, cy, width, height and "
-        "depth_scale, or a 3x3 matrix, or one line 'fx fy cx cy'"
+        f"{path}, line {line}: {len(row)} numbers, of {numbers.size} in the file; expected the 9 of a 3x3 matrix K"
     )
+
+
+def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
+    """Intrinsics of the numbers of a file: a 3x3 or 4x4 matrix row by row, or ``fx fy cx cy [w h [depth_scale]]``.
+
+    Raises:
+        DatasetError: They are of another count, or no intrinsic matrix.
+    """
+    source = str(path)
+    if numbers.size in (4, 6, 7):
+        return Intrinsics(_by_key(*numbers.tolist()), source)
+    if numbers.size not in (9, 16):
+        raise DatasetError(f"{path} holds {numbers.size} numbers; expected the 9 of a 3x3 matrix K, row by row")
+    K = numbers.reshape(math.isqrt(numbers.size), -1)
+    if np.any(K[[1, 2, 2], [0, 0, 1]]) or K[2, 2] != 1:
+        raise DatasetError(f"{path} holds {K[:3, :3].tolist()}; expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+    return Intrinsics(_by_key(*(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))), source)
 
 
 def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:

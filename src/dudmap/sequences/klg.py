@@ -56,13 +56,14 @@ class KlgRecording:
                 "fx,fy,cx,cy[,w,h[,depth_scale]], "
                 "for the Xtion of ElasticFusion's own recordings --camera 528,528,320,240"
             )
-        known = intrinsics.given(camera, DEPTH_SCALE)
+        known = intrinsics.given(camera)
         self._entries = _read_index(self.path)
         times = 1e-6 * np.array([entry.time for entry in self._entries], dtype=np.float64)
         self._order = np.unique(times, return_index=True)[1]
         self.timestamps: NDArray[np.float64] = times[self._order]
-        self.intrinsics_source = known.source
-        self.camera = known.camera(*self._size(known))
+        unit = known.source if "depth_scale" in known.values else "the format"
+        self.sources = {"intrinsics": known.source, "depth unit": unit, "times": "the file"}
+        self.camera = known.camera(*self._size(known), DEPTH_SCALE)
 
     @staticmethod
     def recognises(path: Path) -> bool:

@@ -25,15 +25,27 @@ def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:
-    """Matrices (N, 4, 4) of a text file with 16 numbers each, row by row; line breaks do not matter.
+    """Matrices (N, 4, 4) of a text file with 16 numbers a pose, row by row, or 12 a line, without the last row 0 0 0 1.
 
     Raises:
-        DatasetError: The file cannot be read or the count of numbers is not a multiple of 16.
+        DatasetError: The file cannot be read, or a line has another count of numbers than 4, 12 or 16.
     """
     numbers = _numbers(path)
-    if numbers.size == 0 or numbers.size % 16:
-        raise DatasetError(f"{path} holds {numbers.size} numbers; expected 16 for every pose, row by row")
-    return numbers.reshape(-1, 4, 4)
+    counts = [(n, len(line.replace(",", " ").split())) for n, line in enumerate(read_text(path).splitlines(), start=1)]
+    counts = [(line, count) for line, count in counts if count]
+    usual = counts[0][1] if counts and counts[0][1] in (4, 12, 16) else 16
+    wrong = next(((line, count) for line, count in counts if count != usual), None)
+    if wrong is not None or not counts or (usual == 4 and len(counts) % 4):
+        line, count = wrong or (counts[-1] if counts else (1, 0))
+        raise DatasetError(
+            f"{path}, line {line}: {count} numbers; expected the 16 of a 4x4 matrix for every pose, in one line or "
+            "four, or 12 in one line"
+        )
+    if usual != 12:
+        return numbers.reshape(-1, 4, 4)
+    poses = np.tile(np.eye(4), (len(counts), 1, 1))
+    poses[:, :3] = numbers.reshape(-1, 3, 4)
+    return poses
 
 
 def read_log(path: Path) -> dict[int, NDArray[np.float64]]:

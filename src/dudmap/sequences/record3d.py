@@ -58,7 +58,8 @@ class Record3DRecording:
         color, size, times = self._metadata()
         self.timestamps = times
         known = intrinsics.given(camera) if camera else None
-        self.intrinsics_source = known.source if known else "the metadata of the file"
+        source = "the metadata of the file"
+        self.sources = {"intrinsics": known.source if known else source, "depth unit": "the format", "times": source}
         self.camera = known.camera(*size) if known else color.resized(*size)
         calibration = Calibration(color)
         self.calibration = None if calibration.is_registered(self.camera) else calibration

@@ -5,12 +5,14 @@ from pathlib import Path
 
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences import camera_json, intrinsics
+from dudmap.sequences import intrinsics
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_log, rigid_trajectory
 
 CAMERA = {"fx": 525.0, "fy": 525.0, "cx": 319.5, "cy": 239.5, "width": 640, "height": 480, "depth_scale": 1000.0}
-"""PrimeSense default, the camera of the Redwood data sets and of Open3D where none is given."""
+"""PrimeSense default, the camera of the Redwood data sets."""
+NAMES = r"redwood|/(burghers|cactusgarden|copyroom|lounge|readingroom|stonewall|totempole)(_png)?$"
+"""Path of a recording of these data sets; object scans are known by the names of their files."""
 COLORS = ("color", "rgb", "image", "image_2d")
 """Names of the colour folder that Open3D's reconstruction system takes."""
 OBJECT_SCAN = r"\d{7}-\d{12}\.(?:jpe?g|png)"
@@ -21,7 +23,8 @@ class RedwoodSequence(ImageFolder):
     """Folder with ``color`` (or rgb, image) and ``depth`` (mm) and a ``*.log`` in it or beside it, or an object scan.
 
     A ``.log`` holds camera-to-world matrices by frame number, counted from the first image; ``scene/trajectory.log`` is
-    Open3D's own estimate and no truth. Intrinsics come from a JSON file of Open3D in the folder.
+    Open3D's own estimate and no truth. Intrinsics come from a JSON file of Open3D in the folder; of these data sets
+    they are known.
     """
 
     format = "Redwood or Open3D"
@@ -48,11 +51,10 @@ class RedwoodSequence(ImageFolder):
         stamps = [timed[int(depth.path.stem[:7])] for _, depth in pairs]
         return [(TimedFile(t, c.path), TimedFile(t, d.path)) for t, (c, d) in zip(stamps, pairs, strict=True)]
 
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        files = sorted(file for file in self.path.glob("*.json") if re.search("camera|intrinsic", file.name))
-        if files:
-            return camera_json.load(files, self.depth_scale)
-        return intrinsics.own_or(self.path, CAMERA, "the PrimeSense default of Redwood and Open3D")
+    def _published(self) -> intrinsics.Intrinsics | None:
+        if self.timed or re.search(NAMES, self.path.resolve().as_posix(), flags=re.IGNORECASE):
+            return intrinsics.Intrinsics(dict(CAMERA), "the PrimeSense camera of the Redwood data sets, by name")
+        return None
 
     def _find_ground_truth(self) -> Trajectory | None:
         logs = _logs(self.path)

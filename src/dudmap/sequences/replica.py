@@ -4,7 +4,6 @@ from pathlib import Path
 
 from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences import camera_json, intrinsics
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
 from dudmap.sequences.poses import read_matrices, rigid_trajectory
 
@@ -20,6 +19,7 @@ class ReplicaSequence(ImageFolder):
 
     format = "Replica (NICE-SLAM)"
     depth_scale = CAMERA["depth_scale"]
+    published = "NICE-SLAM's Replica", CAMERA
 
     @staticmethod
     def recognises(path: Path) -> bool:
@@ -30,12 +30,6 @@ class ReplicaSequence(ImageFolder):
         files = list((self.path / "results").iterdir())
         colors = numbered_files(files, r"frame(\d+)\.(?:jpe?g|png)")
         return self._pair_numbered(colors, numbered_files(files, r"depth(\d+)\.png"))
-
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        for place in (self.path, self.path.resolve().parent):
-            if (place / "cam_params.json").is_file():
-                return camera_json.load([place / "cam_params.json"], self.depth_scale)
-        return intrinsics.own_or(self.path, CAMERA, "the Replica camera of NICE-SLAM")
 
     def _find_ground_truth(self) -> Trajectory | None:
         file = self.path / "traj.txt"

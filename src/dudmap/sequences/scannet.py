@@ -35,7 +35,7 @@ class ScanNetSequence(ImageFolder):
         return self._pair_numbered(colors, numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        depth = self._values("depth") | {"depth_scale": self.depth_scale}
+        depth = self._values("depth")
         color = self._values("color")
         height, width = images.read_color(self._pairs[0][0].path).shape[:2]
         return intrinsics.Intrinsics(

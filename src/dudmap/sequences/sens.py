@@ -63,15 +63,20 @@ class SensRecording:
             except struct.error:
                 raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
         self._deflated = header.depth_codec == 1
-        known = intrinsics.given(camera, header.depth_scale) if camera else None
-        self.intrinsics_source = known.source if known else "the header of the file"
+        known = intrinsics.given(camera) if camera else None
         own = header.camera(header.depth_intrinsic, header.depth_size)
-        self.camera = known.camera(*header.depth_size) if known else own
+        self.camera = known.camera(*header.depth_size, header.depth_scale) if known else own
         T_color_depth = se3.inverse(header.color_extrinsic) @ header.depth_extrinsic
         calibration = Calibration(header.camera(header.color_intrinsic, header.color_size), T_color_depth)
-        self.calibration = None if calibration.is_registered(self.camera) else calibration
+        one = calibration.is_registered(self.camera) or (known and header.color_size == header.depth_size)
+        self.calibration = None if one else calibration
         self.timestamps = _times([entry.depth_time for entry in self._entries])
         self.timed = self.timestamps[-1] == 1e-6 * self._entries[-1].depth_time
+        self.sources = {
+            "intrinsics": known.source if known else "the header of the file",
+            "depth unit": known.source if known and "depth_scale" in known.values else "the header of the file",
+            "times": "the file" if self.timed else "assumed, 30 frames a second",
+        }
         self._color_times = [1e-6 * entry.color_time if self.timed else None for entry in self._entries]
         valid = np.isfinite(poses).all(axis=(1, 2))
         truth = Trajectory(self.timestamps[valid], poses[valid] @ header.depth_extrinsic)

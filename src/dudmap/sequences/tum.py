@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.errors import DatasetError, FrameError
+from dudmap.errors import FrameError
 from dudmap.geometry.association import TimedFile, associate, read_list, read_pairs
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
@@ -19,7 +19,7 @@ class TumSequence(ImageFolder):
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
-    Intrinsics come from ``camera``, else from intrinsics.txt, else from the folder name (TUM freiburg1-3, Bonn).
+    Intrinsics come from ``camera``, else from a file, else from the folder's name (TUM freiburg1-3, Bonn).
     The published distortion of TUM freiburg1 and 2 is deliberately left out: it describes the colour lens,
     but the driver reprojected the depth as if that lens had no distortion, and undistorting both images would distort
     correct depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
@@ -71,18 +71,10 @@ class TumSequence(ImageFolder):
         associations = self.path / "associations.txt"
         if associations.is_file():
             return read_pairs(associations)
-        colors, depths = read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt")
-        pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
-        if not pairs:
-            raise DatasetError(
-                f"{self.path}: no colour image lies within 20 ms of a depth image; rgb.txt covers "
-                f"{colors[0].timestamp:.3f} to {colors[-1].timestamp:.3f} s and depth.txt "
-                f"{depths[0].timestamp:.3f} to {depths[-1].timestamp:.3f} s"
-            )
-        return [(colors[i], depths[j]) for i, j in pairs]
+        return self._pair_timed(read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt"))
 
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        return intrinsics.of_folder(self.path)
+    def _published(self) -> intrinsics.Intrinsics | None:
+        return super()._published() or intrinsics.by_name(self.path)
 
     def _find_ground_truth(self) -> Trajectory | None:
         path = self.path / "groundtruth.txt"

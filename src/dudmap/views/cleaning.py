@@ -218,7 +218,11 @@ def unlike(
 
 
 def clean_recording(
-    run: RunContent, sequence: "Sequence", out: Path, progress: "Callable[[int, int], None] | None" = None
+    run: RunContent,
+    sequence: "Sequence",
+    out: Path,
+    progress: "Callable[[int, int], None] | None" = None,
+    max_frames: int | None = None,
 ) -> CleanReport:
     """Write the recording without what moves, in TUM layout.
 
@@ -233,6 +237,7 @@ def clean_recording(
         sequence: The recording.
         out: New or empty folder.
         progress: Called with the number of finished frames and of all.
+        max_frames: Only so many frames from the start; None for all.
 
     Raises:
         DatasetError: The folder is not empty, or run and recording do not fit together.
@@ -246,8 +251,10 @@ def clean_recording(
     for name in ("rgb", "depth", *masks):
         (out / name).mkdir(parents=True, exist_ok=True)
     lines: list[tuple[str, str]] = []
-    shares, left_out = [], sorted(set(range(len(sequence))) - set(cleaner.indices))
-    for done, index in enumerate(cleaner.indices, start=1):
+    wanted = range(len(sequence))[:max_frames]
+    indices = [index for index in cleaner.indices if index in wanted]
+    shares, left_out = [], sorted(set(wanted) - set(indices))
+    for done, index in enumerate(indices, start=1):
         try:
             cleaned = cleaner.clean(index)
         except FrameError:
@@ -256,9 +263,9 @@ def clean_recording(
         lines.append(_write_frame(out, cleaned, sequence.camera.depth_scale))
         shares.append((float(cleaned.moving.mean()), float(_unknown_color(cleaned).mean())))
         if progress is not None:
-            progress(done, len(cleaner.indices))
+            progress(done, len(indices))
     _write_lists(out, run, sequence, lines, masks)
-    replaced, unknown = np.mean(shares, axis=0)
+    replaced, unknown = np.mean(shares, axis=0) if shares else (0.0, 0.0)
     return CleanReport(len(lines), tuple(sorted(left_out)), float(replaced), float(unknown))
 
 
