@@ -118,6 +118,7 @@ READERS = (
     "sens:SensRecording",
     "klg:KlgRecording",
     "record3d:Record3DRecording",
+    "azure_kinect:AzureKinectRecording",
     "realsense:RealSenseRecording",
     "bag:RosBag",
 )
@@ -225,11 +226,6 @@ def _unknown(path: Path) -> str:
     if listed:
         other = "depth.txt" if listed == ["rgb.txt"] else "rgb.txt"
         return f"{path} is not a recording in TUM layout: {other} not found (an associations.txt would do instead)"
-    if path.suffix.lower() == ".mkv":
-        return (
-            f"{path} is a video; recordings of an Azure Kinect are not read, since its library pyk4a has no wheel for "
-            "Python 3.13: export images and intrinsics with Open3D's azure_kinect_mkv_reader and read that folder"
-        )
     kind = "folder" if path.is_dir() else "file"
     formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
     return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"
