@@ -1,6 +1,7 @@
 """Recordings of Azure Kinect and Femto cameras: Matroska videos of the programs ``k4arecorder`` and ``k4aviewer``."""
 
 from collections.abc import Generator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,7 +16,8 @@ from dudmap.geometry.association import associate
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.input_files import LARGEST_FILE, foreign, open_plain, parse_json
-from dudmap.sequences import images, intrinsics
+from dudmap.sequences import images
+from dudmap.sequences.file_recording import FileRecording
 from dudmap.sequences.lens import RATIONAL, Lens
 from dudmap.sequences.message_stream import MessageStream
 
@@ -38,7 +40,7 @@ class _Track(NamedTuple):
     times: NDArray[np.int64]
 
 
-class AzureKinectRecording:
+class AzureKinectRecording(FileRecording):
     """Recording in a ``.mkv`` file with the tracks COLOR and DEPTH and the attachment calibration.json.
 
     Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
@@ -47,7 +49,7 @@ class AzureKinectRecording:
 
     Args:
         path: The file.
-        camera: Intrinsics of the depth images without distortion, instead of those of the file.
+        camera: Intrinsics of the depth images that replace those of the file; its lens stays.
 
     Raises:
         MissingExtraError: The package av is missing.
@@ -55,12 +57,10 @@ class AzureKinectRecording:
     """
 
     format = "Azure Kinect .mkv"
-    options: tuple[str, ...] = ()
+    suffix = ".mkv"
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
-        self.path = Path(path)
-        self.name = self.path.stem
-        self.ground_truth = None
+        super().__init__(path)
         open_plain(self.path).close()
         with extra("azure-kinect", f"the recording {path}"):
             import av  # pyright: ignore[reportMissingImports]
@@ -73,37 +73,20 @@ class AzureKinectRecording:
                 raise DatasetError(
                     f"{path} has {len(color.times)} colour and {len(depth.times)} depth images in no pair"
                 )
-            self.timestamps: NDArray[np.float64] = np.array([time for _, time in self._times]) / 1e9
+            self.timestamps = np.array([time for _, time in self._times]) / 1e9
             self._color, self._depth = color, depth
             self._find_cameras(camera)
         self._stream = MessageStream(self._passing)
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a file is named ``*.mkv``."""
-        return path.suffix.lower() == ".mkv" and path.is_file()
-
-    def __len__(self) -> int:
-        return len(self._times)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: An image is damaged or has another size than its track.
-        """
-        index = range(len(self))[index]
-        name, times = f"frame {index} of {self.path}", self._times[index]
+    def _frame(self, index: int, name: str) -> Frame:
+        times = self._times[index]
         with foreign(FrameError, name):
             color_data, depth_data = self._stream.read([("COLOR", times[0]), ("DEPTH", times[1])])
-            values = np.frombuffer(depth_data, ">u2").reshape(self.camera.shape).astype(np.uint16)
-            depth = images.metres(values, self.camera.depth_scale, name)
-            color = self._color_image(color_data, name)
-            depth, color = self._depth_lens.rectify(depth, depth=True), self._color_lens.rectify(color, depth=False)
+        values = np.frombuffer(depth_data, ">u2").reshape(self.camera.shape).astype(np.uint16)
+        depth = images.metres(values, self.camera.depth_scale, name)
+        color = self._color_image(color_data, name)
+        depth, color = self._depth_lens.rectify(depth, depth=True), self._color_lens.rectify(color, depth=False)
         return Frame(1e-9 * times[1], depth, color, 1e-9 * times[0])
-
-    def mask(self, index: int) -> None:
-        """No true masks are known."""
 
     def _color_image(self, data: bytes, name: str) -> NDArray[np.uint8]:
         import cv2
@@ -164,15 +147,12 @@ class AzureKinectRecording:
         other, (width, height) = tree["CALIBRATION_CameraLocationPV0"], self._color.size
         whole = width * other["SensorHeight"] / other["SensorWidth"]  # rows of an image of the whole sensor
         self._color_lens = _lens(other, self._color.size, (width, whole), (0, (whole - height) / 2))
-        self.intrinsics_source = "calibration.json in the file"
-        if given is not None:
-            known = intrinsics.given(given, 1000.0)
-            self._depth_lens, self.intrinsics_source = Lens(known.camera(*self._depth.size)), known.source
         T_color_depth = np.eye(4)
         T_color_depth[:3, :3] = np.array(other["Rt"]["Rotation"], np.float64).reshape(3, 3)
         T_color_depth[:3, 3] = other["Rt"]["Translation"]
-        self.camera = self._depth_lens.camera
-        self.calibration = Calibration(self._color_lens.camera, T_color_depth)
+        calibration = Calibration(self._color_lens.camera, T_color_depth)
+        self._set_cameras(self._depth_lens.camera, calibration, "calibration.json in the file", given)
+        self._depth_lens = replace(self._depth_lens, camera=self.camera)
 
 
 def _nanoseconds(packet: Any) -> int:  # noqa: ANN401
