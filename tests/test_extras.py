@@ -38,6 +38,7 @@ def where(tmp_path_factory):
     with zipfile.ZipFile(folder / "scan.r3d", "w") as archive:
         archive.writestr("metadata", "{}")
         archive.writestr("rgbd/0.depth", "")
+    (folder / "walk.mkv").write_bytes(b"\x1aE\xdf\xa3")
     (folder / "design.toml").write_text("")
     return folder
 
@@ -51,6 +52,7 @@ CASES = [
     ("ros-bags", "rosbags.rosbag2", ["export", "run", "--to", "a.mcap"]),
     ("ros-bags", "rosbags.rosbag2", ["live", "--camera", "replay:desk", "--record", "a.mcap"]),
     ("record3d", "lzfse", ["info", "scan.r3d"]),
+    ("azure-kinect", "av", ["info", "walk.mkv"]),
     ("realsense", "pyrealsense2", ["live", "--camera", "realsense"]),
     ("oak", "depthai", ["live", "--camera", "oak"]),
     ("orbbec", "pyorbbecsdk", ["live", "--camera", "orbbec"]),

@@ -18,6 +18,7 @@ LOADERS = {
     "klg": Loader(recordings.klg, partial(recordings.read_recording, camera=recordings.CAMERA)),
     "sens": Loader(recordings.sens, recordings.read_recording),
     "record3d": Loader(recordings.r3d, recordings.read_recording),
+    "Azure Kinect": Loader(recordings.mkv, recordings.read_recording),
     "bag of ROS 1": Loader(partial(recordings.bag, "ros1", "a.bag"), recordings.read_recording),
     "bag in SQLite": Loader(partial(recordings.bag, "sqlite", "a"), recordings.read_recording),
     "bag in MCAP": Loader(partial(recordings.bag, "mcap", "a"), recordings.read_recording),

@@ -127,6 +127,12 @@ def r3d(folder):
     return write_r3d(folder / "a.r3d", 2)
 
 
+def mkv(folder):
+    from sequences.test_azure_kinect import write_mkv
+
+    return write_mkv(folder / "a.mkv", frames=2)
+
+
 def bag(kind, name, folder, **options):
     from bags import write_bag
 

@@ -138,7 +138,7 @@ def test_sequential_reading_is_one_pass(tmp_path, kind):
     sequence._bag._reader.messages = lambda *args, **kwargs: opened.append(kwargs) or messages(*args, **kwargs)
     for index in range(30):
         assert sequence[index].color[0, 0, 1] == index
-        assert len(sequence._bag._kept) <= 4, "only neighbours wait"
+        assert len(sequence._bag._stream._kept) <= 4, "only neighbours wait"
     assert len(opened) <= 1
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from bags import write_bag
-from dudmap.errors import DatasetError
 from dudmap.sequences import is_recording, open_sequence
 from recordings import HEIGHT, WIDTH
 from sequences.test_klg import NUMBERS, write_klg
@@ -54,9 +53,3 @@ def test_a_folder_with_one_file_is_that_recording(tmp_path):
     write_sens(tmp_path / "walk" / "a.sens")
     assert open_sequence(tmp_path / "walk").camera.shape == (HEIGHT, WIDTH)
     assert is_recording(tmp_path / "walk" / "a.sens")
-
-
-def test_videos_of_an_azure_kinect_are_not_read(tmp_path):
-    (tmp_path / "a.mkv").write_bytes(b"\x1a\x45\xdf\xa3")
-    with pytest.raises(DatasetError, match=r"Azure Kinect are not read, .* azure_kinect_mkv_reader"):
-        open_sequence(tmp_path / "a.mkv")

@@ -128,6 +128,7 @@ READERS = (
     "sens:SensRecording",
     "klg:KlgRecording",
     "record3d:Record3DRecording",
+    "azure_kinect:AzureKinectRecording",
     "realsense:RealSenseRecording",
     "bag:RosBag",
 )
@@ -268,11 +269,6 @@ def _unknown(path: Path) -> str:
     if listed:
         other = "depth.txt" if listed == ["rgb.txt"] else "rgb.txt"
         return f"{path} is not a recording in TUM layout: {other} not found (an associations.txt would do instead)"
-    if path.suffix.lower() == ".mkv":
-        return (
-            f"{path} is a video; recordings of an Azure Kinect are not read, since its library pyk4a has no wheel for "
-            "Python 3.13: export images and intrinsics with Open3D's azure_kinect_mkv_reader and read that folder"
-        )
     formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
     if path.is_dir() and (images := _images_in(path)):
         return images

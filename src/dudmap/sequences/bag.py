@@ -18,6 +18,7 @@ from dudmap.input_files import GIT_LFS, foreign, open_plain
 from dudmap.sequences import bag_images, bag_topics, intrinsics
 from dudmap.sequences.bag_file import BagFile, MessageTimes
 from dudmap.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
+from dudmap.sequences.file_recording import FileRecording
 from dudmap.sequences.image_folder import PROBES, size
 from dudmap.sequences.lens import Lens
 
@@ -32,7 +33,7 @@ FIRST_TRANSFORMS = 300
 """Number of first /tf messages that tell which frames there are: some seconds of a robot that publishes at 100 Hz."""
 
 
-class RosBag:
+class RosBag(FileRecording):
     """Recording in a ROS bag, opened through its index: neither images nor poses are read before they are asked for.
 
     The time of a frame is that in the header of its depth message; colour is associated one to one, nearest first, at
@@ -61,8 +62,7 @@ class RosBag:
     timed = True
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None, topics: str | None = None) -> None:
-        self.path = Path(path)
-        self.name = self.path.resolve().stem
+        super().__init__(path)
         chosen = bag_topics.parse(topics)
         self._bag = BagFile(self.path)
         weakref.finalize(self, self._bag.close)
@@ -80,30 +80,21 @@ class RosBag:
         self._recorded = [(int(color.recorded[i]), int(depth.recorded[j])) for i, j in self._pairs]
         self._find_cameras(camera)
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
         """Whether a file starts like a bag, or a folder holds the metadata.yaml of a ROS 2 bag."""
         if path.is_dir():
             return (path / "metadata.yaml").is_file()
         magic = MAGIC.get(path.suffix.lower())
         return magic is not None and starts_with(path, magic)
 
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: An image is damaged, of an unknown encoding, or of another size than its camera.
-        """
-        index = range(len(self))[index]
+    def _frame(self, index: int, name: str) -> Frame:
         depth, values, color, image = self._decoded(index, self.camera.depth_scale)
         expected = self.camera if self.calibration is None else self.calibration.camera
         for what, found, camera in (("colour", image, expected), ("depth", values, self.camera)):
             if found.shape[:2] != camera.shape:
                 raise FrameError(
-                    f"frame {index} of {self.path}: the {what} image is {size(found)} pixels, but its camera is "
+                    f"{name}: the {what} image is {size(found)} pixels, but its camera is "
                     f"{camera.width}x{camera.height}"
                 )
         values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
@@ -119,11 +110,8 @@ class RosBag:
             values = bag_images.depth_of(depth, depth_scale, f"the depth image of {name}")
             return depth, values, color, bag_images.color_of(color, f"the colour image of {name}")
 
-    def mask(self, index: int) -> None:
-        """No true masks are known."""
-
     @cached_property
-    def ground_truth(self) -> Trajectory | None:
+    def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
         """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
         with foreign(DatasetError, f"the poses in /tf of {self.path}"):
             return self._true_poses()

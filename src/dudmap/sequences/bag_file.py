@@ -13,7 +13,6 @@ from collections.abc import Callable, Generator, Iterable
 from contextlib import closing, contextmanager
 from itertools import islice
 from pathlib import Path
-from threading import Lock
 from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
 from urllib.parse import quote
 
@@ -23,6 +22,7 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_RATIO, RATIO_FREE_BYTES, open_plain, read_text
+from dudmap.sequences.message_stream import MessageStream
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -34,9 +34,6 @@ LARGEST_METADATA = 2**19
 """Largest metadata.yaml, bytes; one with 100 topics has 60 kB, and its parser takes 20 seconds for a megabyte."""
 SAMPLES = 30
 """Number of first messages from which the delay of recording is estimated where stamps cannot be read cheaply."""
-JUMP = 2_000_000_000
-"""A message that lies further ahead than this, nanoseconds, is searched for; a nearer one is waited for in the stream,
-which costs less than opening a new one."""
 CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
 """Encapsulation, seconds and nanoseconds at the start of a ROS 2 message with a header, by byte order."""
 ROS1_STAMP = struct.Struct("<4xII")
@@ -97,19 +94,16 @@ class BagFile:
         if self._ros1:
             tf = get_typestore(Stores.ROS2_HUMBLE).fielddefs[TF]
             self._types.register({TF: tf, OLD_TF: tf})
-        self._lock = Lock()  # messages may be read by a thread of its own
-        self._passing: Generator[tuple[Connection, int, bytes]] | None = None
-        self._kept: dict[tuple[str, int], bytes] = {}
-        self._position = -1
+        self._stream = MessageStream(self._passing)
 
     def close(self) -> None:
         """Close the file."""
-        self._end_pass()
+        self._stream.close()
         self._reader.close()
 
     def messages(self, connections: "list[Connection]", count: int | None = None) -> Generator[tuple[int, Any]]:
         """Times of recording and content of the first ``count`` messages of some topics, None for all."""
-        with self._lock, closing(self._reader.messages(connections)) as found:
+        with self._stream.lock, closing(self._reader.messages(connections)) as found:
             for connection, time, raw in islice(found, count):
                 yield time, self._decoded(raw, connection)
 
@@ -138,41 +132,17 @@ class BagFile:
     def read(self, wanted: "list[tuple[Connection, int]]") -> list[Any]:
         """Messages of these topics, which are the same in every call, at these times of recording.
 
-        Messages that are asked for in order are streamed through one pass over the bag, in which those of the other
-        topics that are not asked for yet are kept until they lie behind; a jump opens a new pass at the wanted time.
-
         Raises:
             KeyError: There is no such message.
         """
-        keys = [(connection.topic, time) for connection, time in wanted]
-        with self._lock:
-            missing = {key for key in keys if key not in self._kept}
-            first = min((time for _, time in missing), default=self._position)
-            if missing and (self._passing is None or not 0 <= first - self._position <= JUMP):
-                self._end_pass()
-                self._passing = self._reader.messages([connection for connection, _ in wanted], start=first)
-            while missing:
-                missing.discard(self._advance())
-            out = [self._decoded(self._kept[key], topic) for key, (topic, _) in zip(keys, wanted, strict=True)]
-            oldest = min(time for _, time in keys)
-            self._kept = {key: data for key, data in self._kept.items() if key[1] >= oldest}
-        return out
+        raw = self._stream.read([(connection.topic, time) for connection, time in wanted])
+        return [self._decoded(data, connection) for data, (connection, _) in zip(raw, wanted, strict=True)]
 
-    def _advance(self) -> tuple[str, int]:
-        """Keep the next message of the pass; returns its topic and time."""
-        connection, time, data = next(self._passing or iter(()), (None, 0, b""))
-        if connection is None:
-            self._passing = None
-            raise KeyError("there is no such message")
-        self._position = time
-        self._kept[connection.topic, time] = bytes(data)
-        return connection.topic, time
-
-    def _end_pass(self) -> None:
-        if self._passing is not None:
-            self._passing.close()
-        self._passing = None
-        self._kept.clear()
+    def _passing(self, topics: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
+        """All messages of some topics from a time of recording on."""
+        chosen = [connection for connection in self.connections if connection.topic in topics]
+        with closing(self._reader.messages(chosen, start=start)) as messages:
+            yield from ((connection.topic, time, bytes(data)) for connection, time, data in messages)
 
     def _decoded(self, raw: bytes, connection: "Connection") -> Any:  # noqa: ANN401
         decode = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr

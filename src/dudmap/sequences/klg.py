@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from dudmap.errors import DatasetError, FrameError
 from dudmap.frames.frame import Frame
 from dudmap.geometry.camera import Camera
-from dudmap.input_files import LARGEST_FILE, damaged, open_plain
+from dudmap.input_files import LARGEST_FILE, open_plain
 from dudmap.sequences import images, intrinsics
+from dudmap.sequences.file_recording import FileRecording
 from dudmap.sequences.sens import decode_values
 
 FRAME_HEADER = struct.Struct("<qii")
@@ -27,7 +28,7 @@ class _Entry(NamedTuple):
     color_bytes: int
 
 
-class KlgRecording:
+class KlgRecording(FileRecording):
     """Recording in a ``.klg`` file: depth in millimetres (raw or zlib) and colour (raw or JPEG), registered.
 
     The file gives neither the intrinsics nor the image size: the intrinsics must be given, and the size comes from
@@ -42,14 +43,11 @@ class KlgRecording:
     """
 
     format = "ElasticFusion .klg"
+    suffix = ".klg"
     options: tuple[str, ...] = ("depth_unit",)
-    timed = True
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
-        self.path = Path(path)
-        self.name = self.path.stem
-        self.calibration = None
-        self.ground_truth = None
+        super().__init__(path)
         if camera is None:
             raise DatasetError(
                 f"{self.path} is a .klg file, which holds no intrinsics; give --camera "
@@ -65,25 +63,6 @@ class KlgRecording:
         self.sources = {"intrinsics": known.source, "depth unit": unit, "times": "the file"}
         self.camera = known.camera(*self._size(known), DEPTH_SCALE)
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a file is named ``*.klg``."""
-        return path.suffix.lower() == ".klg" and path.is_file()
-
-    def __len__(self) -> int:
-        return len(self._order)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: An image is damaged or has another size than the camera.
-        """
-        index = range(len(self))[index]
-        name = f"frame {index} of {self.path}"
-        with damaged(FrameError, name):
-            return self._frame(index, name)
-
     def _frame(self, index: int, name: str) -> Frame:
         depth_data, color_data = self._read(index)
         raw = len(depth_data) == 2 * self.camera.width * self.camera.height
@@ -93,9 +72,6 @@ class KlgRecording:
             raise FrameError(f"{name}: the colour image is not {self.camera.width}x{self.camera.height} pixels")
         depth = images.metres(values, self.camera.depth_scale, name)
         return Frame(float(self.timestamps[index]), depth, color)
-
-    def mask(self, index: int) -> None:
-        """No true masks are known."""
 
     def _read(self, index: int) -> tuple[bytes, bytes]:
         entry = self._entries[self._order[index]]

@@ -42,8 +42,8 @@ class RealSenseRecording(RosBag):
 
     format = "RealSense recording"
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
         """Whether a .bag or .db3 file has the topics of librealsense."""
         if path.suffix.lower() not in (".bag", ".db3") or not path.is_file():
             return False

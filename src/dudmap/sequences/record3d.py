@@ -13,14 +13,15 @@ from dudmap.extras import extra
 from dudmap.frames.frame import Frame
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
-from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, damaged, open_plain, parse_json
-from dudmap.sequences import images, intrinsics
+from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, open_plain, parse_json
+from dudmap.sequences import images
+from dudmap.sequences.file_recording import FileRecording
 
 LARGEST_COMMAND = 315 + 2359
 """Bytes that one command of an LZFSE block can write."""
 
 
-class Record3DRecording:
+class Record3DRecording(FileRecording):
     """Recording in a ``.r3d`` file.
 
     The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same
@@ -36,13 +37,10 @@ class Record3DRecording:
     """
 
     format = "Record3D .r3d"
-    options: tuple[str, ...] = ()
-    timed = True
+    suffix = ".r3d"
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
-        self.path = Path(path)
-        self.name = self.path.stem
-        self.ground_truth = None
+        super().__init__(path)
         self._lzfse = _lzfse(self.path)
         try:
             open_plain(self.path).close()
@@ -57,38 +55,13 @@ class Record3DRecording:
             raise DatasetError(f"{self.path} holds no depth images rgbd/N.depth")
         color, size, times = self._metadata()
         self.timestamps = times
-        known = intrinsics.given(camera) if camera else None
-        source = "the metadata of the file"
-        self.sources = {"intrinsics": known.source if known else source, "depth unit": "the format", "times": source}
-        self.camera = known.camera(*size) if known else color.resized(*size)
-        calibration = Calibration(color)
-        self.calibration = None if calibration.is_registered(self.camera) else calibration
+        self._set_cameras(color.resized(*size), Calibration(color), "the metadata of the file", camera)
+        self.sources["depth unit"] = "the format"
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a file is named ``*.r3d``."""
-        return path.suffix.lower() == ".r3d" and path.is_file()
-
-    def __len__(self) -> int:
-        return len(self._numbers)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: An image is missing or damaged.
-        """
-        index = range(len(self))[index]
+    def _frame(self, index: int, name: str) -> Frame:
         number = self._numbers[index]
-        with damaged(FrameError, f"frame {index} of {self.path}"):
-            return self._frame(index, number)
-
-    def _frame(self, index: int, number: int) -> Frame:
         color = images.decode_color(self._member(f"rgbd/{number}.jpg"), f"rgbd/{number}.jpg of {self.path}")
         return Frame(float(self.timestamps[index]), self._depth(number), color)
-
-    def mask(self, index: int) -> None:
-        """No true masks are known."""
 
     def _depth(self, number: int) -> NDArray[np.float32]:
         values = self._unpacked(f"rgbd/{number}.depth", "<f4")

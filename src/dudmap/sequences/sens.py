@@ -14,8 +14,9 @@ from dudmap.geometry import se3
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.input_files import LARGEST_FILE, damaged, open_plain
-from dudmap.sequences import images, intrinsics
+from dudmap.input_files import LARGEST_FILE, open_plain
+from dudmap.sequences import images
+from dudmap.sequences.file_recording import FileRecording
 
 VERSION = 4
 """The version of the format that ScanNet publishes."""
@@ -35,7 +36,7 @@ class _Entry(NamedTuple):
     depth_time: int
 
 
-class SensRecording:
+class SensRecording(FileRecording):
     """Recording in a ``.sens`` file.
 
     Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
@@ -51,11 +52,11 @@ class SensRecording:
     """
 
     format = "ScanNet .sens"
+    suffix = ".sens"
     options: tuple[str, ...] = ("depth_unit",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
-        self.path = Path(path)
-        self.name = self.path.stem
+        super().__init__(path)
         with open_plain(self.path) as file:
             try:
                 header = _read_header(file, self.path)
@@ -63,45 +64,21 @@ class SensRecording:
             except struct.error:
                 raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
         self._deflated = header.depth_codec == 1
-        known = intrinsics.given(camera) if camera else None
-        own = header.camera(header.depth_intrinsic, header.depth_size)
-        self.camera = known.camera(*header.depth_size, header.depth_scale) if known else own
         T_color_depth = se3.inverse(header.color_extrinsic) @ header.depth_extrinsic
-        calibration = Calibration(header.camera(header.color_intrinsic, header.color_size), T_color_depth)
-        one = calibration.is_registered(self.camera) or (known and header.color_size == header.depth_size)
-        self.calibration = None if one else calibration
+        color = Calibration(header.camera(header.color_intrinsic, header.color_size), T_color_depth)
+        own = header.camera(header.depth_intrinsic, header.depth_size)
+        self._set_cameras(own, color, "the header of the file", camera)
         self.timestamps = _times([entry.depth_time for entry in self._entries])
         self.timed = self.timestamps[-1] == 1e-6 * self._entries[-1].depth_time
-        self.sources = {
-            "intrinsics": known.source if known else "the header of the file",
-            "depth unit": known.source if known and "depth_scale" in known.values else "the header of the file",
-            "times": "the file" if self.timed else "assumed, 30 frames a second",
-        }
+        if not self.timed:
+            self.sources["times"] = "assumed, 30 frames a second"
         self._color_times = [1e-6 * entry.color_time if self.timed else None for entry in self._entries]
         valid = np.isfinite(poses).all(axis=(1, 2))
         truth = Trajectory(self.timestamps[valid], poses[valid] @ header.depth_extrinsic)
         self.ground_truth = truth if valid.any() else None
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a file is named ``*.sens``."""
-        return path.suffix.lower() == ".sens" and path.is_file()
-
-    def __len__(self) -> int:
-        return len(self._entries)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: An image is damaged or has another size than the header says.
-        """
-        index = range(len(self))[index]
-        entry, name = self._entries[index], f"frame {index} of {self.path}"
-        with damaged(FrameError, name):
-            return self._frame(index, entry, name)
-
-    def _frame(self, index: int, entry: _Entry, name: str) -> Frame:
+    def _frame(self, index: int, name: str) -> Frame:
+        entry = self._entries[index]
         with open_plain(self.path) as file:
             file.seek(entry.offset)
             color = images.decode_color(file.read(entry.color_bytes), f"the colour image of {name}")
@@ -112,9 +89,6 @@ class SensRecording:
         depth = decode_values(data, self.camera.shape, compressed=self._deflated, name=name)
         depth = images.metres(depth, self.camera.depth_scale, name)
         return Frame(float(self.timestamps[index]), depth, color, self._color_times[index])
-
-    def mask(self, index: int) -> None:
-        """No true masks are known."""
 
 
 class _Header(NamedTuple):
