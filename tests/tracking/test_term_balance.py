@@ -5,12 +5,16 @@ from dudmap.config import Config
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.kernels.parameters import SensorNoise, TruncationBand
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.synthetic import sequence
 from dudmap.tracking import term_balance
 from dudmap.tracking.term_balance import Comparison, smooth_covariances, variance_components
 from dudmap.tracking.tracker import Tracker
 
+PARAMETERS = Tracker(Config().tracker, Config().sensor).parameters(
+    TruncationBand(0.04, 0.04, 3.0, 0.3, SensorNoise(Config().sensor.sigma_base, Config().sensor.sigma_scale))
+)
 CAMERA = Camera(131.0, 131.0, 79.5, 59.5, 160, 120)
 
 
@@ -66,7 +70,7 @@ def test_covariance_of_a_smooth_error_is_that_of_registrations_with_such_errors(
     _, frame = room
     rng = np.random.default_rng(4)
     weights = np.ones_like(frame.depth)
-    P_d, P_c = smooth_covariances(_level(frame), weights, np.zeros(6), 0.0)
+    P_d, P_c = smooth_covariances(_level(frame), weights, PARAMETERS, np.zeros(6), 0.0)
     errors = []
     level = _level(frame)
     at_truth = _registered(room, level, 0.0 if term == "depth" else 0.1)
@@ -117,12 +121,28 @@ def test_a_single_disagreement_hardly_moves_the_prior():
     assert 0.2 < s_d < 1
 
 
+def test_covariances_have_the_weights_of_the_registration(room):
+    """Distances weighted by the noise of the sensor: equally where it is the same at all depths."""
+    level, static = _level(room[1]), np.ones(CAMERA.shape, np.float32)
+
+    def covariance(noise, weighting):
+        parameters = PARAMETERS._replace(
+            band=PARAMETERS.band._replace(noise=noise), sigma_at_one_metre=sum(noise), noise_weighting=weighting
+        )
+        return smooth_covariances(level, static, parameters, np.zeros(6), 0.0)[0]
+
+    equal = covariance(SensorNoise(0.003, 0.0), 1.0)
+    np.testing.assert_allclose(covariance(SensorNoise(0.001, 0.002), 0.0), equal, rtol=1e-5)
+    falling = covariance(SensorNoise(0.0, 0.003), 1.0)
+    assert np.trace(np.abs(falling - equal)) > 0.1 * np.trace(equal)
+
+
 def test_covariances_scale_with_speed_only_in_the_colour(room):
     _, frame = room
     weights = np.ones_like(frame.depth)
-    still_d, still_c = smooth_covariances(_level(frame), weights, np.zeros(6), 0.01)
+    still_d, still_c = smooth_covariances(_level(frame), weights, PARAMETERS, np.zeros(6), 0.01)
     velocity = np.array([0.1, 0, -0.2, 0, 1.0, 0])
-    fast_d, fast_c = smooth_covariances(_level(frame), weights, velocity, 0.01)
+    fast_d, fast_c = smooth_covariances(_level(frame), weights, PARAMETERS, velocity, 0.01)
     assert np.array_equal(still_d, fast_d)
     # colours late by 10 ms are those of a camera 10 ms further on, which the pose follows; the rest is rolling shutter
     rest = fast_c - still_c - np.outer(velocity, velocity) * 0.01**2

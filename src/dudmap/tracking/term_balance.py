@@ -10,7 +10,8 @@ from dudmap.config import PreprocessConfig, SensorConfig
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid
-from dudmap.kernels.parameters import NormalEquations
+from dudmap.kernels.parameters import NormalEquations, RegistrationParameters
+from dudmap.kernels.residual import residual_weights
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.tracker import Tracker
@@ -141,7 +142,8 @@ class BalanceEstimator:
         inverse_d, inverse_c = _inverse(H_d), _inverse(H_c)
         noise_d, noise_c = self._noise(distances, both, weights[1], tracker, fine)
         noise_d, noise_c = noise_d * inverse_d, noise_c * inverse_c
-        P_d, P_c = smooth_covariances(coarse, weights[0], velocity, self.sensor.color_time_sigma)
+        parameters = tracker.parameters(volume.band)
+        P_d, P_c = smooth_covariances(coarse, weights[0], parameters, velocity, self.sensor.color_time_sigma)
         comparison = Comparison(inverse_d @ b_d - inverse_c @ b_c, P_d, P_c, noise_d + noise_c)
         self._comparisons.append(comparison)
         self._components = s_d, s_c = variance_components(list(self._comparisons), self._components)
@@ -179,13 +181,19 @@ class BalanceEstimator:
 
 
 def smooth_covariances(
-    level: Level, weights: NDArray[np.float32], velocity: NDArray[np.float64], time_sigma: float
+    level: Level,
+    weights: NDArray[np.float32],
+    parameters: RegistrationParameters,
+    velocity: NDArray[np.float64],
+    time_sigma: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Covariances (6, 6) of the distance pose and of the intensity pose, camera axes, by smooth errors of prior size.
 
     Args:
         level: The image.
         weights: (h, w) static weights in [0, 1].
+        parameters: Of the registration, whose weights apart from the robust ones, which depend on the residuals, are
+            taken.
         velocity: (6,) twist of the camera per second, camera axes.
         time_sigma: Standard deviation of the time between colour and depth of a pixel, seconds.
     """
@@ -193,10 +201,11 @@ def smooth_covariances(
     z, camera = points[:, 2], level.camera
     rays = points / z[:, None]
     v, u = np.nonzero(inside)
-    w = weights[inside].astype(np.float64)
-    # distances: residual n . p, weighted by 1 / z^4 as the registration does
+    shares = residual_weights(level.depth, np.zeros((2, *level.depth.shape), np.float32), weights, parameters)
+    of_distances, of_intensities = shares[:2, inside, None].astype(np.float64)
+    # distances: residual n . p
     J = np.hstack([normals, np.cross(points, normals)])
-    weighted = J * (w * np.minimum(1 / z**2, 1) ** 2)[:, None]
+    weighted = J * of_distances
     error = DEPTH_ERROR * z * np.einsum("ij,ij->i", normals, rays)
     across, down = np.pi * (u + 0.5) / camera.width, np.pi * (v + 0.5) / camera.height
     cosines = [_cosine(i, across) * _cosine(j, down) for i in range(COSINES[0]) for j in range(COSINES[1])]
@@ -212,7 +221,7 @@ def smooth_covariances(
     motion = -np.einsum("ij,ij->i", J, np.broadcast_to(velocity, J.shape)) * time_sigma
     one = np.ones(len(z))
     errors = [shift * g * field for field in (one, x, y) for g in (gx, gy)] + [motion, motion * y]
-    weighted = J * w[:, None]
+    weighted = J * of_intensities
     B = _inverse(weighted.T @ J) @ (weighted.T @ np.stack(errors, axis=1))
     return A @ A.T, B @ B.T
 
