@@ -122,7 +122,7 @@ def _weigh_image(depth, distances, differences, static, parameters, out):
 
 def residual_weights(
     depth: NDArray[np.float32], residuals: ImageStack, static: NDArray[np.float32], parameters: RegistrationParameters
-) -> ImageStack:
+) -> NDArray[np.float32]:
     """Weights of the residuals of an image in the registration.
 
     Args:
@@ -136,7 +136,7 @@ def residual_weights(
         off the map.
     """
     out = np.zeros((3, *depth.shape), np.float32)
-    images = (np.ascontiguousarray(image, np.float32) for image in (depth, *residuals, static))
+    images = (np.ascontiguousarray(image, np.float32) for image in (depth, residuals[0], residuals[1], static))
     _weigh_image(*images, single(parameters), out)
     return out
 

@@ -65,7 +65,7 @@ class GradientAgreement:
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._shade = spatial(level.intensity.astype(np.float64))
         on_surface = known & _complete(z > 0)[self._sampled] & (np.hypot(step[..., 0], step[..., 1]) < STEEPEST)
-        seen, static = residuals[:, *self._sampled], static[self._sampled]
+        seen, static = np.stack([residuals[n][self._sampled] for n in (0, 1)]), static[self._sampled]
         self._valid = on_surface & np.isfinite(seen[1]) & (static > 0)
         self._weights = residual_weights(level.depth[self._sampled], seen, static, parameters)
 
