@@ -26,6 +26,11 @@ class ConfigSection(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid", use_attribute_docstrings=True, allow_inf_nan=False)
 
 
+def reading_sigma(z: Any, base: Any, scale: Any) -> Any:  # noqa: ANN401 - numbers or arrays
+    """Standard deviation of a depth reading at depth ``z``, metres (thesis eq. 3.91); the kernels compile this text."""
+    return base + scale * (z * z)
+
+
 class SensorConfig(ConfigSection):
     """Noise model of the depth sensor: sigma(z) = sigma_base + sigma_scale z^2 (thesis eq. 3.91)."""
 
@@ -47,7 +52,7 @@ class SensorConfig(ConfigSection):
 
     def sigma(self, z: Any) -> Any:  # noqa: ANN401 - a number or an array
         """Standard deviation of a depth reading, metres, at depth ``z`` in metres (a number or an array)."""
-        return self.sigma_base + self.sigma_scale * z**2
+        return reading_sigma(z, self.sigma_base, self.sigma_scale)
 
 
 class PreprocessConfig(ConfigSection):

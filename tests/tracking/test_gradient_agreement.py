@@ -44,12 +44,12 @@ def test_the_sums_over_the_map_are_its_normal_equations():
     T, step, weights = np.eye(4), 1e-4, ones(level)
     weights[[0, -1]] = weights[:, [0, -1]] = 0
     system = tracker.linearize(volume, level, T, weights)
-    parameters = tracker._parameters(volume, None)
+    parameters = tracker.parameters(volume.band)
     for twist in np.random.default_rng(1).normal(size=(3, 6)):
         forth, back = (
             tracker.linearize(volume, level, se3.retract(T, way * twist), weights).residuals for way in (step, -step)
         )
-        agreement = GradientAgreement(level, system.residuals, weights, np.eye(3), parameters, SENSOR)
+        agreement = GradientAgreement(level, system.residuals, weights, np.eye(3), parameters)
         seen = (weights * agreement_mask(agreement, level)).astype(np.float32)
         H = tracker.linearize(volume, level, T, seen).H
         assert agreement.sums(twist, forth, back, step)[:, 0].sum() == pytest.approx(twist @ H @ twist, rel=0.02)
@@ -71,8 +71,8 @@ def test_the_gradients_of_an_image_are_those_of_its_scene():
     points = rays * depth[..., None]
     level = Level(camera, depth.astype(np.float32), (0.5 + points @ SHADE).astype(np.float32))
     R = se3.exp_rotation(np.array([0.2, -0.4, 0.3]))
-    parameters = Tracker(CONFIG.tracker, CONFIG.sensor)._parameters(corner_map(), None)
-    agreement = GradientAgreement(level, np.zeros((2, 60, 80)), ones(level), R, parameters, CONFIG.sensor)
+    parameters = Tracker(CONFIG.tracker, CONFIG.sensor).parameters(corner_map().band)
+    agreement = GradientAgreement(level, np.zeros((2, 60, 80)), ones(level), R, parameters)
     # the intensity of a point is that of the plane where its ray meets it
     along_ray = SHADE - TILTED * np.sum(rays * SHADE, axis=-1, keepdims=True) / (rays @ TILTED)[..., None]
     for twist in np.random.default_rng(2).normal(size=(3, 6)):

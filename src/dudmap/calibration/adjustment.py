@@ -12,6 +12,7 @@ from dudmap.config import SensorConfig
 from dudmap.geometry import se3
 from dudmap.geometry.calibration import NUM_PARAMETERS, Calibration
 from dudmap.kernels.color_pairs import SHARED, UNKNOWNS, linearize_pair
+from dudmap.kernels.parameters import SensorNoise, single
 
 PRIOR_SIGMA = np.array([0.03] * 3 + [np.radians(2)] * 3 + [0.05] + [0.005] * 2 + [0.1, 0.3] + [0.03, 0.03])
 """Standard deviations of a camera about which nothing is known but what is given, in the units of ``PARAMETERS``; that
@@ -206,7 +207,7 @@ class Adjustment:
         H, b = np.empty((len(pairs), UNKNOWNS, UNKNOWNS)), np.empty((len(pairs), UNKNOWNS))
         place, lens = calibration.T_color_depth[:3].astype(np.float32), calibration.lens.astype(np.float32)
         intrinsics, size = calibration.camera.scaled(level).intrinsics, self.levels.index(level)
-        noise, residuals = np.array([self.sensor.sigma_base, self.sensor.sigma_scale], np.float32), []
+        noise, residuals = single(SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale)), []
         for number, (pair, T, light) in enumerate(zip(pairs, Ts.astype(np.float32), state.light, strict=True)):
             first, second = pair.first, pair.second
             residuals.append(np.empty((2, len(first.points)), np.float32))

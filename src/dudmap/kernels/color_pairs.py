@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.kernels.pixel import elements, rotate, transform
+from dudmap.kernels.pixel import elements, rotate, sigma, transform
 from dudmap.kernels.threads import kernel, scalar
 
 f32 = np.float32
@@ -158,7 +158,7 @@ def linearize_pair(
         place, intrinsics, lens, scale, readout: As for ``_color``.
         gain, bias: The second intensity is gain times the first plus bias.
         step: Depth differences beyond this share of the depth are another surface.
-        noise: (2,) float32, standard deviation of a depth reading: noise[0] + noise[1] z^2.
+        noise: SensorNoise, of float32.
         by_color: Reciprocal standard deviation of the intensity difference.
         by_depth: Reciprocal standard deviation of the depth difference in units of ``noise``.
         huber: Constant of the robust weight, standard deviations.
@@ -191,12 +191,12 @@ def linearize_pair(
         difference = surface - z
         if abs(difference) > step * near:
             continue
-        sigma = noise[0] + noise[1] * z * z
-        residuals[1, n] = difference / sigma
+        deviation = sigma(z, noise)
+        residuals[1, n] = difference / deviation
         # the step along the ray is longer than the distance to a slanted surface
         sx, sy = du * fx / z, dv * fy / z
         sz = -(sx * x + sy * y) / z - f32(1)
-        scaled = by_depth / sigma / np.sqrt(sx * sx + sy * sy + sz * sz)
+        scaled = by_depth / deviation / np.sqrt(sx * sx + sy * sy + sz * sz)
         r = difference * scaled
         weight = huber / max(abs(r), huber)
         J[13], J[14], J[15] = sx, sy, sz

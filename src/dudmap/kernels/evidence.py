@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import reading_sigma
 from dudmap.kernels import labeling
 from dudmap.kernels.parameters import FREE, SURFACE, UNKNOWN, MapSample, single
 from dudmap.kernels.reprojection import ReprojectionTarget, reproject
@@ -99,7 +100,7 @@ class ReadingNoise(NamedTuple):
 
 def static_sigma(z: Any, base: Any, scale: Any, map_variance: Any) -> Any:
     """Standard deviation of the distance of a static point at depth z, metres: of the reading and of the map."""
-    sigma = base + scale * (z * z)
+    sigma = reading_sigma(z, base, scale)
     return np.sqrt(sigma * sigma + map_variance)
 
 

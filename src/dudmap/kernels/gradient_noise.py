@@ -4,7 +4,7 @@
 import numpy as np
 
 from dudmap.kernels.pixel import sigma
-from dudmap.kernels.residual import huber_weight, noise_scale, tukey_inlier
+from dudmap.kernels.residual import weigh
 from dudmap.kernels.threads import kernel
 
 NUM_MOMENTS = 10
@@ -38,20 +38,15 @@ def noise_sums(
     height, width = depth.shape
     distances, differences = residuals
     fx, fy, cx, cy = intrinsics[0], intrinsics[1], intrinsics[2], intrinsics[3]
-    p, one, tiny = parameters, np.float32(1), np.float32(1e-6)
+    p, tiny = parameters, np.float32(1e-6)
     for v in range(stride // 2, height, stride):
         for u in range(stride // 2, width, stride):
             static = weights[v, u]
-            difference = abs(differences[v, u])
-            if not (static > 0 and difference < np.inf):
+            if not (static > 0 and abs(differences[v, u]) < np.inf):
                 continue
             z = depth[v, u]
             pixel = z / fx
-            scale = noise_scale(z, p)
-            distance = abs(distances[v, u]) * scale
-            inlier = tukey_inlier(distance, one / p.tukey) if p.tukey > 0 else one
-            robust = inlier * inlier if p.tukey > 0 else huber_weight(distance, p.huber)
-            w = static * robust * scale * scale
+            _, _, _, _, _, w, of_color = weigh(distances[v, u], differences[v, u], z, static, True, p)
             across = depth[v, min(u + 1, width - 1)] - depth[v, max(u - 1, 0)]
             down = depth[min(v + 1, height - 1), u] - depth[max(v - 1, 0), u]
             step = min(np.sqrt(across * across + down * down) / 2, steepest * pixel) * scale_px
@@ -62,7 +57,6 @@ def noise_sums(
             sums[0] += 1
             sums[1] += z
             sums[2] += w
-            of_color = p.color_weight * static * huber_weight(difference, p.color_huber)
             for term in range(2):
                 share = w * variance if term == 0 else of_color
                 n = 3 + NUM_MOMENTS * term

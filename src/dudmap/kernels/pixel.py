@@ -6,11 +6,14 @@ A rigid motion (3, 4) is passed as its twelve elements, row by row (``elements``
 
 import numpy as np
 
+from dudmap.config import reading_sigma
 from dudmap.kernels.threads import scalar, written_out
 
 f32, sqrt = np.float32, np.sqrt
 UNKNOWN_COSINE = f32(0.3)
 """Cosine of the angle of incidence that is assumed at depth edges, where it is not known."""
+
+_sigma = scalar(reading_sigma)
 
 
 @scalar
@@ -53,8 +56,8 @@ def project(x, by_z, f, c):
 
 @scalar
 def sigma(z, noise):
-    """Standard deviation of a reading at depth ``z``, metres (thesis eq. 3.91)."""
-    return noise.base + noise.scale * z * z
+    """Standard deviation of a reading at depth ``z``, metres."""
+    return _sigma(z, noise.base, noise.scale)
 
 
 @scalar

@@ -1,9 +1,14 @@
-"""Scalar mathematics of a residual: trilinear interpolation, robust costs and weights, terms of normal equations."""
+"""Mathematics of a residual: trilinear interpolation, robust costs and weights, terms of normal equations.
+
+``weigh`` is the only text of the weight of a residual; who needs it for a whole image asks ``residual_weights``.
+"""
 
 import numpy as np
+from numpy.typing import NDArray
 
+from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 from dudmap.kernels.pixel import band_front, sigma
-from dudmap.kernels.threads import scalar, written_out
+from dudmap.kernels.threads import kernel, scalar, written_out
 
 f32 = np.float32
 GATE = f32(0.95)
@@ -101,6 +106,39 @@ def weigh(r, rc, z, static, known, p):
         used * robust * scale * scale,
         used * color_robust * p.color_weight,
     )
+
+
+@kernel
+def _weigh_image(depth, distances, differences, static, parameters, out):
+    height, width = depth.shape
+    for v in range(height):
+        for u in range(width):
+            r, rc = distances[v, u], differences[v, u]
+            known = abs(rc) < np.inf
+            _, _, _, _, square, of_distance, of_intensity = weigh(r, rc, depth[v, u], static[v, u], known, parameters)
+            if known:
+                out[0, v, u], out[1, v, u], out[2, v, u] = of_distance, of_intensity, square
+
+
+def residual_weights(
+    depth: NDArray[np.float32], residuals: ImageStack, static: NDArray[np.float32], parameters: RegistrationParameters
+) -> NDArray[np.float32]:
+    """Weights of the residuals of an image in the registration.
+
+    Args:
+        depth: (h, w) metres, 0 = none.
+        residuals: (2, h, w) of a linearisation, NaN off the map.
+        static: (h, w) static weights.
+        parameters: Those of the linearisation.
+
+    Returns:
+        (3, h, w) weights of the distances and of the intensities, and the weighted squared distances at one metre; 0
+        off the map.
+    """
+    out = np.zeros((3, *depth.shape), np.float32)
+    images = (np.ascontiguousarray(image, np.float32) for image in (depth, residuals[0], residuals[1], static))
+    _weigh_image(*images, single(parameters), out)
+    return out
 
 
 @written_out

@@ -11,9 +11,9 @@ that the tunnel seems to narrow, and to move with the camera.
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import SensorConfig
 from dudmap.frames.observation import Level
 from dudmap.kernels.parameters import ImageStack, RegistrationParameters
+from dudmap.kernels.residual import residual_weights
 from dudmap.tracking.observability import STEEPEST
 
 ACROSS = 80
@@ -33,7 +33,6 @@ class GradientAgreement:
         static: (h, w) static weights.
         R_world_camera: (3, 3).
         parameters: The weights of the residuals.
-        sensor: Noise of the depth readings.
     """
 
     def __init__(
@@ -43,7 +42,6 @@ class GradientAgreement:
         static: NDArray[np.float32],
         R_world_camera: NDArray[np.float64],
         parameters: RegistrationParameters,
-        sensor: SensorConfig,
     ) -> None:
         camera, stride = level.camera, max(1, level.camera.width // ACROSS)
         self._sampled = slice(1, -1, stride), slice(1, -1, stride)
@@ -67,9 +65,9 @@ class GradientAgreement:
         self._normal = normal / np.linalg.norm(normal, axis=-1, keepdims=True)
         self._shade = spatial(level.intensity.astype(np.float64))
         on_surface = known & _complete(z > 0)[self._sampled] & (np.hypot(step[..., 0], step[..., 1]) < STEEPEST)
-        distance, difference = (np.abs(residuals[n][self._sampled]) for n in (0, 1))
-        self._valid = on_surface & np.isfinite(difference) & (static[self._sampled] > 0)
-        self._weights = _weights(distance, difference, depth, parameters, sensor) * static[self._sampled]
+        seen, static = np.stack([residuals[n][self._sampled] for n in (0, 1)]), static[self._sampled]
+        self._valid = on_surface & np.isfinite(seen[1]) & (static > 0)
+        self._weights = residual_weights(level.depth[self._sampled], seen, static, parameters)
 
     def along(self, twist: NDArray[np.float64], forth: ImageStack, back: ImageStack, step: float) -> float:
         """Share of the gradients along a twist that map and image have in common, in [-1, 1]: from the ``sums``
@@ -112,20 +110,3 @@ def _complete(known: NDArray[np.bool_]) -> NDArray[np.bool_]:
     out = np.zeros_like(known)
     out[1:-1, 1:-1] = known[1:-1, 2:] & known[1:-1, :-2] & known[2:, 1:-1] & known[:-2, 1:-1]
     return out
-
-
-def _weights(
-    distance: NDArray[np.float32],
-    difference: NDArray[np.float32],
-    depth: NDArray[np.float64],
-    p: RegistrationParameters,
-    sensor: SensorConfig,
-) -> NDArray[np.float64]:
-    """Weights (2, h, w) of the two residuals, of which the absolute values are given: ``kernels/residual.py``."""
-    scale = np.ones_like(depth)
-    if p.noise_weighting > 0:
-        scale = np.minimum(p.sigma_at_one_metre / np.maximum(sensor.sigma(depth), 1e-6), 1)
-    scaled = distance * scale
-    tukey = (1 - np.minimum(scaled / p.tukey, 1) ** 2) ** 2 if p.tukey > 0 else None
-    robust = p.huber / np.maximum(scaled, p.huber) if tukey is None else tukey
-    return np.stack([robust * scale**2, p.color_weight * p.color_huber / np.maximum(difference, p.color_huber)])

@@ -11,7 +11,8 @@ from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.kernels.descent import SHORT_STEP, Descent, DescentRules
 from dudmap.kernels.median import median
-from dudmap.kernels.parameters import NormalEquations, RegistrationParameters
+from dudmap.kernels.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.kernels.residual import residual_weights
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.tracking.checks import REGISTRATION, Limits, first_failure
 from dudmap.tracking.gradient_agreement import SHOWN, GradientAgreement
@@ -190,7 +191,7 @@ class Tracker:
         least, R = self.config.min_information, T_world_camera[:3, :3]
         if least == 0:
             return COMPLETE
-        parameters = self._parameters(volume, color_weight)
+        parameters = self.parameters(volume.band, color_weight)
         noise = gradient_noise(
             level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, parameters
         )  # fmt: skip
@@ -200,7 +201,7 @@ class Tracker:
         seen = noise.observability(distances.H, system.H, R, least)
         if seen.is_complete:
             return COMPLETE
-        agreement = GradientAgreement(level, system.residuals, weights, R, parameters, self.sensor)
+        agreement = GradientAgreement(level, system.residuals, weights, R, parameters)
         step, shown = volume.voxel_size, []
         for twist in seen.unobservable @ np.kron(np.eye(2), R).T:
             forth, back = (
@@ -223,7 +224,7 @@ class Tracker:
         """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds."""
         return volume.backend.register(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
-            self._parameters(volume, color_weight),
+            self.parameters(volume.band, color_weight),
         )  # fmt: skip
 
     def _rules(self, limit: int, finest: bool, seen: Observability) -> DescentRules:
@@ -258,14 +259,14 @@ class Tracker:
         """
         return volume.backend.linearize(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
-            volume.T_grid_camera(T_world_camera), self._parameters(volume, color_weight),
+            volume.T_grid_camera(T_world_camera), self.parameters(volume.band, color_weight),
         )  # fmt: skip
 
-    def _parameters(self, volume: TsdfVolume, color_weight: float | None) -> RegistrationParameters:
-        """Parameters of the cost in a map; ``color_weight`` None takes that of the configuration."""
+    def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
+        """Parameters of the cost in a map with this truncation band; ``color_weight`` None: as configured."""
         config, sensor = self.config, self.sensor
         return RegistrationParameters(
-            band=volume.band,
+            band=band,
             huber=config.huber,
             tukey=config.tukey if config.robust == "tukey" else 0.0,
             color_weight=config.color_weight if color_weight is None else color_weight,
@@ -305,13 +306,8 @@ class Tracker:
     def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
         """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
         computes with ``noise_weighting``."""
-        config, sensor = self.config, self.sensor
-        valid = np.isfinite(system.residuals[1])
-        sigma = sensor.sigma(level.depth[valid])
-        scale = np.minimum(sensor.sigma(1.0) / np.maximum(sigma, 1e-6), 1)
-        residual = np.abs(system.residuals[0][valid]) * scale
-        if config.robust == "tukey":
-            robust = (1 - np.minimum(residual / config.tukey, 1) ** 2) ** 2  # eq. 4.45
-        else:
-            robust = config.huber / np.maximum(residual, config.huber)  # eq. 4.44
-        return float(np.sum(weights[valid] * robust * residual**2, dtype=np.float64))
+        noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale)
+        everywhere = TruncationBand(np.inf, np.inf, 0.0, np.inf, noise)  # other residuals are NaN
+        parameters = self.parameters(everywhere)._replace(noise_weighting=1.0)
+        squares = residual_weights(level.depth, system.residuals, weights, parameters)[2]
+        return float(np.sum(squares, dtype=np.float64))

@@ -1,0 +1,65 @@
+"""The weight of a residual: against plain NumPy, and that its text stands in one place."""
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import dudmap
+from dudmap.kernels.parameters import RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.kernels.residual import residual_weights
+
+BAND = TruncationBand(0.05, 0.05, 3.0, 0.3, SensorNoise(0.001, 0.0019))
+
+
+@pytest.mark.parametrize("tukey", [0.0, 0.03])
+@pytest.mark.parametrize("noisy", [0.0, 1.0])
+def test_weights_are_those_of_the_thesis(tukey, noisy):
+    """Equations 4.44 to 4.46, with the noise of the sensor (3.91)."""
+    rng, p = np.random.default_rng(1), RegistrationParameters(BAND, 0.01, tukey, 0.13, 0.1, 0.0029, noisy)
+    z = rng.uniform(0.5, 4, (20, 30)).astype(np.float32)
+    r, rc = rng.normal(0, 0.02, z.shape).clip(-0.04, 0.04), rng.normal(0, 0.2, z.shape)
+    rc[3] = np.nan
+    static = rng.uniform(0, 1, z.shape)
+    of_distance, of_intensity, square = residual_weights(z, np.stack([r, rc]).astype(np.float32), static, p)
+    scale = np.minimum(0.0029 / (0.001 + 0.0019 * z**2), 1) if noisy else np.ones_like(z)
+    a, known = np.abs(r * scale), np.isfinite(rc)
+    robust = np.where(a < tukey, (1 - (a / tukey) ** 2) ** 2, 0) if tukey else np.minimum(0.01 / a, 1)
+    np.testing.assert_allclose(of_distance, np.where(known, static * robust * scale**2, 0), rtol=1e-4, atol=1e-6)
+    np.testing.assert_allclose(square, np.where(known, static * robust * a**2, 0), rtol=1e-4, atol=1e-9)
+    expected = np.where(known, static * 0.13 * np.minimum(0.1 / np.abs(rc), 1), 0)
+    np.testing.assert_allclose(of_intensity, expected, rtol=1e-4)
+
+
+OWNERS = {
+    ("huber", "tukey", "color_huber", "noise_weighting", "sigma_at_one_metre"): {
+        "kernels/residual.py",
+        "tracking/tracker.py:parameters",  # hands them on
+        "tracking/tracker.py:_judge",  # asks whether the weights have the noise
+    },
+    ("sigma_base", "sigma_scale"): {
+        "config.py:sigma",
+        "mapping/integrator.py:of",  # hands them on, as do all that follow
+        "tracking/tracker.py:_chi_square",
+        "dynamics/detector.py:_noise_parameters",
+        "dynamics/detector.py:distance_sigma",
+        "calibration/adjustment.py:_linearize_pairs",
+    },
+}
+"""Parameters of a formula, and the files or functions that may name them; everybody else calls the formula."""
+
+
+@pytest.mark.parametrize("names", OWNERS, ids=["weight", "sigma"])
+def test_the_formula_stands_in_one_place(names):
+    root = Path(dudmap.__file__).parent
+    found = set()
+    for path in sorted(root.rglob("*.py")):
+        file = path.relative_to(root).as_posix()
+        for part in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(part, ast.FunctionDef) and any(
+                isinstance(node, ast.Attribute) and node.attr in names for node in ast.walk(part)
+            ):
+                found.add(f"{file}:{part.name}")
+    others = {place for place in found if not {place, place.partition(":")[0]} & OWNERS[names]}
+    assert not others, "these name the parameters of a formula; call weigh, residual_weights or sigma instead"
