@@ -85,6 +85,7 @@ class FakeSlam:
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
+        self.device = "cpu"
         self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
 
     @property

@@ -342,7 +342,7 @@ class Config(ConfigSection):
     """Set of values from which the configuration starts."""
     device: str = Field(default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?|warp-cpu)$")
     """Where the frames are computed: cpu, cuda, or cuda:1 for the second GPU (extra gpu); auto takes a GPU where one
-    works; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""
+    works and ``volume.adaptive`` is off; warp-cpu runs the kernels of the GPU on the CPU, slowly, for tests."""
     sensor: SensorConfig = SensorConfig()
     preprocess: PreprocessConfig = PreprocessConfig()
     similarity: SimilarityConfig = SimilarityConfig()

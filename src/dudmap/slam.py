@@ -161,7 +161,7 @@ class Slam(SlamResults):
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images
-            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size, observation.backend)
+            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
             timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
             frame = FrameView(observation, pyramid, segmentation, timer)
         if dynamic_mask is not None:

@@ -9,7 +9,7 @@ from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment
 from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.observation import Level
 from dudmap.geometry.camera import Camera
-from dudmap.kernels.cpu import CpuBackend
+from dudmap.kernels.evidence import segment_counts
 from dudmap.slam import Slam
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
@@ -59,7 +59,7 @@ def test_a_step_smaller_than_the_slope_of_the_floor_cuts():
 
 
 def split(segmentation, before):
-    counts = CpuBackend().segment_counts(segmentation.labels, segmentation.count, [before])
+    counts = segment_counts(segmentation.labels, segmentation.count, [before])
     return split_mixed_segments(segmentation, before, *counts)
 
 
@@ -92,25 +92,25 @@ def test_a_segment_that_stood_still_for_the_settle_time_has_settled(speed, stand
     for i in range(35):
         image, board = scene(speed * i / 30)
         surface = segment(image, TOLERANCE)
-        still = memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board)
+        still = memory.settled(i / 30, image, np.eye(4), surface, sigma, board)
         assert not still[~board].any()
         if i < 30:
             assert not still.any()
         memory.update(i / 30, image, np.eye(4), board, surface)
-        before = memory.last_dynamic(CpuBackend(), image, np.eye(4), 0.1)
+        before = memory.last_dynamic(image, np.eye(4), 0.1)
         inner = board.copy()
         inner[1:, 1:] &= board[:-1, :-1]
         assert before[inner].mean() > 0.9
         assert not before[~board].any()
     assert (still[board].mean() > 0.9) == stands
     memory.reset()
-    assert not memory.settled(CpuBackend(), i / 30, image, np.eye(4), surface, sigma, board).any()
+    assert not memory.settled(i / 30, image, np.eye(4), surface, sigma, board).any()
 
 
 def free_space(memory, timestamp, image, T, unknown=0.0):
     """Pixels that single frames have seen to be free, with readings that differ by up to 0.1 m."""
     noise, frames = np.full(CAMERA.shape, 0.1, np.float32), memory.free_space_frames(timestamp, unknown)
-    return memory.seen_free(CpuBackend(), image, T, noise, frames)
+    return memory.seen_free(image, T, noise, frames)
 
 
 def test_single_frames_give_free_space():

@@ -22,8 +22,7 @@ from dudmap.dynamics.segments import (
 from dudmap.dynamics.temporal_memory import TemporalMemory
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
-from dudmap.kernels import labeling
-from dudmap.kernels.backend import Backend
+from dudmap.kernels import evidence, labeling
 from dudmap.kernels.evidence import (
     EDGES,
     EvidenceParameters,
@@ -107,13 +106,12 @@ class DynamicDetector:
         self.memory = TemporalMemory(config)
         self.background = BackgroundModel(config)
 
-    def segment(self, level: Level, voxel_size: float, backend: Backend) -> Callable[[], Segmentation]:
+    def segment(self, level: Level, voxel_size: float) -> Callable[[], Segmentation]:
         """Begin to segment the surface an image shows; needs no map.
 
         Args:
             level: The image, at the resolution of the labels.
             voxel_size: Edge of the map's voxels, metres.
-            backend: Compute device.
 
         Returns:
             A function that waits for the segmentation. It is computed in another thread, or, where the configuration
@@ -121,7 +119,7 @@ class DynamicDetector:
         """
 
         def compute() -> Segmentation:
-            return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level), backend)
+            return segment(level, depth_tolerance(distance_sigma(self.sensor, level.depth, voxel_size), level))
 
         config = self.config
         needed = config.method == "em" and ((config.regions and config.pieces) or config.start_seconds > 0)
@@ -164,24 +162,23 @@ class DynamicDetector:
             exposure: Gain and offset that make the image's intensities those of the map.
         """
         sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
-        backend = volume.backend
-        noise = backend.reading_noise(level.depth, self._noise_parameters(level, volume.voxel_size))
+        noise = evidence.reading_noise(level.depth, self._noise_parameters(level, volume.voxel_size))
         frame = _Comparison(timestamp, level, T_world_camera, exposure, sample, noise)
-        histogram, unknown = backend.residual_counts(sample, level.depth, noise.sigma)
+        histogram, unknown = evidence.residual_counts(sample, level.depth, noise.sigma)
         if self.config.method == "threshold":
             dynamic = self._threshold_and_flood(frame, volume.truncation)
             return Labels(np.where(dynamic, np.float32(0), np.float32(1)), dynamic, None, histogram, sample)
         mixture = fit_mixture(histogram, EDGES)
-        evidence = self._evidence(backend, frame, mixture, unknown)
-        probability = backend.label(evidence, level.depth, noise.tolerance, COUPLING, SWEEPS)
+        log_odds = self._log_odds(frame, mixture, unknown)
+        probability = labeling.mean_field(log_odds, level.depth, noise.tolerance, COUPLING, SWEEPS)
         dynamic = (probability < 0.5) & (level.depth > 0)
         segments = None
         if self.config.regions:
             seeds = opened_mask(dynamic, level) | (dynamic & frame.free)
             least = MIN_REGION * seeds.size
-            dynamic = backend.moving_regions(seeds, evidence, level.depth, noise.tolerance, least, SEEDED_SHARE)
+            dynamic = evidence.moving_regions(seeds, log_odds, level.depth, noise.tolerance, least, SEEDED_SHARE)
             if self.config.pieces:
-                dynamic, segments = self._segments(backend, frame, dynamic, seeds, segmentation())
+                dynamic, segments = self._segments(frame, dynamic, seeds, segmentation())
             if moving is not None:
                 dynamic = dynamic | moving
             # what belongs to no moving region fits badly for another reason, which the robust weights deal with
@@ -226,7 +223,7 @@ class DynamicDetector:
             config.noise_threshold / 3,
         )  # fmt: skip
 
-    def _evidence(self, backend: Backend, frame: _Comparison, mixture: Mixture, unknown: float) -> NDArray[np.float32]:
+    def _log_odds(self, frame: _Comparison, mixture: Mixture, unknown: float) -> NDArray[np.float32]:
         """Log odds (h, w) static : dynamic of each pixel alone, 0 = unknown.
 
         Near a surface of the map they are those of the mixture, but at least 1 within the noise (eq. 4.57). In known
@@ -234,15 +231,14 @@ class DynamicDetector:
         """
         config, level, seen_free = self.config, frame.level, None
         if config.free_space and (older := self.memory.free_space_frames(frame.timestamp, unknown)):
-            seen_free = self.memory.seen_free(backend, level, frame.T_world_camera, frame.noise.gap, older)
+            seen_free = self.memory.seen_free(level, frame.T_world_camera, frame.noise.gap, older)
         parameters = EvidenceParameters(
             *mixture.coefficients, MAX_LOG_ODDS, config.noise_threshold, config.noise_sigmas
         )
-        return backend.log_odds(frame.sample, frame.noise.sigma, parameters, config.free_space, seen_free)
+        return evidence.log_odds(frame.sample, frame.noise.sigma, parameters, config.free_space, seen_free)
 
     def _segments(
         self,
-        backend: Backend,
         frame: _Comparison,
         dynamic: NDArray[np.bool_],
         seeds: NDArray[np.bool_],
@@ -255,20 +251,20 @@ class DynamicDetector:
         3. Segments that have settled are static.
         """
         level, T_world_camera = frame.level, frame.T_world_camera
-        before = self.memory.last_dynamic(backend, level, T_world_camera, MAX_DISPLACEMENT)
-        counts = backend.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
+        before = self.memory.last_dynamic(level, T_world_camera, MAX_DISPLACEMENT)
+        counts = evidence.segment_counts(segmentation.labels, segmentation.count, (before, seeds))
         split = split_mixed_segments(segmentation, before, *counts[:2])
         if split is not segmentation:
-            segmentation, counts = split, backend.segment_counts(split.labels, split.count, (before, seeds))
+            segmentation, counts = split, evidence.segment_counts(split.labels, split.count, (before, seeds))
         size, labels = np.maximum(counts[0], 1), segmentation.labels
         sigma = frame.noise.bounded_sigma
-        dynamic, sums = backend.compare_segments(
+        dynamic, sums = evidence.compare_segments(
             frame.sample, segmentation.with_noise(sigma), counts[2] / size >= STARTED_SHARE, dynamic, level.intensity,
             frame.exposure,
         )  # fmt: skip
         moving = classify_segments(evidence_of(sums, segmentation.min_pixels), counts[1] / size)
         dynamic = dynamic | moving[labels]
-        settled = self.memory.settled(backend, frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
+        settled = self.memory.settled(frame.timestamp, level, T_world_camera, segmentation, sigma, dynamic)
         return dynamic & ~settled, segmentation
 
     def _threshold_and_flood(self, frame: _Comparison, truncation: float) -> NDArray[np.bool_]:
@@ -280,7 +276,7 @@ class DynamicDetector:
 
         level = frame.level
         distance = np.abs(np.nan_to_num(frame.sample.distance))
-        noise = noise_threshold(self.config, np.asarray(frame.noise.sigma))
+        noise = noise_threshold(self.config, frame.noise.sigma)
         rim = 0.95 * truncation  # a stored distance never exceeds the truncation
         marked = (distance > min(self.config.threshold, rim)) | frame.free
         width = level.camera.width

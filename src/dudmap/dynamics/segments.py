@@ -7,9 +7,7 @@ from numpy.typing import NDArray
 
 from dudmap.dynamics.label_scale import pixel_scale, scaled_area, scaled_length, scaled_side
 from dudmap.frames.observation import Level
-from dudmap.kernels.backend import Backend
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.segmentation import SegmentImage, SegmentSums
+from dudmap.kernels.segmentation import SegmentImage, SegmentSums, segment_surface
 
 EDGE_REACH = 3
 """Pixels from a concave edge to the normals that are compared on either side, at REFERENCE_WIDTH."""
@@ -91,16 +89,15 @@ class SegmentEvidence:
     min_pixels: float = MIN_PIXELS
 
 
-def segment(level: Level, tolerance: NDArray[np.float32], backend: Backend | None = None) -> Segmentation:
+def segment(level: Level, tolerance: NDArray[np.float32]) -> Segmentation:
     """Cut the surface an image shows along depth edges and concave edges (Stein et al. 2014).
 
     Args:
         level: The image.
         tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
-        backend: Compute device; None takes the CPU.
     """
     edge_reach, normal_reach = scaled_length(EDGE_REACH, level), scaled_length(NORMAL_REACH, level)
-    labels, count = (backend or CpuBackend()).segment_surface(
+    labels, count = segment_surface(
         level.depth, level.camera.intrinsics, tolerance, edge_reach, normal_reach, CONCAVITY
     )
     return Segmentation(labels, count, intensity_gradient(level), scaled_area(MIN_PIXELS, level), scaled_side(1, level))

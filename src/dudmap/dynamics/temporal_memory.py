@@ -12,7 +12,7 @@ from dudmap.dynamics.label_scale import scaled_side
 from dudmap.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
-from dudmap.kernels.backend import Backend
+from dudmap.kernels.evidence import compare_with_frame, free_space, seen_marked
 from dudmap.kernels.reprojection import ReprojectionTarget
 
 SETTLE_FRAMES = 4
@@ -125,13 +125,10 @@ class TemporalMemory:
         self._recent_frames.clear()
         self._start_frames = self._start_frames if self._imported else []
 
-    def last_dynamic(
-        self, backend: Backend, level: Level, T_world_camera: NDArray[np.float64], max_gap: float
-    ) -> NDArray[np.bool_]:
+    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
         """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
 
         Args:
-            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
@@ -139,7 +136,7 @@ class TemporalMemory:
         if self._last is None or not self._last.dynamic.any():
             return np.zeros(level.depth.shape, dtype=bool)
         (target,) = _targets(T_world_camera, [self._last])
-        return backend.seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
+        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
 
     def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
         """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
@@ -159,7 +156,6 @@ class TemporalMemory:
 
     @staticmethod
     def seen_free(
-        backend: Backend,
         level: Level,
         T_world_camera: NDArray[np.float64],
         noise: NDArray[np.float32],
@@ -171,18 +167,16 @@ class TemporalMemory:
         at least half as many frames have as have seen a surface at it.
 
         Args:
-            backend: Compute device.
             level: The image.
             T_world_camera: (4, 4) its pose.
             noise: (h, w) float32, largest depth difference between two readings of one point, metres.
             frames: As of ``free_space_frames``.
         """
         targets, side = _targets(T_world_camera, frames), scaled_side(SEAM, level)
-        return backend.free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
+        return free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
 
     def settled(
         self,
-        backend: Backend,
         timestamp: float,
         level: Level,
         T_world_camera: NDArray[np.float64],
@@ -197,7 +191,6 @@ class TemporalMemory:
         sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
 
         Args:
-            backend: Compute device.
             timestamp: Seconds.
             level: The image.
             T_world_camera: (4, 4) its pose.
@@ -216,7 +209,7 @@ class TemporalMemory:
         settled[: count + 1] = False
         for target in _targets(T_world_camera, frames):
             image = level.depth, level.intensity, level.camera.intrinsics
-            sums = backend.compare_with_frame(*image, target, parts.with_noise(sigma), 4)
+            sums = compare_with_frame(*image, target, parts.with_noise(sigma), 4)
             evidence = evidence_of(sums, parts.min_pixels)
             visible = evidence.compared > 0.7
             common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])

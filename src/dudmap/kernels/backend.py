@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.kernels.descent import Descent, DescentRules
-from dudmap.kernels.label_backend import LabelBackend
 from dudmap.kernels.parameters import (
     ColorProjection,
     DepthView,
@@ -23,8 +22,8 @@ from dudmap.kernels.parameters import (
 )
 
 
-class Backend(LabelBackend, Protocol):
-    """Operations of a compute device, with those on the label image.
+class Backend(Protocol):
+    """Operations of a compute device.
 
     A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
     must not run at the same time. Results do not depend on the number of threads.
@@ -72,18 +71,6 @@ class Backend(LabelBackend, Protocol):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
         """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
         ``max(tolerance, tolerance z)`` behind the nearest one z."""
-        ...
-
-    def segment_surface(
-        self,
-        depth: NDArray[np.float32],
-        intrinsics: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        reach: int,
-        normal_reach: int,
-        sine: float,
-    ) -> tuple[NDArray[np.int32], int]:
-        """Connected segments of surface; see ``segmentation.segment_surface``. May run beside other operations."""
         ...
 
     # -- integrate ---------------------------------------------------------------------------------------------------
@@ -255,8 +242,3 @@ class Backend(LabelBackend, Protocol):
         from unknown space straight to the inside, there is none.
         """
         ...
-
-
-_PROTOCOLS = Backend, LabelBackend
-OPERATIONS = tuple(name for protocol in _PROTOCOLS for name in vars(protocol) if not name.startswith("_"))
-"""Names of all operations."""

@@ -11,14 +11,11 @@ from numpy.typing import NDArray
 from dudmap.kernels import (
     antialiasing,
     color_registration,
-    evidence,
     filtering,
     integration,
-    labeling,
     raycasting,
     registration,
     sampling,
-    segmentation,
     visibility,
 )
 from dudmap.kernels.descent import Descent, DescentRules, descend
@@ -63,16 +60,6 @@ class CpuBackend:
     """``Backend`` on the CPU."""
 
     raycast = staticmethod(raycasting.raycast)
-    segment_surface = staticmethod(segmentation.segment_surface)
-    reading_noise = staticmethod(evidence.reading_noise)
-    residual_counts = staticmethod(evidence.residual_counts)
-    free_space = staticmethod(evidence.free_space)
-    log_odds = staticmethod(evidence.log_odds)
-    moving_regions = staticmethod(evidence.moving_regions)
-    seen_marked = staticmethod(evidence.seen_marked)
-    segment_counts = staticmethod(evidence.segment_counts)
-    compare_segments = staticmethod(evidence.compare_segments)
-    compare_with_frame = staticmethod(evidence.compare_with_frame)
 
     def __init__(self) -> None:
         self._padded = np.empty((0, 0), dtype=np.float32)
@@ -396,17 +383,6 @@ class CpuBackend:
             bands(shape[0], max(8, -(-shape[0] // 8))),
         )  # fmt: skip
         return out
-
-    def label(
-        self,
-        log_odds: NDArray[np.float32],
-        depth: NDArray[np.float32],
-        tolerance: NDArray[np.float32],
-        coupling: float,
-        sweeps: int,
-    ) -> NDArray[np.float32]:
-        """See ``Backend.label``."""
-        return labeling.mean_field(log_odds, depth, tolerance, coupling, sweeps)
 
 
 def _concatenated(found: list[NDArray[np.int32]], counts: list[int]) -> NDArray[np.int32]:

@@ -146,7 +146,7 @@ def surface_log_odds(
 
 
 def reading_noise(depth: NDArray[np.float32], parameters: NoiseParameters) -> ReadingNoise:
-    """See ``LabelBackend.reading_noise``."""
+    """Noise of the readings of an image (h, w), metres, 0 = none."""
     p = single(parameters)
     sigma = static_sigma(depth, p.base, p.scale, p.map_variance)
     gap = p.gap * noise_limit(sigma, p.floor, p.sigmas)
@@ -155,7 +155,8 @@ def reading_noise(depth: NDArray[np.float32], parameters: NoiseParameters) -> Re
 
 
 def residual_counts(sample: MapSample, depth: NDArray[np.float32], sigma: NDArray[np.float32]) -> ResidualCounts:
-    """See ``LabelBackend.residual_counts``."""
+    """Histogram of the normalised residuals of an image at the surfaces of the map; arguments as of ``log_odds``,
+    and the depth (h, w) in metres, 0 = none."""
     surface, valid = sample.occupancy == SURFACE, depth > 0
     histogram = np.bincount(residual_bin(sample.distance[surface], sigma[surface]), minlength=BINS)
     unknown = np.count_nonzero((sample.occupancy == UNKNOWN) & valid) / max(np.count_nonzero(valid), 1)
@@ -169,7 +170,15 @@ def log_odds(
     free_space: bool,
     seen_free: NDArray[np.bool_] | None,
 ) -> NDArray[np.float32]:
-    """See ``LabelBackend.log_odds``."""
+    """Log odds static : dynamic (h, w) float32 of each pixel alone, 0 = unknown (eq. 4.56, 4.57).
+
+    Args:
+        sample: The map at the points of the image.
+        sigma: (h, w) float32, standard deviation of the distance of a static point, metres.
+        parameters: Of the log odds at surfaces of the map.
+        free_space: Whether a pixel in space that the map knows to be free is certain to move.
+        seen_free: (h, w) bool, other pixels that then are, as of ``free_space``; None = none.
+    """
     p = parameters
     noise = noise_limit(sigma, np.float32(p.noise_floor), np.float32(p.noise_sigmas))
     limit = np.float32(p.limit)
@@ -189,7 +198,15 @@ def free_space(
     targets: Sequence[ReprojectionTarget],
     side: int,
 ) -> NDArray[np.bool_]:
-    """See ``LabelBackend.free_space``."""
+    """Pixels (h, w) bool that at least half as many older frames have seen through as have a reading there, opened.
+
+    Args:
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        noise: (h, w) float32, largest depth difference of two readings of one point, metres.
+        targets: The older frames.
+        side: Of the square that the mask is opened with, pixels, odd.
+    """
     import cv2
 
     num_free, num_surface = (np.zeros(depth.shape, dtype=np.float32) for _ in range(2))
@@ -208,7 +225,15 @@ def moving_regions(
     min_area: float,
     seeded_share: float,
 ) -> NDArray[np.bool_]:
-    """See ``LabelBackend.moving_regions``."""
+    """Pixels (h, w) bool of regions that grow from seeds over the surface, up to depth edges and static pixels.
+
+    Args:
+        seeds: (h, w) bool, pixels with a reading.
+        log_odds: (h, w) float32 of each pixel alone; a pixel is static from 1 on.
+        depth, tolerance: As of ``labeling.mean_field``.
+        min_area: Fewest pixels of a region.
+        seeded_share: Least share of seeds in a region.
+    """
     labels, count = labeling.grow_regions(seeds, log_odds < 1, depth, tolerance)
     areas = np.bincount(labels.reshape(-1), minlength=count + 1)
     seeded = np.bincount(labels[seeds], minlength=count + 1)
@@ -224,7 +249,14 @@ def seen_marked(
     target: ReprojectionTarget,
     max_gap: float,
 ) -> NDArray[np.bool_]:
-    """See ``LabelBackend.seen_marked``."""
+    """Pixels (h, w) bool whose points a marked reading of an older frame shows, within ``max_gap`` metres.
+
+    Args:
+        depth, intensity: (h, w) float32; depth in metres, 0 = none.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        target: The older frame.
+        max_gap: Metres.
+    """
     ((gap, _, marks),) = reproject(depth, intensity, intrinsics, [target])
     return (marks > 0) & (np.abs(gap) < max_gap)
 
@@ -232,7 +264,13 @@ def seen_marked(
 def segment_counts(
     labels: NDArray[np.int32], count: int, masks: Sequence[NDArray[np.bool_]]
 ) -> list[NDArray[np.int64]]:
-    """See ``LabelBackend.segment_counts``."""
+    """Pixels (count + 1,) of each segment, and for each mask (h, w) those that lie in it.
+
+    Args:
+        labels: (h, w) int32 numbers of the segments from 1, 0 = none.
+        count: Number of segments.
+        masks: Any number.
+    """
     members = labels.reshape(-1), *(labels[mask] for mask in masks)
     return [np.bincount(found, minlength=count + 1) for found in members]
 
@@ -245,7 +283,17 @@ def compare_segments(
     intensity: NDArray[np.float32],
     exposure: tuple[float, float],
 ) -> tuple[NDArray[np.bool_], SegmentSums]:
-    """See ``LabelBackend.compare_segments``."""
+    """Dynamic pixels (h, w) bool, without those in unknown space whose segment has not started to move, and sums
+    over the segments, of a frame compared with the map.
+
+    Args:
+        sample: The map at the points of the image.
+        segments: The segments of the image.
+        started: (count + 1,) bool, segments that have started.
+        dynamic: (h, w) bool.
+        intensity: (h, w) float32.
+        exposure: Gain and offset that make the image's intensities those of the map.
+    """
     surface, known = sample.occupancy == SURFACE, sample.occupancy != UNKNOWN
     dynamic = dynamic & (known | started[segments.labels])
     gain, offset = exposure
@@ -263,7 +311,8 @@ def compare_with_frame(
     segments: SegmentImage,
     max_sigmas: float,
 ) -> SegmentSums:
-    """See ``LabelBackend.compare_with_frame``."""
+    """Sums over the segments of a frame compared with an older one, in which points move that are off by more than
+    ``max_sigmas``; other arguments as of ``seen_marked`` and ``compare_segments``."""
     ((gap, difference, _),) = reproject(depth, intensity, intrinsics, [target])
     compared = ~np.isnan(gap)
     displaced = np.abs(gap) > max_sigmas * segments.sigma  # not where it is NaN
