@@ -169,7 +169,7 @@ def open_sequence(path: str | Path, camera: "Camera | str | None" = None, **opti
         )
     with damaged(DatasetError, f"the recording {place}"):
         sequence = reader(place, camera, **given)
-    sequence.name = printable(sequence.name)
+    vars(sequence)["name"] = printable(sequence.name)  # it may be that of a folder from elsewhere
     return sequence
 
 
