@@ -1,4 +1,4 @@
-"""The node where ROS is missing: its imports, parameters, lifecycle and callbacks, with stand-ins of what ROS provides."""
+"""The node where ROS is missing: imports, parameters, lifecycle, callbacks, on stand-ins of what ROS provides."""
 
 import importlib
 import sys
@@ -6,9 +6,9 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-from ros.test_session import STORE, messages, recording  # noqa: F401 - a fixture
 
 from dudmap.config import Config
+from ros.test_session import STORE, messages, recording  # noqa: F401 - a fixture
 
 SUCCESS, FAILURE = "success", "failure"
 
@@ -71,7 +71,7 @@ class Synchronizer:
     def __init__(self, inputs, *, queue_size, slop):
         assert slop > 0
 
-    def registerCallback(self, callback):  # noqa: N802 - ROS's name
+    def registerCallback(self, callback):
         self.callback = callback
 
 
@@ -79,7 +79,7 @@ class Broadcaster:
     def __init__(self, node):
         self.sent = []
 
-    def sendTransform(self, message):  # noqa: N802
+    def sendTransform(self, message):
         self.sent.append(message)
 
 
