@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import rclpy
-from dudmap.exporting.mesh_simplification import simplified
 from message_filters import ApproximateTimeSynchronizer, Subscriber
 from nav_msgs.msg import Odometry, Path
 from rclpy.executors import ExternalShutdownException
@@ -19,6 +18,7 @@ from visualization_msgs.msg import Marker, MarkerArray
 
 from dudmap.errors import DudmapError
 from dudmap.exporting import ros_messages as ros
+from dudmap.geometry.mesh_simplification import simplified
 from dudmap_ros.session import Session, config_of, default_parameters
 
 SETTINGS = {

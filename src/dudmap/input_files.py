@@ -133,8 +133,8 @@ def parse_json(text: str | bytes, *, exact: bool = False) -> Any:  # noqa: ANN40
     Raises:
         ValueError: It is not UTF-8 or not JSON, too large, or nested too deeply.
     """
-    comma, opening = (b",", (b"[", b"{")) if isinstance(text, bytes) else (",", ("[", "{"))
-    if text.count(comma) + sum(text.count(one) for one in opening) > LARGEST_COUNT:
+    raw = text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass")
+    if sum(map(raw.count, (b",", b"[", b"{"))) > LARGEST_COUNT:
         raise ValueError(f"it has more than {LARGEST_COUNT} values")
     try:
         return _shallow(json.loads(text, parse_int=int if exact else _number))

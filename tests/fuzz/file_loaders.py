@@ -169,3 +169,23 @@ def load_run_folder(path):
             read()
         except DudmapError as error:
             check_sentence(error)
+
+
+def write_into_run_folder(path):
+    """What a run does with a folder that exists, and what going on with a run does."""
+    from dudmap.errors import DudmapError
+    from dudmap.geometry.trajectory import Trajectory
+    from dudmap.pipeline.run_folder import locked, prepare_run_folder, save_mask
+    from dudmap.pipeline.storing import stored_options
+    from dudmap.viewing.thumbnails import Thumbnails
+
+    try:
+        with locked(path):
+            stored_options(path)
+    except DudmapError as error:
+        check_sentence(error)
+    with locked(path):
+        prepare_run_folder(path, None, save_masks=True)
+        Thumbnails().start(None, path, 3)
+        save_mask(path / "masks" / "0.000000.png", np.zeros((4, 4), bool))
+        Trajectory.from_poses([(0.0, np.eye(4))]).save(path / "trajectory.txt")

@@ -42,5 +42,9 @@ LOADERS = {
     "array": Loader(files.array, files.load_array),
     **{f"mesh {kind}": Loader(partial(files.mesh, kind), files.load_mesh) for kind in ("ply", "obj", "glb", "stl")},
     "run folder": Loader(files.run_folder, files.load_run_folder),
+    "run folder to write": Loader(files.run_folder, files.write_into_run_folder, owns=True),
+    "merged folder": Loader(maps.merged_folder, maps.load_merged_folder),
+    "world": Loader(maps.world, maps.load_world),
+    "world to replace": Loader(maps.world, maps.replace_world, owns=True),
 }  # fmt: skip
 """All loaders by name."""

@@ -46,12 +46,31 @@ def load_map(path):
     loaded.raycast(np.eye(4), loaded.camera)
 
 
+def parts():
+    """A state with values of all kinds that a tree has."""
+    from collections import deque
+
+    from dudmap.config import Config
+    from dudmap.geometry.camera import Camera
+    from dudmap.places.atlas import TimedPose
+    from dudmap.places.place_recognition import Keyframe, PlacedFeatures
+
+    rng = np.random.default_rng(0)
+    features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
+    keyframe, numbers = Keyframe(1.0, np.eye(4), features), np.arange(100.0)
+    return {
+        "volume": volume(), "numbers": numbers, "again": [numbers, keyframe], "keyframe": keyframe, "rng": rng,
+        "config": Config(), "camera": Camera(20, 20, 15.5, 11.5, 32, 24), "last": deque([1.5, None, "a"], 5),
+        "poses": [TimedPose(0.1 * k, np.eye(4), 0) for k in range(40)], "seen": {1, 2}, "pair": (1, np.float32(0.5)),
+    }  # fmt: skip
+
+
 def state(folder):
     from dudmap.state.database import StateDatabase
     from dudmap.state.system import take_snapshot
 
     database = StateDatabase(folder / "state.db")
-    database.write(take_snapshot({"volume": volume(), "numbers": np.arange(100.0)}, database), {"next": 1})
+    database.write(take_snapshot(parts(), database), {"next": 1})
     database.close()
     return folder / "state.db"
 
@@ -63,8 +82,16 @@ def load_state(path):
     try:
         reader = StateReader(path)
         reader.meta()
-        restore(reader, {"volume": volume()})
+        like = parts()
+        kinds = {key: type(value) for key, value in like.items()}
+        found = restore(reader, like)
         reader.close()
+        for key, value in found.items():
+            assert value is None or isinstance(value, kinds.get(key, object))
+        if found.get("keyframe") is not None:
+            assert found["keyframe"].features.points.dtype.kind in "fiu"
+        if found.get("volume") is not None:
+            found["volume"].extract_mesh()
     finally:
         for companion in ("-wal", "-shm"):  # SQLite makes them beside any database that is read while it may be written
             path.with_name(path.name + companion).unlink(missing_ok=True)
@@ -99,3 +126,50 @@ def load_depth_model(path):
     from dudmap.calibration.depth_model import DepthModel
 
     DepthModel.load(path).correction  # noqa: B018
+
+
+def merged_folder(folder):
+    """Folder of two merged runs, as other commands read it."""
+    from file_loaders import run_folder, trajectory
+
+    run = run_folder(folder)
+    (run / "trajectory-2.txt").write_text(trajectory())
+    (run / "merge.json").write_text('{"runs": ["a", "b"], "trajectories": ["trajectory.txt", "trajectory-2.txt"]}')
+    return run
+
+
+def load_merged_folder(path):
+    from file_loaders import load_run_folder
+
+    from dudmap.pipeline.merge import run_trajectories
+
+    load_run_folder(path)
+    run_trajectories(path, np.eye(4))
+
+
+def world(folder):
+    """Folder of many merged runs."""
+    import json
+
+    made = folder / "world"
+    for name in ("map", "tiles"):
+        (made / name).mkdir(parents=True)
+    volume().save(made / "map" / "0000000000000.npz")
+    (made / "tiles" / "0.glb").write_bytes(b"glTF")
+    one = {"file": "map/0000000000000.npz", "codes": [0, 1], "blocks": 1, "low_m": [-9, -9, -9], "high_m": [9, 9, 9]}
+    tree = {"format": "dudmap world 1", "voxel_size": 0.1, "runs": [], "ranges": [one], "map_blocks": 1, "tiles": 1}
+    (made / "world.json").write_text(json.dumps(tree))
+    (made / "tileset.json").write_text("{}")
+    return made
+
+
+def load_world(path):
+    from dudmap.fleet.merge import load_part
+
+    load_part(path, np.full(3, -1.0), np.full(3, 1.0))
+
+
+def replace_world(path):
+    from dudmap.fleet.merge import _check_out
+
+    _check_out(path)

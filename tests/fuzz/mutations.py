@@ -11,6 +11,8 @@ import zipfile
 import zlib
 from functools import cache, lru_cache
 
+from state_mutations import state_tree
+
 NUMBERS = (
     b"0", b"-1", b"1e999", b"-1e308", b"nan", b"inf", b"1e-320", b"1000000000", b"999999999999999999999",
     b"9" * 400, b"", b"0x10", b"1_000", b"1.2.3", b"\xd9\xa3", b"4294967296", b"2147483647", b"true", b'"a"', b"[]",
@@ -53,6 +55,8 @@ def mutated(rng, name, data):
 def mutators(name, data):
     if data.startswith(b"\x89PNG"):
         return [png_chunk, png_chunk, png_size, png_bomb, *RAW]
+    if data.startswith(b"SQLite format 3"):
+        return [state_tree, state_tree, state_tree, state_tree, *RAW]
     if data.startswith(b"PK"):
         return [zip_member, zip_member, zip_member, zip_bomb, zip_names, *RAW]
     if data.startswith(b"\x93NUMPY"):
@@ -328,6 +332,19 @@ def tar_member(rng, data):
 
 
 # -- folders -----------------------------------------------------------------------------------------------------------
+
+
+def put_link(rng, home, elsewhere):
+    """A link in the place of a folder, a lock or a temporary file, or beside what is there."""
+    name = rng.choice(
+        (".lock", "state.db", "masks", "thumbnails", "movers", "map", "tiles", "part-2", ".work", "x.part")
+    )
+    place = home / name
+    if place.is_dir() and not place.is_symlink():
+        place.rename(place.with_name(f"{name}-before"))
+    elif place.exists() or place.is_symlink():
+        place.unlink()
+    place.symlink_to(rng.choice((elsewhere, elsewhere / "0.000000.png", "/dev/zero", "nowhere", name)))
 
 
 def put_special(path, kind, secret):

@@ -9,7 +9,7 @@ from contextlib import contextmanager
 
 import numpy as np
 from loaders import LOADERS
-from mutations import SPECIAL, mutated, put_special
+from mutations import SPECIAL, mutated, put_link, put_special
 from verdict import check_sentence
 
 from dudmap.errors import DudmapError
@@ -21,6 +21,8 @@ SECONDS = 10
 NAMES = "a\nb", "\x1b[2J", "x" * 200, "-0.png", "nan.png"
 """Names of files that no recorder gives."""
 SECRET = "the content of a file outside"
+OTHERS = "0.000000.png", "0.000000.color.jpg", "1.ply", "0000000000001.npz", "a.glb", "trajectory.txt"
+"""Files of somebody else, with names that dudmap gives."""
 
 
 class Finding(Exception):  # noqa: N818
@@ -41,11 +43,15 @@ class Subject:
         self.home.mkdir(parents=True)
         self.secret = folder / "secret.txt"
         self.secret.write_text(SECRET)
+        self.elsewhere = folder / "elsewhere"
+        self.elsewhere.mkdir()
+        for name in OTHERS:
+            (self.elsewhere / name).write_text(SECRET)
         os.environ["DUDMAP_CACHE"] = str(folder / "cache")
         self.cache = folder / "cache"
         self.path = self.loader.write(self.home)
         self.files = {file: file.read_bytes() for file in sorted(self.home.rglob("*")) if file.is_file()}
-        for file in (*self.files, self.secret):
+        for file in (*self.files, self.secret, *self.elsewhere.iterdir()):
             mark(file)
         self.renamed = []
         self.valid = self.listed()
@@ -63,10 +69,17 @@ class Subject:
             else:
                 file.write_bytes(mutated(rng, file.name, self.files[file]))
                 mark(file)
+        if self.loader.owns and rng.random() < 0.5:
+            put_link(rng, self.path, self.elsewhere)
         return chosen
 
     def restore(self, changed=None):
         """Make the input valid again, where only the files ``changed`` are not (default: any file)."""
+        if self.loader.owns:
+            changed = None
+            shutil.rmtree(self.path)
+            for folder in {file.parent for file in self.files}:
+                folder.mkdir(parents=True, exist_ok=True)
         for path in sorted(self.listed().keys() - self.valid.keys(), reverse=True) if changed is None else ():
             os.rmdir(path) if os.path.isdir(path) and not os.path.islink(path) else os.unlink(path)
         for file in self.renamed:
@@ -121,7 +134,10 @@ class Subject:
             if isinstance(error, KeyboardInterrupt):
                 raise
             raise Finding(f"{type(error).__name__}: {str(error)[:300]}") from error
-        if self.listed() != before:
+        after = self.listed()
+        inside = f"{self.home}{os.sep}" if self.loader.owns else "\0"
+        outside = {name for name in before.keys() | after.keys() if not name.startswith(inside)}
+        if any(before.get(name, 0) != after.get(name, 0) for name in outside):
             raise Finding("a file was written, renamed or removed")
 
     def warm_up(self):

@@ -6,10 +6,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Loader:
-    """``write(folder)`` makes a valid input and returns its path; ``load(path)`` reads everything in it."""
+    """``write(folder)`` makes a valid input and returns its path; ``load(path)`` reads everything in it.
+
+    With ``owns`` it may write into the folder, which links and files of others may lie in, and nowhere else.
+    """
 
     write: Callable
     load: Callable
+    owns: bool = False
 
 
 def check_sentence(error):

@@ -112,3 +112,10 @@ def test_only_the_node_imports_ros_and_the_package_declares_it():
     used = imported("node.py") - {"array", "importlib", "typing", "numpy", "dudmap", "dudmap_ros"}
     declared = {element.text for element in ElementTree.parse(PACKAGE / "package.xml").iter("exec_depend")}
     assert used <= declared
+
+
+def test_the_image_is_made_of_what_the_lock_file_names():
+    text = (PACKAGE / "Dockerfile").read_text(encoding="utf-8")
+    assert "--require-hashes -r /dudmap/requirements/run.txt" in text
+    assert "--no-index --no-build-isolation --no-deps /dudmap" in text
+    assert "FROM ${BASE}" in text

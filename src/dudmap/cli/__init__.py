@@ -63,6 +63,8 @@ class CommandGroup(TyperGroup):
             raise
         except OSError as error:
             fail(f"{error.filename}: {error.strerror}" if error.filename else str(error))
+        except MemoryError as error:
+            fail(not_enough_memory(error))
         except (typer.Exit, typer.Abort, _USAGE):
             raise
         except Exception as error:  # a defect of ours, whatever it is
@@ -71,6 +73,11 @@ class CommandGroup(TyperGroup):
             fail(str(report_crash(error, Path.cwd())))
         except KeyboardInterrupt as interrupt:
             fail(str(interrupt) or "interrupted", code=130)
+
+
+def not_enough_memory(error: MemoryError) -> str:
+    """Sentence on what memory was missing for."""
+    return f"there is not enough memory ({error or 'none is left'}); give the process more, or shorten what it works on"
 
 
 def fail(sentence: str, code: int = 1) -> None:

@@ -83,7 +83,7 @@ def observers(
             say(f"{window.url} shows the run {window.access.notice}", err=True)
         try:
             yield tuple(watching)
-        except (DudmapError, OSError, typer.Exit):
+        except (DudmapError, OSError, MemoryError, typer.Exit):
             raise
         except Exception as error:  # a defect of ours, whatever it is
             raise report_crash(error, events.out or Path.cwd(), events.recent) from error

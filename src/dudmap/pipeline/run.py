@@ -204,7 +204,7 @@ class Job:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
             except BaseException as error:
-                stopped, defect = repr(error), not isinstance(error, OSError)
+                stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
                 raise
             finally:
                 report = self._finish(state, store, stopped, defect=defect)

@@ -8,10 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.errors import DudmapError, StateError
-from dudmap.input_files import DAMAGE, read_json
+from dudmap.input_files import DAMAGE, damaged, read_json
 from dudmap.own_folder import remove_files
 from dudmap.pipeline.environment import versions
 from dudmap.pipeline.metrics import RunRecord
+from dudmap.state import schema
 from dudmap.state.checkpoints import Checkpoints
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
@@ -194,7 +195,12 @@ def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") 
         StateError: The database is damaged.
     """
     current = {"slam": slam, "record": RunRecord(), "finished_slam": other, "finished_record": RunRecord()}
-    return RunState.of_tree(restore(reader, current, store.database, slam.device))
+    tree = restore(reader, current, store.database, slam.device)
+    with damaged(StateError, reader.path):
+        state = RunState.of_tree(tree)
+        if not schema.fits_fields(state):
+            raise ValueError(f"it is no state of a run: {sorted(tree)}")
+        return state
 
 
 def _position(state: RunState, frame: "Frame | Exception") -> dict[str, Any]:

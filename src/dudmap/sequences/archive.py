@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, NamedTuple
+from typing import IO, NamedTuple, cast
 
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged, open_plain, read_bytes
@@ -181,7 +181,7 @@ def _zip_members(path: Path) -> "Generator[Member]":
 def _tar_members(path: Path) -> "Generator[Member]":
     with open_plain(path) as file, _unpacked(file) as content:
         bounded = _Bounded(content)
-        with tarfile.open(fileobj=bounded, mode="r|") as archive:
+        with tarfile.open(fileobj=cast("IO[bytes]", bounded), mode="r|") as archive:
             while (info := archive.next()) is not None:
                 kind = "folder" if info.isdir() else "file" if info.isreg() else "link or device"
                 bounded.left = info.size + LARGEST_HEADER
@@ -189,7 +189,7 @@ def _tar_members(path: Path) -> "Generator[Member]":
                 bounded.left = LARGEST_HEADER
 
 
-def _unpacked(file: IO[bytes]) -> IO[bytes]:
+def _unpacked(file: IO[bytes]) -> "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile":
     """Content of a file that may be packed, which is found by its first bytes."""
     start = file.read(6)
     file.seek(0)
@@ -208,7 +208,7 @@ def _unpacked(file: IO[bytes]) -> IO[bytes]:
 class _Bounded:
     """A stream that ends with an error where the headers of one member take more than ``LARGEST_HEADER`` bytes."""
 
-    def __init__(self, content: IO[bytes]) -> None:
+    def __init__(self, content: "IO[bytes] | gzip.GzipFile | bz2.BZ2File | lzma.LZMAFile") -> None:
         self._content, self.left = content, LARGEST_HEADER
 
     def read(self, size: int) -> bytes:

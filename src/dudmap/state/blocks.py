@@ -16,6 +16,8 @@ from dudmap.mapping.volume import TsdfVolume
 from dudmap.mapping.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
 from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
 
+LARGEST_TABLE = 2**26
+"""Largest number of places of the hash table of a map: that of 50 million blocks."""
 VOXELS = 2 * BLOCK**3
 """Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""
 
@@ -220,7 +222,9 @@ def _check_index(index: dict[str, Any]) -> NDArray[np.int64]:
     if (
         any(a != b for a, b in (*sizes, (len(index["written"]), m), (len(index["fused"]), m)))
         or not np.array_equal(index["slot_of"][index["entry_of"][owned]], owned)
-        or not 0.8 * index["table"] >= n
+        or not isinstance(index["table"], int)
+        or not 0.8 * min(index["table"], LARGEST_TABLE) >= n
+        or index["table"] > LARGEST_TABLE
     ):
         raise StateError("the stored map is damaged: the parts of its index do not fit each other")
     return owned

@@ -7,6 +7,7 @@ write-ahead log makes a checkpoint whole or absent after a crash, and lets other
 
 import hashlib
 import json
+import math
 import sqlite3
 import weakref
 import zlib
@@ -20,7 +21,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import StateError
-from dudmap.input_files import LARGEST_FILE, LARGEST_RATIO, LARGEST_TREE, RATIO_FREE_BYTES, inflated, parse_json
+from dudmap.input_files import (
+    DAMAGE,
+    LARGEST_FILE,
+    LARGEST_RATIO,
+    LARGEST_TREE,
+    RATIO_FREE_BYTES,
+    SAFE_KINDS,
+    inflated,
+    parse_json,
+)
 from dudmap.mapping.block_pager import Region
 from dudmap.mapping.region_store import COLUMNS, blobs_of, records_of
 from dudmap.mapping.voxel_blocks import BlockRecords
@@ -241,11 +251,15 @@ class StateReader:
                 raise ValueError("its checksum is wrong")
             described = parse_json(inflated(packed, LARGEST_TREE), exact=True)
             chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
+            parts = [key for one in described["arrays"] + described["records"] for key in one["chunks"]]
+            total, held = sum(len(chunks[key]) for key in parts), sum(map(len, chunks.values()))
+            if total > max(RATIO_FREE_BYTES, LARGEST_RATIO * held):  # a part may stand in many arrays
+                raise ValueError(f"its arrays have {total} bytes, and {held} are stored")
             arrays = [_array(about, chunks) for about in described["arrays"]]
             texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
             records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
             return described["tree"], arrays, records
-        except (ValueError, KeyError, TypeError, zlib.error, RecursionError) as error:
+        except (*DAMAGE, MemoryError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
 
     def blocks(
@@ -377,10 +391,11 @@ def _block_rows(changed: MapSnapshot) -> Iterable[tuple[int, int, int, bytes]]:
 
 def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
     """An array from its chunks; it may be written."""
-    dtype = np.dtype(about["dtype"])
-    if dtype.hasobject:
-        raise ValueError("an array holds objects")
-    shape = tuple(int(length) for length in about["shape"])
+    dtype, shape = np.dtype(about["dtype"]), tuple(about["shape"])
+    if dtype.kind not in SAFE_KINDS or any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
+        raise ValueError(f"found an array of {dtype} with the shape {shape}; expected numbers or text")
+    if math.prod(shape) * dtype.itemsize != sum(len(chunks[key]) for key in about["chunks"]):
+        raise ValueError(f"an array of {dtype} with the shape {shape} has not the size of its parts")
     data = b"".join(_checked(key, chunks[key]) for key in about["chunks"])
     stored = np.frombuffer(data, np.uint8).view(dtype) if data else np.empty(0, dtype)
     if about["transposed"]:

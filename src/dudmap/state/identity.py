@@ -10,11 +10,17 @@ import numpy as np
 
 from dudmap.errors import FrameError
 from dudmap.pipeline.environment import versions
-from dudmap.state.wiring import PACKAGES
 
 if TYPE_CHECKING:
     from dudmap.frames.frame import Frame
     from dudmap.sequences import Sequence
+
+CODE = (
+    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "gpu", "gpu.kernels",
+    "kernels", "mapper", "mapping", "objects", "pipeline.metrics", "pipeline.storing", "places", "result", "slam",
+    "stage_timer", "state", "tracking",
+)  # fmt: skip
+"""Parts of this package that a state depends on."""
 
 
 @cache
@@ -25,7 +31,7 @@ def code_fingerprint() -> str:
     """
     digest = hashlib.sha256(repr(sorted(versions().items())).encode())
     root = files("dudmap")
-    for part in (*PACKAGES, "gpu", "gpu.kernels", "state", "pipeline.storing"):
+    for part in CODE:
         place = root.joinpath(*part.split("."))
         found = place.iterdir() if place.is_dir() else [root.joinpath(*f"{part.replace('.', '/')}.py".split("/"))]
         for file in sorted(found, key=lambda one: one.name):

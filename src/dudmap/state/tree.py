@@ -3,13 +3,12 @@
 The tree is found by walking through all attributes of all objects, so that no class needs to list what it remembers,
 and an attribute that is added later is stored without further work. What cannot be stored (a thread, an open file, a
 function) is an error unless ``wiring.py`` says how it is made again. Nothing is executed when a tree is read: objects
-are made of the classes of a few packages only, without calling them, and receive their attributes.
+are made of the classes of a table only, without calling them, and receive the attributes that ``schema.py`` allows.
 
 A node is a number, a text, None, or an object with one key that names its kind.
 """
 
 import json
-import sys
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -21,12 +20,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from dudmap.errors import StateError
+from dudmap.input_files import DAMAGE
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.places.frame_file import FrameFile
 from dudmap.places.frame_store import FrameStore
-from dudmap.state import wiring
+from dudmap.state import schema, wiring
 
 if TYPE_CHECKING:
     from dudmap.state.blocks import MapSnapshot, StoredMaps
@@ -131,18 +131,18 @@ class TreeWriter:
                 return {"numbers": self._add(np.array(items, np.int64 if kind is int else np.float64))}
             if kind is np.ndarray and items[0].size <= 64 and len({(a.shape, a.dtype) for a in items}) == 1:
                 return {"stack": self._add(np.stack(items))}
-            if kind.__name__ in wiring.COLUMNS and wiring.is_state_class(kind):
+            if kind.__name__ in wiring.COLUMNS and schema.is_state_class(kind):
                 names = list(wiring.attributes(items[0]))
                 columns = [self._items([getattr(item, name) for item in items], f"{place}.{name}") for name in names]
-                return {"columns": _name(kind), "names": names, "values": columns, "count": len(items)}
+                return {"columns": schema.name_of(kind), "names": names, "values": columns, "count": len(items)}
         return [self._node(item, f"{place}[{n}]") for n, item in enumerate(items)]
 
     def _object(self, value: object, place: str, number: int) -> Node:
         cls = type(value)
-        if not wiring.is_state_class(cls) or not hasattr(value, "__dict__"):
+        if not schema.is_state_class(cls) or not hasattr(value, "__dict__"):
             raise StateError(f"{place} is a {cls.__module__}.{cls.__qualname__}, which cannot be stored")
         evaluated, records = wiring.EVALUATED.get(cls.__name__, ()), wiring.RECORDS.get(cls.__name__, ())
-        node: dict[str, Node] = {"object": _name(cls), "id": number}
+        node: dict[str, Node] = {"object": schema.name_of(cls), "id": number}
         if isinstance(value, TsdfVolume):
             state, changed = self._maps.snapshot(value)
             self.snapshot.maps.append(changed)
@@ -203,6 +203,8 @@ class TreeReader:
         self._arrays, self._records = arrays, records
         self._load_map, self._load_frames, self._make_backend = load_map, load_frames, make_backend
         self._made: dict[int, Any] = {}
+        self._at: list[str] = []  # where the tree is being read
+        self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
         self._taken: set[int] = set()  # identities of the objects of the given system that are in use
 
     def restore(self, node: Node, current: object) -> Any:  # noqa: ANN401
@@ -216,9 +218,21 @@ class TreeReader:
             StateError: The tree is damaged or of another version.
         """
         try:
-            return self._value(node, current)
-        except (KeyError, IndexError, TypeError, ValueError, AttributeError, RecursionError) as error:
-            raise StateError(f"the stored state is damaged: {type(error).__name__} {error}") from error
+            value = self._value(node, current)
+            if not schema.is_alike(value, current):
+                raise ValueError(f"found {type(value).__name__}; expected {type(current).__name__}")
+            return value
+        except (*DAMAGE, MemoryError) as error:
+            place = "".join(["state", *self._at])
+            what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
+            raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
+
+    def _within(self, place: str, node: Node, current: Any = None) -> Any:  # noqa: ANN401
+        """Value of a part of the tree, whose place an error names."""
+        self._at.append(place)
+        value = self._value(node, current)
+        self._at.pop()
+        return value
 
     def _value(self, node: Node, current: Any = None) -> Any:  # noqa: ANN401
         if not isinstance(node, dict):
@@ -229,7 +243,10 @@ class TreeReader:
             usable = type(current).__name__ in wiring.BACKENDS and id(current) not in self._taken
             return self._use(node["backend"], current if usable else self._make_backend())
         if "scalar" in node:
-            return np.dtype(node["scalar"]).type(node["value"])
+            kind = np.dtype(node["scalar"])
+            if kind.kind not in "biuf" or not isinstance(node["value"], bool | int | float):
+                raise ValueError(f"found a {kind} of {type(node['value']).__name__}; expected a number")
+            return kind.type(node["value"])
         if "object" in node:
             return self._object(node, current)
         value = self._leaf(node) if "list" not in node and "dict" not in node and "deque" not in node else None
@@ -249,9 +266,9 @@ class TreeReader:
         if "array" in node:
             return self._arrays[node["array"]]
         if "model" in node:
-            cls = _class(node["model"])
+            cls = schema.class_of(node["model"])
             if not issubclass(cls, BaseModel):
-                raise StateError(f"the stored state is damaged: {cls.__name__} is no configuration")
+                raise ValueError(f"{cls.__name__} is no configuration")
             return cls.model_validate_json(node["json"])
         if "random" in node:
             generator = np.random.default_rng(0)
@@ -262,8 +279,13 @@ class TreeReader:
             future.set_result(self._value(node["result"]))
             return future
         if "tuple" in node:
-            items = [self._value(item) for item in node["tuple"]]
-            return _class(node["class"])(*items) if "class" in node else tuple(items)
+            items = self._items(node["tuple"])
+            if "class" not in node:
+                return tuple(items)
+            cls: Any = schema.class_of(node["class"])
+            if not issubclass(cls, tuple) or len(items) != len(cls._fields):
+                raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
+            return tuple.__new__(cls, items)
         items = self._items(node["frozenset"] if "frozenset" in node else node["set"])
         return frozenset(items) if "frozenset" in node else set(items)
 
@@ -282,41 +304,53 @@ class TreeReader:
             self._made[node["id"]] = value
             keys = self._items(node["dict"])
             known = [current.get(key) for key in keys] if isinstance(current, dict) else []
-            value.update(zip(keys, self._items(node["values"], known), strict=True))
+            content = self._items(node["values"], known)
+            if not all(map(schema.is_alike, content, known or content)):
+                raise ValueError(f"found values of other types than those of {keys}")
+            value.update(zip(keys, content, strict=True))
         return value
 
     def _items(self, node: Node, current: Any = None) -> list[Any]:  # noqa: ANN401
         if isinstance(node, list):
             known = current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
-            return [self._value(item, one) for item, one in zip(node, known, strict=True)]
+            return [self._within(f"[{n}]", item, one) for n, (item, one) in enumerate(zip(node, known, strict=True))]
         if "numbers" in node:
             return self._arrays[node["numbers"]].tolist()
         if "stack" in node:
-            return [row.copy() for row in self._arrays[node["stack"]]]
-        cls = _class(node["columns"])
+            stack = self._arrays[node["stack"]]
+            if len(stack) > schema.LARGEST_COUNT:
+                raise ValueError(f"found {len(stack)} arrays; expected {schema.LARGEST_COUNT} or less")
+            return [row.copy() for row in stack]
+        cls = schema.class_of(node["columns"])
         columns = [self._items(column) for column in node["values"]]
+        schema.check_attributes(cls, dict.fromkeys(node["names"]), {})
         out = []
         for values in zip(*columns, strict=True):
             one = object.__new__(cls)
             for name, value in zip(node["names"], values, strict=True):
+                schema.check_value(cls, name, value, None)
                 object.__setattr__(one, name, value)
             out.append(one)
         return out
 
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
-        cls = _class(node["object"])
+        cls = schema.class_of(node["object"])
         usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
+        if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
+            raise ValueError(f"{cls.__name__} is no class of plain objects")
         value = self._use(node["id"], current if usable else object.__new__(cls))
-        rebuilt = wiring.rebuilt(cls)
         content = node["attributes"]
-        if usable:
-            for name in [name for name in vars(value) if name not in content and name not in rebuilt]:
-                object.__delattr__(value, name)
-        else:
+        like = self._new.setdefault(cls, wiring.attributes(current)) if usable else self._new.get(cls, {})
+        schema.check_attributes(cls, content, like)
+        if not usable:
             for name, default in _defaults(cls).items():
                 object.__setattr__(value, name, default)
         for name, attribute in content.items():
-            object.__setattr__(value, name, self._attribute(attribute, getattr(current, name, None)))
+            self._at.append(f".{name}")
+            made = self._attribute(attribute, getattr(current, name, None))
+            schema.check_value(cls, name, made, like.get(name))
+            object.__setattr__(value, name, made)
+            self._at.pop()
         if "map" in node:
             self._load_map(value, node["map"], self._value(node["blocks"]))
         if "store" in node:
@@ -348,25 +382,10 @@ def _is_frozen(cls: type) -> bool:
     return parameters is not None and parameters.frozen
 
 
-def _name(cls: type) -> str:
-    return f"{cls.__module__}:{cls.__qualname__}"
-
-
 def _class_name(value: object, place: str) -> str:
-    if not wiring.is_state_class(type(value)):
-        raise StateError(f"{place} is a {_name(type(value))}, which cannot be stored")
-    return _name(type(value))
-
-
-def _class(name: str) -> type:
-    """The class of a name, if it is one whose objects may be made from a database."""
-    module, _, path = name.partition(":")
-    found: Any = sys.modules.get(module)
-    for part in path.split("."):
-        found = getattr(found, part, None)
-    if not isinstance(found, type) or not wiring.is_state_class(found):
-        raise StateError(f"the stored state holds a {name!r}, which this version does not know")
-    return found
+    if not schema.is_state_class(type(value)):
+        raise StateError(f"{place} is a {schema.name_of(type(value))}, which cannot be stored")
+    return schema.name_of(type(value))
 
 
 def lines(records: list[Any]) -> str:

@@ -1,12 +1,8 @@
 """What of the objects of a run is not stored as it is: connections, threads, files and buffers that are made anew."""
 
+from functools import cached_property
 from typing import Any
 
-PACKAGES = (
-    "bootstrap", "calibration", "color_calibration", "config", "dynamics", "frames", "geometry", "kernels", "mapper",
-    "mapping", "objects", "pipeline.metrics", "places", "result", "slam", "stage_timer", "tracking",
-)  # fmt: skip
-"""Parts of this package whose classes hold state; no other class is ever made from a database."""
 REBUILT = {
     "Atlas": ("make_volume",),  # a method of Slam
     "BlockPager": (  # the regions have a table
@@ -54,12 +50,6 @@ COLUMNS = frozenset({"TimedPose"})
 """Classes of which many objects stand in one list and nowhere else; they are stored attribute by attribute."""
 
 
-def is_state_class(cls: type) -> bool:
-    """Whether objects of a class may be stored and made from what is stored."""
-    package, _, rest = cls.__module__.partition(".")
-    return package == "dudmap" and any(rest == part or rest.startswith(part + ".") for part in PACKAGES)
-
-
 def rebuilt(cls: type) -> set[str]:
     """Attributes that objects of a class make themselves."""
     return {name for base in cls.__mro__ for name in REBUILT.get(base.__name__, ())}
@@ -70,12 +60,14 @@ def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
 
     Values that ``functools.cached_property`` keeps are left out: they follow from the others.
     """
-    from functools import cached_property
-
-    cls = type(value)
-    left_out = rebuilt(cls)
+    left_out = rebuilt(type(value))
     return {
         name: content
         for name, content in vars(value).items()
-        if name not in left_out and not isinstance(getattr(cls, name, None), cached_property)
+        if name not in left_out and not is_computed(type(value), name)
     }
+
+
+def is_computed(cls: type, name: str) -> bool:
+    """Whether an attribute is one that ``functools.cached_property`` keeps."""
+    return isinstance(getattr(cls, name, None), cached_property)
