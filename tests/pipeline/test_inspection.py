@@ -12,7 +12,7 @@ from dudmap.cli import app
 from dudmap.geometry.calibration import Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.inspection import inspect
+from dudmap.pipeline.inspection import inspect, repeats
 from dudmap.sequences import open_sequence
 from recordings import HEIGHT, WIDTH, color_image, cut, write_recording
 
@@ -40,6 +40,24 @@ def test_what_is_found(recording):
     assert found.ground_truth == 2
     assert found.gaps == []
     assert found.warnings == []
+
+
+def test_rates_are_those_of_distinct_images(recording):
+    """Frames at 10 Hz, of which every second one repeats the depth, and the last both images."""
+    depths, colors = (sorted(recording.glob(kind)) for kind in ("depth/*.png", "rgb/*.png"))
+    for old, new in ((0, 1), (2, 3), (4, 5)):
+        depths[new].write_bytes(depths[old].read_bytes())
+    colors[5].write_bytes(colors[4].read_bytes())
+    sequence = open_sequence(recording)
+    found = inspect(sequence)
+    assert found.distinct_rate("depth") is None  # not looked at
+    found.repeats = repeats(sequence)
+    assert found.repeats == pytest.approx({"frame": 1 / 5, "depth": 2 / 5, "color": 0})
+    assert found.distinct_rate("depth") == pytest.approx(10 * (1 - 3 / 5))
+    assert found.distinct_rate("color") == pytest.approx(10 * (1 - 1 / 5))
+    said = " ".join(call("info", recording).stdout.split())
+    assert "about 4 Hz depth, 8 Hz colour; 20% of the frames repeat both images, 40% of the frames repeat depth" in said
+    assert "times from the recording" in said
 
 
 def warnings(sequence):

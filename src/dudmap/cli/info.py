@@ -37,13 +37,14 @@ def info(
     from rich.table import Table
 
     from dudmap.pipeline.contact_sheet import save_overview
-    from dudmap.pipeline.inspection import inspect, sample
+    from dudmap.pipeline.inspection import inspect, repeats, sample
     from dudmap.sequences import open_sequence
     from dudmap.terminal import plain_console
 
     recording = open_sequence(path, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     frames, unreadable = sample(recording)
     found = inspect(recording, frames, unreadable)
+    found.repeats = repeats(recording)
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:
@@ -70,6 +71,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         ("recording", found.name),
         ("format", found.format),
         ("frames", f"{found.frames} in {found.duration:.2f} s" + (f", {', '.join(rates)}" if rates else "")),
+        ("distinct images", _distinct(found)),
         ("depth camera", _camera(found.camera)),
         ("colour camera", "the same, registered" if registered else _camera(found.color_camera)),
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
@@ -78,6 +80,15 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         ("ground truth", f"{found.ground_truth} poses" if found.ground_truth else "none"),
         ("gaps", _gaps(found)),
     ]
+
+
+def _distinct(found: "Inspection") -> str:
+    depth, color = found.distinct_rate("depth"), found.distinct_rate("color")
+    if depth is None or color is None:
+        return "not known"
+    what = {"frame": "both images", "depth": "depth alone", "color": "colour alone"}
+    said = [f"{share:.0%} of the frames repeat {what[kind]}" for kind, share in found.repeats.items() if share]
+    return f"about {depth:.4g} Hz depth, {color:.4g} Hz colour" + (f"; {', '.join(said)}" if said else "")
 
 
 def _camera(camera: dict[str, Any]) -> str:

@@ -141,11 +141,7 @@ class StreamCheck:
     def _compare_with_last(self, observation: Observation) -> Repeats:
         """What a frame repeats of the last one that arrived."""
         before, self._before = self._before, (observation.depth, observation.as_recorded.color)
-        if before is None:
-            return ""
-        depth = _equal(before[0], observation.depth) and bool(observation.depth.any())
-        color = _equal(before[1], observation.as_recorded.color)
-        return "frame" if depth and color else "depth" if depth else "color" if color else ""
+        return "" if before is None else repeated(before, self._before)
 
     def _changed_unit(self, observation: Observation) -> Rejection | None:
         depth, stamp = observation.depth[::STRIDE, ::STRIDE].copy(), observation.timestamp
@@ -161,6 +157,15 @@ class StreamCheck:
             self._unit = 0.0
             return None
         return Rejection("unit", f"all depths changed by the factor {np.exp(self._unit):.3g} at once: another unit")
+
+
+def repeated(
+    before: tuple[NDArray[np.float32], NDArray[np.uint8]], after: tuple[NDArray[np.float32], NDArray[np.uint8]]
+) -> Repeats:
+    """What the images (depth, colour) of a frame repeat of the one before; a depth image without readings does not."""
+    depth = _equal(before[0], after[0]) and bool(after[0].any())
+    color = _equal(before[1], after[1])
+    return "frame" if depth and color else "depth" if depth else "color" if color else ""
 
 
 def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach: float) -> float:

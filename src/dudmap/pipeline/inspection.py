@@ -34,6 +34,8 @@ SLOW, FAST = 1.0, 0.001
 """Median time between frames, seconds, beyond which the times are in another unit, or not of one camera."""
 LATE = 0.015
 """Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
+RUN = 6
+"""Number of frames in a row that are compared with each other at every sampled place."""
 SCALES = (1.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
 """Depth scales in use, units per metre, of which one is proposed where the given one is implausible."""
 USUAL = (0.4, 8.0)
@@ -59,6 +61,8 @@ class Inspection:
         valid_depth: Share of pixels with a reading.
         unreadable: Reasons of the sampled frames that cannot be read.
         ground_truth: Number of true poses, 0 without.
+        repeats: Shares of the frames that repeat the one before: both images (``frame``), or ``depth`` or ``color``
+            alone; empty where they were not compared.
         warnings: Sentences on what looks wrong.
     """
 
@@ -78,7 +82,15 @@ class Inspection:
     valid_depth: float
     ground_truth: int
     unreadable: list[str] = field(default_factory=list)
+    repeats: dict[str, float] = field(default_factory=dict)
     warnings: list[str] = field(default_factory=list)
+
+    def distinct_rate(self, stream: str) -> float | None:
+        """Images per second of the ``depth`` or ``color`` stream without those that repeat the one before; None where
+        that is not known."""
+        if self.rate is None or not self.repeats:
+            return None
+        return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
 
     def tree(self) -> dict[str, Any]:
         """Nested dictionary of numbers, lists and words, for JSON."""
@@ -94,6 +106,30 @@ def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int,
         except FrameError as error:
             unreadable.append(str(error))
     return frames, unreadable
+
+
+def repeats(sequence: "Sequence") -> dict[str, float]:
+    """Shares of the frames whose images are bit for bit those of the frame before, by what repeats: ``frame``,
+    ``depth`` or ``color``; from RUN frames in a row at SAMPLES places. Empty where no two can be read."""
+    from dudmap.frames.stream_check import repeated
+
+    counts, pairs = {"frame": 0, "depth": 0, "color": 0}, 0
+    last = max(0, len(sequence) - RUN)
+    for start in np.unique(np.linspace(0, last, SAMPLES).astype(int)):
+        before = None
+        for index in range(start, min(start + RUN, len(sequence))):
+            try:
+                frame = sequence[index]
+            except FrameError:
+                before = None
+                continue
+            if before is not None:
+                pairs += 1
+                kind = repeated((before.depth, before.color), (frame.depth, frame.color))
+                if kind:
+                    counts[kind] += 1
+            before = frame
+    return {kind: count / pairs for kind, count in counts.items()} if pairs else {}
 
 
 def inspect(
