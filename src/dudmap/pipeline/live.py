@@ -1,4 +1,4 @@
-"""A live run: frames of a camera are processed as they arrive, those dropped are counted, all are recorded if wanted."""
+"""A live run: frames of a camera are processed as they come, those dropped are counted, all recorded if wanted."""
 
 from collections.abc import Callable, Generator
 from contextlib import closing
@@ -21,6 +21,7 @@ from dudmap.pipeline.run_folder import RunReport, locked, prepare_run_folder, wr
 if TYPE_CHECKING:
     from dudmap.geometry.calibration import Calibration
     from dudmap.pipeline.observer import RunObserver
+    from dudmap.slam import Slam
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream begins."""
