@@ -138,13 +138,15 @@ class _Excerpt:
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
-        self._sequence, self._halvings, self._count = sequence, halvings, count
+        self._sequence, self._halvings = sequence, halvings
+        self.name, self.ground_truth = sequence.name, None
         self._step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
+        self.timestamps = sequence.timestamps[: count : self._step]
         self.camera = sequence.camera.scaled(halvings)
         self.calibration = replace(given, camera=given.camera.scaled(halvings))
 
     def __len__(self) -> int:
-        return -(-self._count // self._step)
+        return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
         frame, backend = self._sequence[self._step * index], CpuBackend()
