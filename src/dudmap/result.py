@@ -1,6 +1,6 @@
 """Result of processing one frame."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Literal
 
@@ -36,7 +36,7 @@ class FrameResult:
         tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
         relocalized: Whether the pose comes from a recognised place after tracking was lost.
-        movers: Moving objects, by id; none in a lost frame.
+        find_movers: Finds the moving objects.
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
@@ -63,7 +63,7 @@ class FrameResult:
     tracking: TrackingResult | None
     timings: dict[str, float] = field(default_factory=dict)
     relocalized: bool = False
-    movers: tuple[Mover, ...] = ()
+    find_movers: Callable[[], tuple[Mover, ...]] = tuple
     submap: int = 0
     corrected: bool = False
     blind: bool = False
@@ -73,3 +73,8 @@ class FrameResult:
     repeats: Repeats = ""
     checks: Mapping[str, float] = field(default_factory=dict)
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+
+    @property
+    def movers(self) -> tuple[Mover, ...]:
+        """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""
+        return self.find_movers()

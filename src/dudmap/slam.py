@@ -1,7 +1,7 @@
 """The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Unpack
 
@@ -220,13 +220,13 @@ class Slam(SlamResults):
             fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
         mask = self._dynamic_mask(view, estimate)
         self._learn_noise(view, estimate, mask)
-        movers = self.objects.update(view, estimate)
+        find_movers = self.objects.update(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, movers=movers, uncertain=uncertain, calibrated=calibrated,
+            corrected=corrected, find_movers=find_movers, uncertain=uncertain, calibrated=calibrated,
             checks=verdict.figures,
         )  # fmt: skip
 
@@ -392,7 +392,7 @@ class Slam(SlamResults):
         fused: bool = False,
         relocalized: bool = False,
         corrected: bool = False,
-        movers: tuple[Mover, ...] = (),
+        find_movers: Callable[[], tuple[Mover, ...]] = tuple,
         uncertain: str = "",
         calibrated: bool = False,
         checks: Mapping[str, float] | None = None,
@@ -409,14 +409,14 @@ class Slam(SlamResults):
             dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
             residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
             labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
-            relocalized=relocalized, movers=movers, submap=self.atlas.current, corrected=corrected, blind=view.blind,
-            uncertain=uncertain, calibrated=calibrated,
+            relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,
+            blind=view.blind, uncertain=uncertain, calibrated=calibrated,
             unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
             repeats=self.stream.repeats, rejected=rejected,
         )  # fmt: skip
         if not rejected:
             self._last = replace(
-                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, movers=(),
+                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, find_movers=tuple,
                 corrected=False, blind=False, calibrated=False, uncertain="", checks={},
             )  # fmt: skip
         return result

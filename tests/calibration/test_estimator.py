@@ -9,7 +9,7 @@ from dudmap.calibration.adjustment import Adjustment, _State
 from dudmap.calibration.collector import KeyframeCollector
 from dudmap.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
 from dudmap.calibration.pairs import Pair
-from dudmap.config import PreprocessConfig, SensorConfig
+from dudmap.config import Config, PreprocessConfig, SensorConfig
 from dudmap.frames.color_registration import color_projection
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
@@ -17,6 +17,7 @@ from dudmap.geometry import se3
 from dudmap.geometry.calibration import PARAMETERS, Calibration
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.cpu import CpuBackend
+from dudmap.pipeline.calibration import _enlarged, _Excerpt, calibrate_sequence
 
 CAMERA = Camera(130.0, 130.0, 79.5, 59.5, 160, 120)
 FPS, FRAMES = 30.0, 80
@@ -124,6 +125,56 @@ def test_what_is_wrong_is_found_and_what_is_right_stays(name):
         assert not result.calibration.estimated
         assert result.calibration.is_registered(CAMERA)
     assert np.all(np.isfinite(result.calibration.sigma))
+
+
+class Walls:
+    """A recording of the walls, which remembers what was read."""
+
+    name, camera, calibration, ground_truth = "walls", CAMERA, None, None
+    timestamps = np.arange(FRAMES) / FPS
+
+    def __init__(self, truth: Calibration) -> None:
+        self.truth, self.read = truth, []
+
+    def __len__(self) -> int:
+        return FRAMES
+
+    def __getitem__(self, index: int) -> Frame:
+        self.read.append(index)
+        return record(self.truth, index)
+
+
+def test_a_recording_is_calibrated_in_one_quick_pass():
+    step = np.array([STEPS["place"].get(key, 0.0) for key in PARAMETERS])
+    truth, said = Calibration.registered(CAMERA).retract(step), []
+    walls = Walls(truth)
+    found = calibrate_sequence(walls, Config(), Calibration.registered(CAMERA), notice=said.append).calibration
+    assert walls.read == list(range(0, FRAMES, 2))
+    assert "log_focal" in found.estimated
+    assert displacement(found, truth) < 0.5 < displacement(Calibration.registered(CAMERA), truth) / 5
+    assert len(said) == 2
+
+
+def test_the_images_of_the_quick_pass_are_halved_and_its_result_is_for_whole_ones():
+    whole = replace(CAMERA, fx=520.0, fy=520.0, cx=318.5, cy=238.0, width=640, height=480)
+    given = Calibration(replace(whole, fx=500.0, cx=322.0), np.eye(4), 0.01)
+    depth, color = np.full((480, 640), 2.0, np.float32), np.zeros((480, 640, 3), np.uint8)
+    depth[:, 320:], color[:, 320:] = 3.0, 200
+    whole_sequence = Walls(given)
+    whole_sequence.camera = whole
+    excerpt = _Excerpt(whole_sequence, given, 1, 5)
+    excerpt._sequence = [Frame(n / FPS, depth, color) for n in range(5)]
+    assert len(excerpt) == 3
+    frame = excerpt[2]
+    assert frame.timestamp == 4 / FPS
+    assert (frame.depth == depth[::2, ::2]).all()
+    assert (frame.color == color[::2, ::2]).all()
+    u = 401.0  # a column of the whole image, which lies at (u - 0.5) / 2 in the halved one
+    ray = ((u - 0.5) / 2 - excerpt.camera.cx) / excerpt.camera.fx
+    assert ray == pytest.approx((u - whole.cx) / whole.fx)
+    found = _enlarged(replace(excerpt.calibration, sigma=np.ones(13)), given.camera, 1)
+    assert found.camera == given.camera
+    assert found.sigma.tolist() == [2.0 if name.startswith("center") else 1.0 for name in PARAMETERS]
 
 
 class Explained:

@@ -11,6 +11,7 @@ from dudmap.config import Config, MoversConfig
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
+from dudmap.objects.moving_objects import MOST_WAITING, MovingObjects
 from dudmap.objects.object_tracker import ObjectTracker
 from dudmap.pipeline.metrics import RunRecord
 from dudmap.slam import Slam
@@ -164,6 +165,41 @@ def test_lines_of_the_file(tmp_path):
     assert set(row) == {"id", "centroid", "box", "velocity", "speed", "age", "pixels"}
     assert row["pixels"] == mask.sum()
     np.testing.assert_allclose(row["centroid"], [0.3, 0, 2], atol=0.01)
+
+
+def test_movers_are_found_when_they_are_asked_for():
+    objects, direct, asked = MovingObjects(Config()), ObjectTracker(MoversConfig()), []
+    update = objects.tracker.update
+    objects.tracker.update = lambda timestamp, *rest: asked.append(timestamp) or update(timestamp, *rest)
+    images = [board(0.01 * k) for k in range(MOST_WAITING + 5)]
+    finders = [
+        objects.update(
+            SimpleNamespace(timestamp=k / 30, labelled=level),
+            SimpleNamespace(labels=SimpleNamespace(dynamic=mask), T_world_camera=np.eye(4)),
+        )
+        for k, (mask, level) in enumerate(images)
+    ]
+    assert len(asked) == 5, "those of more frames would have to wait"
+    found = [movers() for movers in reversed(finders)][::-1]
+    assert asked == [k / 30 for k in range(len(images))]
+    for k, (mask, level) in enumerate(images):
+        (expected,) = direct.update(k / 30, mask, level, np.eye(4))
+        assert found[k][0].id == expected.id
+        assert found[k][0].velocity.tolist() == expected.velocity.tolist()
+
+
+def test_a_live_run_adds_movers_when_there_is_time():
+    record = RunRecord(dropped=0)
+    result = SimpleNamespace(
+        timestamp=1.5, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
+        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="",
+        movers=(),
+    )  # fmt: skip
+    record.add(result, 1.0, 1.0, None)
+    assert "movers" not in record.rows[0]
+    assert record.catch_up()
+    assert record.rows[0]["movers"] >= 0
+    assert not record.catch_up()
 
 
 def test_a_walking_person_in_the_whole_system():

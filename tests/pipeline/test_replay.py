@@ -101,6 +101,22 @@ def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
     assert isinstance(arrivals[0], Arrival)
 
 
+def test_other_work_is_done_while_no_frame_waits():
+    done, left = [], [True] * 3
+
+    def idle():
+        done.append(arrived[-1] if arrived else None)
+        return bool(left and left.pop())
+
+    arrived = []
+    for arrival in live(0.1 * np.arange(4), str, idle):
+        arrived.append(arrival.number)
+        time.sleep(0.25 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
+    assert arrived == [0, 1, 2, 3]
+    assert not left
+    assert 1 not in done
+
+
 def test_stopping_early_stops_the_sensor():
     before = threading.active_count()
     frames = live(np.array([0.0, 60.0]), str)

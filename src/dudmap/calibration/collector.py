@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.calibration.keyframes import ColorKeyframe, keyframe, velocity_at
+from dudmap.calibration.keyframes import ColorKeyframe, central_velocity, keyframe
 from dudmap.frames.observation import Observation
 from dudmap.geometry.camera import Camera
 
@@ -11,10 +11,8 @@ INTERVAL = 0.1
 """Time between two keyframes at the start, seconds."""
 MAX_KEYFRAMES = 60
 """Largest number of keyframes; beyond it every second one is dropped and the interval doubles."""
-MAX_GAP = 0.1
-"""Largest mean time from frame to frame for the velocity of a keyframe to be known, seconds."""
-NEIGHBOURS = 2
-"""Frames before and after a keyframe from whose poses its velocity is estimated."""
+MAX_GAP = 0.2
+"""Largest time between the two neighbours of a keyframe for its velocity to be known, seconds."""
 
 
 class KeyframeCollector:
@@ -31,35 +29,35 @@ class KeyframeCollector:
         self.color_camera = color_camera
         self.keyframes: list[ColorKeyframe] = []
         self._interval = INTERVAL
-        self._poses: list[tuple[float, NDArray[np.float64]]] = []  # of the latest frames, and the images of those
-        self._waiting: list[tuple[Observation, NDArray[np.bool_]]] = []  # that may still become keyframes
+        self._before: tuple[float, NDArray[np.float64]] | None = None
+        self._pending: tuple[Observation, NDArray[np.float64], NDArray[np.bool_]] | None = None
 
     def add(
         self, observation: Observation, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_]
     ) -> None:
-        """Take note of a tracked frame; an earlier one may become a keyframe, since its velocity is now known.
+        """Take note of a tracked frame; the one before may become a keyframe, since its velocity is now known.
 
         Args:
             observation: The frame.
             T_world_camera: (4, 4) pose.
             dynamic_mask: (H, W) bool, pixels that move.
         """
-        self._poses = [*self._poses, (observation.timestamp, T_world_camera)][-2 * NEIGHBOURS - 1 :]
-        self._waiting = [*self._waiting, (observation, dynamic_mask)][-NEIGHBOURS - 1 :]
-        times, poses = zip(*self._poses, strict=True)
-        steady = times[-1] - times[0] <= 2 * NEIGHBOURS * (MAX_GAP + 1e-3)
-        middle, mask = self._waiting[0]
-        if len(times) <= 2 * NEIGHBOURS or not steady or not self._is_due(middle.timestamp):
-            return
-        velocity = velocity_at(NEIGHBOURS, times, poses)
-        self.keyframes.append(keyframe(middle, self.color_camera, poses[NEIGHBOURS], velocity, mask))
-        if len(self.keyframes) > MAX_KEYFRAMES:
-            del self.keyframes[1::2]
-            self._interval *= 2
+        now = observation.timestamp
+        if self._pending is not None:
+            middle, T, mask = self._pending
+            before = self._before
+            if before is not None and now - before[0] <= MAX_GAP and self._is_due(middle.timestamp):
+                velocity = central_velocity(before, (now, T_world_camera))
+                self.keyframes.append(keyframe(middle, self.color_camera, T, velocity, mask))
+                if len(self.keyframes) > MAX_KEYFRAMES:
+                    del self.keyframes[1::2]
+                    self._interval *= 2
+            self._before = middle.timestamp, T
+        self._pending = observation, T_world_camera, dynamic_mask
 
     def interrupt(self) -> None:
         """Tracking was lost, or the poses jumped: the velocity across is not known."""
-        self._poses, self._waiting = [], []
+        self._before = self._pending = None
 
     def clear(self) -> None:
         """Another map has begun, whose poses cannot be compared."""

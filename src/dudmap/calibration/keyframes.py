@@ -1,6 +1,5 @@
 """Frames from which the calibration is estimated."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,9 +15,8 @@ GEOMETRY_WIDTH = 160
 """Width of the depth images that are compared, pixels."""
 COLOR_WIDTHS = (80, 160, 320)
 """Widths of the colour images that are compared, coarse to fine, pixels."""
-POINT_STRIDE = 4
-"""Every so many pixels, across and down, are points that are compared: nearer ones err together, and with every third
-pixel the estimates differ by less than their standard deviations."""
+POINT_STRIDE = 3
+"""Every so many pixels, across and down, are points that are compared."""
 SAME_SURFACE = 0.03
 """Depth differences below this share of the depth belong to one surface."""
 
@@ -118,15 +116,8 @@ def _off_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
     return out
 
 
-def velocity_at(
-    middle: int, times: Sequence[float], Ts_world_camera: Sequence[NDArray[np.float64]]
+def central_velocity(
+    before: tuple[float, NDArray[np.float64]], after: tuple[float, NDArray[np.float64]]
 ) -> NDArray[np.float64]:
-    """Twist per second (6,), camera axes, at one of several frames: slope of the polynomial through their poses.
-
-    With two neighbours on either side it is exact to the fourth order in time. The mean over both neighbours, 67 ms
-    away, is 10 % too small for a hand that shakes twice a second, and a delay would be found as much too long.
-    """
-    t = np.asarray(times) - times[middle]
-    slope = np.linalg.inv(np.vander(t, increasing=True))[1]
-    to_middle = se3.inverse(Ts_world_camera[middle])
-    return slope @ np.array([se3.log(to_middle @ T) for T in Ts_world_camera])
+    """Twist per second (6,), camera axes, between two (time, pose) around a frame."""
+    return se3.log(se3.inverse(before[1]) @ after[1]) / max(after[0] - before[0], 1e-3)

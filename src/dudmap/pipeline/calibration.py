@@ -33,7 +33,8 @@ estimator compares pairs of keyframes from both halves of the time."""
 
 WIDTH, INTERVAL = 320, 1 / 15
 """Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
-at most 320 wide, and their largest interval (s), which the velocity of a hand-held camera needs."""
+at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
+noise of the poses and more of the camera's shaking enter, the longer they are."""
 VOXEL_SIZE = 0.02
 """Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
 
@@ -124,7 +125,6 @@ def _quick(config: Config, halvings: int) -> Config:
     preprocess = config.preprocess
     return config.override([
         "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
-        "tracker.widths=[80, 160]", "tracker.iterations=[8, 6]",
         f"volume.voxel_size={max(config.volume.voxel_size, VOXEL_SIZE)}",
         f"preprocess.filter_sigma_px={preprocess.filter_sigma_px / (1 << halvings)}",
         f"preprocess.filter_radius={max(1, preprocess.filter_radius >> halvings)}",
@@ -141,13 +141,15 @@ class _Excerpt:
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
-        self._sequence, self._halvings, self._count = sequence, halvings, count
+        self._sequence, self._halvings = sequence, halvings
+        self.name, self.ground_truth = sequence.name, None
         self._step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
+        self.timestamps = sequence.timestamps[: count : self._step]
         self.camera = sequence.camera.scaled(halvings)
         self.calibration = replace(given, camera=given.camera.scaled(halvings))
 
     def __len__(self) -> int:
-        return -(-self._count // self._step)
+        return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
         frame, backend = self._sequence[self._step * index], CpuBackend()

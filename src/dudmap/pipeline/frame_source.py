@@ -88,14 +88,15 @@ def in_order(
 
 
 def in_real_time(
-    sequence: "Sequence", count: int, masks: "MaskFolder | None", slam: "Slam"
+    sequence: "Sequence", count: int, masks: "MaskFolder | None", slam: "Slam", idle: Callable[[], bool]
 ) -> "Generator[SourceFrame]":
     """Frames of a recording at the rate of the sensor, prepared by the thread that reads them; dropped where there is
-    no time."""
+    no time. For ``idle`` see ``replay.arrivals``."""
     from dudmap.pipeline.replay import live
 
     last = -1
-    with closing(live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks, slam))) as arrivals:
+    frames = live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks, slam), idle)
+    with closing(frames) as arrivals:
         for arrival in arrivals:
             yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
             last = arrival.number

@@ -77,7 +77,7 @@ def run_live(
                 first.process(frame)
             for observer in observers:
                 observer.start(slam, out, None)
-            with closing(_arriving_frames(camera, recorder, slam)) as frames:
+            with closing(_arriving_frames(camera, recorder, slam, metrics.catch_up)) as frames:
                 for source in frames:
                     process_source(source, slam, metrics, display, out if save_masks else None, None, observers)
                     if max_frames is not None and len(metrics.rows) >= max_frames:
@@ -108,9 +108,11 @@ def run_live(
     return report
 
 
-def _arriving_frames(camera: LiveCamera, recorder: Recorder | None, slam: "Slam") -> Generator[SourceFrame]:
+def _arriving_frames(
+    camera: LiveCamera, recorder: Recorder | None, slam: "Slam", idle: Callable[[], bool]
+) -> Generator[SourceFrame]:
     """Frames of the camera, prepared by the thread that takes them; all that arrive are recorded, those for which there
-    is no time are dropped."""
+    is no time are dropped. For ``idle`` see ``replay.arrivals``."""
 
     def deliver(put: Callable[[Arrival[FrameRead]], None], wait: Callable[[float], bool]) -> None:
         start, latest = None, -np.inf
@@ -125,7 +127,7 @@ def _arriving_frames(camera: LiveCamera, recorder: Recorder | None, slam: "Slam"
             put(Arrival(arrived.number - start, prepared(arrived.frame, slam), arrived.time))
 
     last = -1
-    with closing(arrivals(deliver, camera.close)) as delivered:
+    with closing(arrivals(deliver, camera.close, idle)) as delivered:
         for arrival in delivered:
             yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
             last = arrival.number

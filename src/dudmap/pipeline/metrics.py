@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file, write_text
 from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
+from dudmap.objects.moving_objects import MOST_WAITING
 from dudmap.pipeline.environment import peak_rss_mb
 
 if TYPE_CHECKING:
@@ -36,6 +37,7 @@ class RunRecord:
         mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
+        postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
         fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
         degenerate: Number of tracked frames with unobservable directions of motion.
         masked: Number of frames with an external mask, None without external masks.
@@ -51,6 +53,7 @@ class RunRecord:
     mask_ious: list[float] = field(default_factory=list)
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
+    postponed: "list[tuple[dict[str, Any], FrameResult]]" = field(default_factory=list)
     fused: int = 0
     skipped_similar: int = 0
     relocalized: int = 0
@@ -89,7 +92,7 @@ class RunRecord:
             delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
                 arrival to the result, ms.
         """
-        self.rows.append(
+        row: dict[str, Any] = (
             {
                 "timestamp": f"{result.timestamp:.6f}",
                 "state": result.state,
@@ -101,6 +104,7 @@ class RunRecord:
             | {key: round(value, 3) for key, value in delays.items()}
             | {stage: round(ms, 3) for stage, ms in result.timings.items()}
         )
+        self.rows.append(row)
         self.fused += result.fused
         self.skipped_similar += result.skipped_similar
         self.relocalized += result.relocalized
@@ -117,13 +121,28 @@ class RunRecord:
             self.checks.append({"timestamp": f"{result.timestamp:.6f}", "state": result.state} | known)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
-        if result.movers:
-            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]}
-            self.movers.append(json.dumps(line))
+        self.postponed.append((row, result))
+        if self.dropped is None or len(self.postponed) > MOST_WAITING:
+            self.catch_up()
         if result.labels is not None:
             self.residuals = self.residuals + result.labels.histogram
         if mask is not None and mask.mean() > SCORED_COVERAGE:
             self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
+
+    def catch_up(self) -> bool:
+        """Add the moving objects of the first frame that lacks them; returns whether one did."""
+        if not self.postponed:
+            return False
+        (row, result), start = self.postponed.pop(0), time.perf_counter()
+        if result.movers:
+            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]}
+            self.movers.append(json.dumps(line))
+        row["movers"] = round(1000 * (time.perf_counter() - start), 3)
+        return True
+
+    def _complete(self) -> None:
+        while self.catch_up():
+            pass
 
     def skip(self, error: "FrameError") -> None:
         """Count a frame that cannot be read or used."""
@@ -135,6 +154,7 @@ class RunRecord:
 
     def save_timings(self, path: Path) -> None:
         """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
+        self._complete()
         _write_table(path, self.rows, "0")
 
     def save_checks(self, path: Path) -> None:
@@ -143,6 +163,7 @@ class RunRecord:
 
     def save_movers(self, path: Path) -> None:
         """Write JSON lines, one per frame with moving objects."""
+        self._complete()
         write_text(path, "".join(f"{line}\n" for line in self.movers))
 
     def save_residuals(self, path: Path) -> None:

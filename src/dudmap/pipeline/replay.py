@@ -40,6 +40,11 @@ class WaitingRoom(Generic[T]):
         self._held: list[T] = []
         self._closed = False
 
+    @property
+    def is_empty(self) -> bool:
+        """Whether no item waits."""
+        return not self._held
+
     def put(self, item: T) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
@@ -88,18 +93,21 @@ def replay(
         index += 1
 
 
-def live(timestamps: NDArray[np.float64], read: Callable[[int], T]) -> Generator[Arrival[T]]:
+def live(
+    timestamps: NDArray[np.float64], read: Callable[[int], T], idle: Callable[[], bool] = lambda: False
+) -> Generator[Arrival[T]]:
     """Replay a recording in real time; each step yields the next frame that has arrived.
 
     Frames for which the consumer leaves no room are dropped, which leaves a gap in ``Arrival.number``. The last frame
-    is always yielded.
+    is always yielded. For ``idle`` see ``arrivals``.
     """
-    return arrivals(lambda put, wait: replay(timestamps, read, put, wait))
+    return arrivals(lambda put, wait: replay(timestamps, read, put, wait), idle=idle)
 
 
 def arrivals(
     deliver: Callable[[Callable[[Arrival[T]], None], Callable[[float], bool]], None],
     stop: Callable[[], None] | None = None,
+    idle: Callable[[], bool] = lambda: False,
 ) -> Generator[Arrival[T]]:
     """Items that a sensor delivers; those for which the consumer leaves no room (``WaitingRoom``) are dropped.
 
@@ -107,6 +115,7 @@ def arrivals(
         deliver: Runs in a thread of its own and passes every item to its first argument. Its second argument waits for
             at most the given number of seconds and returns True to stop.
         stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
+        idle: Called while no item waits; does a few milliseconds of other work and returns True, or has none.
     """
     waiting: WaitingRoom[Arrival[T]] = WaitingRoom()
     stopping = threading.Event()
@@ -120,7 +129,11 @@ def arrivals(
     with ThreadPoolExecutor(1, thread_name_prefix="dudmap-sensor") as thread:
         future = thread.submit(sensor)
         try:
-            while (arrival := waiting.take()) is not None:
+            while True:
+                while waiting.is_empty and idle():
+                    pass
+                if (arrival := waiting.take()) is None:
+                    break
                 yield arrival
             future.result()
         finally:

@@ -232,7 +232,7 @@ class Job:
                 else:
                     observer.start(state.slam, self.out, self.count)
             with closing(
-                in_real_time(self.sequence, self.count, self.masks, state.slam)
+                in_real_time(self.sequence, self.count, self.masks, state.slam, state.record.catch_up)
                 if self.live
                 else in_order(self.sequence, self.count, self.ahead, self.masks, state.slam, state.next)
             ) as frames:
