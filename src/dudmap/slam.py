@@ -416,8 +416,8 @@ class Slam(SlamResults):
         )  # fmt: skip
         if not rejected:
             self._last = replace(
-                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, find_movers=tuple,
-                corrected=False, blind=False, calibrated=False, uncertain="", checks={},
+                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False,
+                find_movers=tuple, corrected=False, blind=False, calibrated=False, uncertain="", checks={},
             )  # fmt: skip
         return result
 

@@ -1,6 +1,7 @@
 """What recordings of iPhones have beyond the tests of all formats: videos, confidence, two sets of cameras."""
 
 import shutil
+import struct
 
 import cv2
 import numpy as np
@@ -8,6 +9,7 @@ import pytest
 
 from dudmap.errors import DatasetError, FrameError
 from dudmap.sequences import open_sequence
+from dudmap.sequences.video import Video
 from layouts import arkit_scenes, color, polycam, stray_scanner, write
 
 
@@ -20,6 +22,38 @@ def test_frames_of_a_video_in_any_order(tmp_path):
     sequence = open_sequence(write(stray_scanner, tmp_path / "a")[0])
     for index in (2, 2, 0, 1, 0, 2):
         assert red(sequence[index]) == pytest.approx(10 * index, abs=4)
+
+
+def write_video(path, frames, pause):
+    """MP4 file; with ``pause`` its 100th frame lasts twice as long, by more entries in its box stts (ISO 14496-12)."""
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 60, (64, 48))
+    for k in range(frames):
+        writer.write(np.roll(color(k % 7), 5 * k, axis=1))
+    writer.release()
+    data = path.read_bytes()
+    at = data.index(b"stts") - 4
+    count, step = struct.unpack_from(">II", data, at + 16)
+    assert (count, data.index(b"moov") > data.index(b"mdat")) == (frames, True), "no offset changes then"
+    if pause:
+        table = struct.pack(">I4sIIIIIIII", 40, b"stts", 0, 3, 99, step, 1, 2 * step, frames - 100, step)
+        new = bytearray(data[:at] + table + data[at + 24 :])
+        for box in (b"moov", b"trak", b"mdia", b"minf", b"stbl"):
+            place = data.index(box) - 4
+            struct.pack_into(">I", new, place, struct.unpack_from(">I", data, place)[0] + 16)
+        path.write_bytes(new)
+    return Video(path)
+
+
+@pytest.mark.parametrize("pause", [False, True])
+def test_far_frames_of_a_video_are_those_of_decoding_all(tmp_path, pause):
+    everything = write_video(tmp_path / "a.mp4", 200, pause)
+    frames = [everything[k] for k in range(200)]
+    video = Video(tmp_path / "a.mp4")
+    for k in (150, 20, 199, 0, 100, 101, 99):
+        np.testing.assert_array_equal(video[k], frames[k])
+    assert video._constant is not pause
+    with pytest.raises(FrameError, match="has no frame 200"):
+        video[200]
 
 
 def test_a_video_that_ends_too_early_costs_only_the_frames_it_lacks(tmp_path):

@@ -14,11 +14,18 @@ MARK = b"ftyp"
 """Bytes 4 to 8 of an MP4 file. Without this check the decoder guesses the format, and playlists name other files."""
 
 
+EXACT = 1e-5
+"""Largest error of a number that is computed from a time; a frame left out in an hour changes the mean rate more."""
+FAR = 60
+"""Frames ahead up to which decoding all frames costs less than a search."""
+
+
 class Video:
     """Frames of an MP4 file by number.
 
-    Frames are decoded one after the other, as a seek does not reach the exact frame in every video: a frame further
-    ahead costs the decoding of those before it, an earlier frame that of all from the beginning.
+    Frames that are asked for in order are decoded one after the other. Others are searched for in videos of a constant
+    rate, where the time of a frame tells its number; elsewhere, or where the search ends at another frame, all frames
+    are decoded from the beginning.
 
     Args:
         path: The file.
@@ -34,6 +41,7 @@ class Video:
         if head[4:] != MARK:
             raise DatasetError(f"{path} is not an MP4 video; expected one as the recording application writes it")
         self._lock = Lock()
+        self._constant: bool | None = None  # the rate of the frames, once it is needed
         self._open()
 
     def _open(self) -> None:
@@ -49,6 +57,34 @@ class Video:
             )
         self._next = 0
 
+    def _jump(self, index: int) -> None:
+        """Go to a frame that is not near, or to the beginning."""
+        import cv2
+
+        self._open()
+        if index > FAR and self._constant is None:
+            last = int(self._capture.get(cv2.CAP_PROP_FRAME_COUNT)) - 1
+            step = self._next_is(0) and self._next_is(1)
+            self._constant = step and self._finds(last) and not self._capture.grab()
+        if index > FAR and self._constant and self._finds(index):
+            self._next = index + 1
+        elif index > FAR:
+            self._open()
+
+    def _finds(self, index: int) -> bool:
+        """Whether a search for a frame ends there."""
+        import cv2
+
+        self._capture.set(cv2.CAP_PROP_POS_FRAMES, index)
+        return self._next_is(index)
+
+    def _next_is(self, index: int) -> bool:
+        """Whether the time of the next frame is that of this number at the mean rate."""
+        import cv2
+
+        rate = self._capture.get(cv2.CAP_PROP_FPS) / 1000
+        return self._capture.grab() and abs(self._capture.get(cv2.CAP_PROP_POS_MSEC) * rate - index) < EXACT
+
     def __getitem__(self, index: int) -> NDArray[np.uint8]:
         """Frame (H, W, 3), RGB.
 
@@ -58,8 +94,8 @@ class Video:
         import cv2
 
         with self._lock:
-            if index < self._next - 1:
-                self._open()
+            if not self._next - 1 <= index <= self._next + FAR:
+                self._jump(index)
             while self._next <= index:
                 if not self._capture.grab():
                     raise FrameError(f"{self.path} has no frame {index}; it ends after {self._next} frames")
