@@ -43,8 +43,8 @@ class OpenLorisSequence(ImageFolder):
         fx, cx, fy, cy = numbers.ravel().tolist()
         values = {"fx": fx, "fy": fy, "cx": cx, "cy": cy}
         for key in ("width", "height"):
-            if isinstance(node.get(key), float):
-                values[key] = node[key]
+            if isinstance(node.get(key), int | float):
+                values[key] = float(node[key])
         return intrinsics.Intrinsics(values, "sensors.yaml")
 
     def _find_ground_truth(self) -> Trajectory | None:

@@ -1,41 +1,30 @@
-"""YAML files as OpenCV and ROS write them, read by OpenCV."""
+"""YAML files as OpenCV, ROS and Kalibr write them."""
 
 import re
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import yaml
 
 from dudmap.errors import DatasetError
 from dudmap.input_files import LARGEST_TREE, read_text
 
-if TYPE_CHECKING:
-    import cv2
-
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Nested dictionaries and lists of a YAML file; all numbers are floats.
+    """Nested dictionaries and lists of a YAML file; OpenCV's header and type names are left out.
 
     Raises:
-        DatasetError: The file cannot be read or holds no keys.
+        DatasetError: The file cannot be read, holds no keys, or uses aliases, which could make it endless.
     """
-    import cv2
-
     try:
-        text = read_text(path, LARGEST_TREE)
-        if not text.startswith("%YAML"):  # OpenCV wants its own header, and lists to be indented
-            text = "%YAML:1.0\n---\n" + re.sub(r"^( *)- ", r"\1  - ", text.removeprefix("---"), flags=re.MULTILINE)
-        storage = cv2.FileStorage(text, cv2.FILE_STORAGE_READ | cv2.FILE_STORAGE_MEMORY)
+        text = re.sub(r"^%YAML.*\n|!!opencv-\w+", "", read_text(path, LARGEST_TREE))
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise DatasetError(f"{path} uses aliases (*name); expected YAML of plain keys and values")
+        content = yaml.safe_load(text)
     except (OSError, UnicodeDecodeError) as error:
         raise DatasetError(f"cannot read {path}: {error}") from error
-    except (cv2.error, SystemError):
+    except (yaml.YAMLError, RecursionError, ValueError):
         raise DatasetError(f"cannot read {path}; expected YAML of keys, numbers, texts and lists") from None
-    if not storage.isOpened() or not storage.root().isMap():
+    if not isinstance(content, dict):
         raise DatasetError(f"{path} holds no keys; expected YAML of keys and values")
-    return _value(storage.root())
-
-
-def _value(node: "cv2.FileNode") -> Any:  # noqa: ANN401
-    if node.isMap():
-        return {key: _value(node.getNode(key)) for key in node.keys()}
-    if node.isSeq():
-        return [_value(node.at(k)) for k in range(node.size())]
-    return node.real() if node.isInt() or node.isReal() else node.string()
+    return content
