@@ -53,7 +53,7 @@ class Segmentation:
     window: int = 3
 
     def with_noise(self, sigma: NDArray[np.float32]) -> SegmentImage:
-        """The segments as a compute device takes them; sigma (h, w) is that of the distance of a static point."""
+        """The segments as kernels take them; sigma (h, w) is that of the distance of a static point."""
         return SegmentImage(self.labels, self.count, sigma, self.gradient, self.window)
 
     def share(self, pixels: NDArray[np.bool_]) -> NDArray[np.float64]:

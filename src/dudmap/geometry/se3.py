@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 Matrix = NDArray[np.float64]
-ONE, HALF, FOUR, SIX = 1.0, 0.5, 4.0, 6.0
 SMALL = 1e-8
 """Squared angle below which a rotation is that of the Taylor series."""
 
@@ -66,24 +65,17 @@ def exp_all(twists: Matrix) -> Matrix:
 
 def exp_rotation(omega: Matrix) -> Matrix:
     """Rotation matrix (3, 3) of a rotation vector (3,), radians (Rodrigues)."""
-    return np.array(rotation_elements(*(float(value) for value in omega))).reshape(3, 3)
-
-
-def rotation_elements(x, y, z):  # noqa: ANN001, ANN201 - plain numbers; Warp compiles the same text
-    """Elements (9,), row by row, of the rotation matrix of a rotation vector (Rodrigues)."""
+    x, y, z = (float(value) for value in omega)
     theta_squared = x * x + y * y + z * z
-    a, b = (
-        ONE - theta_squared / SIX,
-        HALF - theta_squared / (FOUR * SIX),
-    )  # Taylor series: the closed forms are 0/0 at 0
+    a, b = 1 - theta_squared / 6, 0.5 - theta_squared / 24  # Taylor series: the closed forms are 0/0 at 0
     if theta_squared >= SMALL:
         theta = math.sqrt(theta_squared)
-        a, b = math.sin(theta) / theta, (ONE - math.cos(theta)) / theta_squared
-    return (
-        ONE - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
-        b * x * y + a * z, ONE - b * (x * x + z * z), b * y * z - a * x,
-        b * x * z - a * y, b * y * z + a * x, ONE - b * (x * x + y * y),
-    )  # fmt: skip
+        a, b = math.sin(theta) / theta, (1 - math.cos(theta)) / theta_squared
+    return np.array([
+        [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
+        [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
+        [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def log(T: Matrix) -> Matrix:

@@ -88,10 +88,7 @@ class Backend(Protocol):
     def reading_weights(
         self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
     ) -> NDArray[np.uint8]:
-        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m.
-
-        It may be anything that ``np.asarray`` takes, so that a device keeps what nobody reads.
-        """
+        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m."""
         ...
 
     def touched_cells(

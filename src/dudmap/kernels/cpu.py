@@ -267,8 +267,9 @@ class CpuBackend:
         )  # fmt: skip
         starts = [start for start, _ in ranges]
         written = [np.s_[start : start + n] for start, n in zip(starts, counts, strict=True)]
-        counts = count * np.concatenate([repeats[part] for part in written])
-        return np.concatenate([slots[part] for part in written]), counts
+        repeats = np.concatenate([repeats[part] for part in written])
+        repeats *= count
+        return np.concatenate([slots[part] for part in written]), repeats
 
     def _pixel_buffer(self, size: int) -> NDArray[np.int32]:
         """Words (size, 2) of the pixels; the last row, of a voxel without a pixel, is 0."""

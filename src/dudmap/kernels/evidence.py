@@ -1,6 +1,6 @@
 """Evidence of motion at single pixels: normalised residuals, log odds, and free space that single frames have seen.
 
-The formulas stand first; they are plain arithmetic, which NumPy does on images and a compiler for GPUs on numbers.
+The formulas stand first: arithmetic on numbers or images.
 """
 
 from collections.abc import Sequence

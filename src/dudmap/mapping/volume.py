@@ -264,7 +264,7 @@ class TsdfVolume(PagedMap):
         words = self.blocks.geometry[np.maximum(slots, 0), numbers]
         weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
         out = np.zeros(depth.shape, np.float32)
-        gains = np.asarray(self._integrator.reading_weights(depth, camera))
+        gains = self._integrator.reading_weights(depth, camera)
         out[rows, columns] = weights / (weights + gains[rows, columns])
         return out
 

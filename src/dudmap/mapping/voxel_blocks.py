@@ -198,7 +198,7 @@ class VoxelBlocks:
         return slots
 
     def use_slots(self, num_slots: int) -> None:
-        """Take the slots below a number for used, on a device, too."""
+        """Take the slots below a number for used."""
         self.num_slots = num_slots
         self.geometry_mirror.used = self.colors_mirror.used = num_slots
 
