@@ -28,6 +28,13 @@ if TYPE_CHECKING:
     from dudmap.slam import Slam
 
 DATABASE = "state.db"
+OPTIONS = {
+    "recording": dict[str, Any], "report": bool, "every": float | None, "count": int, "masks": str | None,
+    "save_masks": bool, "save_map": bool, "ahead": int, "passes": int, "config": str, "max_memory": int | None,
+}  # fmt: skip
+"""What describes a run, and the types of its values."""
+PLACE = {"recording": str, "pass": int, "next": int, "frame": str}
+"""What says where a run stands."""
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 
 
@@ -154,7 +161,9 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
     if not meta:
         raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
-    if not {"options", "recording", "pass", "next", "frame"} <= meta.keys():
+    options = meta.get("options")
+    described = isinstance(options, dict) and all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
+    if not described or not all(schema.fits(meta.get(key), kind) for key, kind in PLACE.items()):
         raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
     return reader, meta
 
