@@ -3,8 +3,8 @@
 import numpy as np
 
 
-def volume():
-    """A small map of a wall."""
+def volume(content=True):
+    """A small map of a wall, or an empty one."""
     from dudmap.config import SensorConfig, VolumeConfig
     from dudmap.frames.frame import Frame
     from dudmap.geometry.camera import Camera
@@ -12,7 +12,8 @@ def volume():
 
     made = TsdfVolume(Camera(20, 20, 15.5, 11.5, 32, 24), VolumeConfig(voxel_size=0.1), SensorConfig(), 3.0)
     frame = Frame(0.0, np.full((24, 32), 1.5, np.float32), np.full((24, 32, 3), 90, np.uint8))
-    made.integrate(frame, np.eye(4), np.ones((24, 32), bool))
+    if content:
+        made.integrate(frame, np.eye(4), np.ones((24, 32), bool))
     return made
 
 
@@ -46,8 +47,8 @@ def load_map(path):
     loaded.raycast(np.eye(4), loaded.camera)
 
 
-def parts():
-    """A state with values of all kinds that a tree has."""
+def parts(content=True):
+    """A state with values of all kinds that a tree has; its map is empty without ``content``."""
     from collections import deque
 
     from dudmap.config import Config
@@ -59,7 +60,7 @@ def parts():
     features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
     keyframe, numbers = Keyframe(1.0, np.eye(4), features), np.arange(100.0)
     return {
-        "volume": volume(), "numbers": numbers, "again": [numbers, keyframe], "keyframe": keyframe, "rng": rng,
+        "volume": volume(content), "numbers": numbers, "again": [numbers, keyframe], "keyframe": keyframe, "rng": rng,
         "config": Config(), "camera": Camera(20, 20, 15.5, 11.5, 32, 24), "last": deque([1.5, None, "a"], 5),
         "poses": [TimedPose(0.1 * k, np.eye(4), 0) for k in range(40)], "seen": {1, 2}, "pair": (1, np.float32(0.5)),
     }  # fmt: skip
@@ -82,7 +83,7 @@ def load_state(path):
     try:
         reader = StateReader(path)
         reader.meta()
-        like = parts()
+        like = parts(content=False)
         kinds = {key: type(value) for key, value in like.items()}
         found = restore(reader, like)
         reader.close()

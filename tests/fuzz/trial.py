@@ -143,6 +143,8 @@ class Subject:
     def warm_up(self):
         """Read the valid input without a limit of time: kernels are compiled and libraries loaded."""
         self.loader.load(self.path)
+        if self.loader.owns:
+            self.restore()
 
     def trial(self, seed):
         """Read input number ``seed``; one that takes too long is read again, as the process may have been held up.

@@ -1,6 +1,8 @@
 """A database of a run from elsewhere is data: it runs nothing, and is bounded in memory and time."""
 
+import json
 import os
+import re
 import signal
 import sqlite3
 import threading
@@ -12,7 +14,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import StateError
-from dudmap.state import database
+from dudmap.state import database, schema
 from dudmap.state.database import StateDatabase, StateReader
 from dudmap.state.system import restore, take_snapshot
 
@@ -95,3 +97,92 @@ def test_a_row_that_is_larger_than_memory(path):
     change(path, "UPDATE meta SET value = zeroblob(400000000)")
     with pytest.raises(StateError, match="is damaged"):
         StateReader(path).meta()
+
+
+def store(path, tree, arrays=()):
+    """Replace the tree of a database."""
+    packed = zlib.compress(json.dumps({"tree": tree, "arrays": list(arrays), "records": []}).encode())
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute("UPDATE state SET crc = ?, tree = ?", (zlib.crc32(packed), packed))
+
+
+CALLED = {"tuple": [10**9], "class": "dudmap.mapping.voxel_blocks:VoxelBlocks", "id": 1}
+LIST = {"list": [1, 2], "id": 1}
+
+
+def camera(**changes):
+    values = {"fx": 30.0, "fy": 30.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30, "depth_scale": 1000.0,
+              "distortion": {"tuple": [], "id": 2}} | changes  # fmt: skip
+    attributes = {key: value for key, value in values.items() if value != "left out"}
+    return {"object": "dudmap.geometry.camera:Camera", "id": 1, "attributes": attributes}
+
+
+@pytest.mark.parametrize(("node", "match"), [
+    (CALLED, r"at state\[0\]: VoxelBlocks is no tuple of 1 values"),
+    (LIST, r"at state\[0\]: found list; expected Camera|found values of other types"),
+    (camera(fx={"dict": [], "values": [], "id": 3}), r"at state\[0\]\.fx: found dict; expected float"),
+    (camera(width="left out"), r"at state\[0\]: found the attributes .* of Camera; expected"),
+    (camera(__class__=1), r"found the attributes \['__class__', "),
+    ({"object": "dudmap.mapping.volume:TsdfVolume", "id": 1, "attributes": {}}, "of other types|TsdfVolume"),
+    ({"object": "os:system", "id": 1, "attributes": {}}, "which this version does not know"),
+    ({"scalar": "<U999999999", "value": "a"}, "not understood|expected a number"),
+    ({"deque": [], "limit": "x", "id": 1}, "TypeError"),
+    ({"same": 77}, "KeyError 77"),
+    (camera(width=10**9), "camera image is 1000000000x30"),
+    ({"model": "dudmap.slam:Slam", "json": "{}", "id": 1}, "Slam is no configuration"),
+])  # fmt: skip
+def test_a_tree_of_another_type_is_refused_with_its_place(node, match, path):
+    from dudmap.geometry.camera import Camera
+
+    like = {"camera": Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)}
+    store(path, {"dict": ["camera"], "values": [camera()], "id": 0})
+    assert restore(StateReader(path), dict(like))["camera"] == Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)
+    store(path, {"dict": ["camera"], "values": [node], "id": 0})
+    with pytest.raises(StateError, match="damaged or not of this program") as error:
+        restore(StateReader(path), dict(like))
+    assert re.search(match, str(error.value)), error.value
+
+
+@pytest.mark.parametrize("array", [
+    {"dtype": "|u1", "shape": [10**12], "transposed": False, "chunks": []},
+    {"dtype": "|O", "shape": [0], "transposed": False, "chunks": []},
+    {"dtype": "<U999999999", "shape": [1], "transposed": False, "chunks": []},
+    {"dtype": "<f8", "shape": [-1], "transposed": False, "chunks": []},
+    {"dtype": "<f8", "shape": "ab", "transposed": False, "chunks": []},
+])  # fmt: skip
+def test_arrays_have_the_size_of_what_is_stored(array, path):
+    store(path, None, [array])
+    with pytest.raises(StateError, match=r"is damaged: .*(array|data type)"):
+        restore(StateReader(path), None)
+
+
+def test_one_part_that_stands_in_many_arrays(path):
+    """Equal parts are stored once; a small file must not become a large array by that."""
+    with closing(sqlite3.connect(path)) as connection:
+        key = connection.execute("SELECT key FROM chunks").fetchone()[0].hex()
+    store(path, None, [{"dtype": "<f8", "shape": [10**7], "transposed": False, "chunks": [key] * 100_000}])
+    with pytest.raises(StateError, match="its arrays have 80000000 bytes, and 800 are stored"):
+        restore(StateReader(path), None)
+
+
+def test_what_is_missing_in_the_state_of_a_run(tmp_path):
+    """A tree that is one, but not that of a run."""
+    from types import SimpleNamespace
+
+    from dudmap.pipeline.storing import restored
+
+    made = StateDatabase(tmp_path / "state.db")
+    made.write(take_snapshot({"numbers": np.arange(10.0)}, made), {"next": 1})
+    store, slam = SimpleNamespace(database=None), SimpleNamespace(device="cpu")
+    with pytest.raises(StateError, match=r"cannot read .*state\.db, it is damaged"):
+        restored(StateReader(tmp_path / "state.db"), store, slam, slam)
+
+
+def test_the_annotations_of_all_classes_of_a_state_are_known():
+    """A dataclass whose annotations cannot be evaluated would be read without a look at its types."""
+    from dataclasses import is_dataclass
+
+    classes = [schema.class_of(name) for name in schema._table()]
+    assert len(classes) > 100
+    unknown = [cls.__name__ for cls in classes if is_dataclass(cls) and not schema._hints(cls)]
+    assert unknown == []

@@ -99,7 +99,10 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
     assert not (out / "state.db").exists()
     with pytest.raises(StateError, match=r"is finished \(4 frames\); there is nothing to resume"):
         resume(out)
-    about = {"options": {"recording": {"path": str(recording)}}, "recording": recording_fingerprint(sequence),
+    options = {"recording": {"path": str(recording)}, "report": False, "every": None, "count": 4, "masks": None,
+               "save_masks": False, "save_map": True, "ahead": 2, "passes": 1, "config": Config().model_dump_json(),
+               "max_memory": None}  # fmt: skip
+    about = {"options": options, "recording": recording_fingerprint(sequence),
              "code": "of yesterday", "versions": {"dudmap": "0.0"}, "pass": 0, "next": 0, "frame": ""}  # fmt: skip
     database = StateDatabase(out / "state.db")
     database.write_meta(about)
@@ -108,6 +111,9 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
     database.write_meta({"code": code_fingerprint(), "recording": "of another room"})
     with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
         resume(out)
-    database.write_meta({"recording": recording_fingerprint(sequence), "next": 3, "frame": "of another frame"})
+    database.write_meta({"recording": recording_fingerprint(sequence), "options": options | {"count": "4"}})
+    with pytest.raises(StateError, match="is damaged or not the state of a run"):
+        resume(out)
+    database.write_meta({"options": options, "next": 3, "frame": "of another frame"})
     with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
         resume(out)

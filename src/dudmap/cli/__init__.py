@@ -77,7 +77,8 @@ class CommandGroup(TyperGroup):
 
 def not_enough_memory(error: MemoryError) -> str:
     """Sentence on what memory was missing for."""
-    return f"there is not enough memory ({error or 'none is left'}); give the process more, or shorten what it works on"
+    what = str(error) or "none is left"
+    return f"there is not enough memory ({what}); give the process more, or shorten what it works on"
 
 
 def fail(sentence: str, code: int = 1) -> None:

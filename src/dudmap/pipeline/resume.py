@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from dudmap.config import Config
 from dudmap.errors import StateError
+from dudmap.input_files import damaged
 from dudmap.pipeline.progress import RunProgress
 from dudmap.pipeline.run import Job, run
 from dudmap.pipeline.run_folder import RunReport, locked
@@ -57,10 +58,10 @@ def resume(
         reader, meta = stored_options(out)
         with closing(reader):
             options = meta["options"]
-            if sequence is None:
-                sequence = open_recording(options["recording"])
+            with damaged(StateError, reader.path):
+                sequence = open_recording(options["recording"]) if sequence is None else sequence
+                config = on_device(Config.model_validate_json(options["config"]), device)
             check_recording(sequence, meta, out)
-            config = on_device(Config.model_validate_json(options["config"]), device)
             limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
             if "pass" in meta:
                 display = RunProgress(options["count"] * options["passes"], bar=progress)

@@ -28,6 +28,14 @@ if TYPE_CHECKING:
     from dudmap.slam import Slam
 
 DATABASE = "state.db"
+OPTIONS = {
+    "recording": dict[str, Any], "report": bool, "every": float | None, "count": int, "masks": str | None,
+    "save_masks": bool, "save_map": bool, "ahead": int, "passes": int, "config": str, "max_memory": int | None,
+    "localize": bool, "saved_map": str | None, "depth_model": str | None,
+}  # fmt: skip
+"""What describes a run, and the types of its values."""
+PLACE = {"pass": int, "next": int, "frame": str}
+"""What says where a run stands, once it has begun."""
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 
 
@@ -163,7 +171,10 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
     if not meta:
         raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
-    if not {"options", "recording"} <= meta.keys() or len({"pass", "next", "frame"} & meta.keys()) not in (0, 3):
+    options, begun = meta.get("options"), any(key in meta for key in PLACE)
+    known = isinstance(meta.get("recording"), str) and isinstance(options, dict)
+    known = known and all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
+    if not known or (begun and not all(schema.fits(meta.get(key), kind) for key, kind in PLACE.items())):
         raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
     return reader, meta
 

@@ -1,7 +1,7 @@
 """What a stored state may hold: the classes of its objects, and for each of them the names and types of its attributes.
 
 A state is data. Its classes are the table ``CLASSES``; attributes of a dataclass are its fields with their annotations,
-those of another class what its constructor sets, of the types that they have in a new object of the class.
+those of another class what its methods name, of the types that they have in a new object of the class.
 """
 
 import sys
@@ -101,8 +101,7 @@ def _names(cls: type) -> frozenset[str]:
     """Names that the attributes of an object may have."""
     if is_dataclass(cls):
         return frozenset(field.name for field in fields(cls))
-    constructors = (vars(base).get("__init__") for base in cls.__mro__)
-    codes = (getattr(one, "__code__", None) for one in constructors)
+    codes = (getattr(one, "__code__", None) for base in cls.__mro__ for one in vars(base).values())
     return frozenset(name for code in codes if code is not None for name in code.co_names)
 
 

@@ -11,6 +11,7 @@ from dudmap.config import Config
 from dudmap.errors import StateError
 from dudmap.geometry.camera import Camera
 from dudmap.gpu.device import make_backend
+from dudmap.input_files import damaged
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.pipeline.environment import versions
 from dudmap.places.frame_store import FrameStore
@@ -98,9 +99,10 @@ def resume_system(path: Path, device: str | None) -> "Slam":
     reader = StateReader(path)
     meta = reader.meta()
     check_code(meta, path)
-    camera = meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])}
-    config = on_device(Config.model_validate_json(meta["config"]), device)
-    slam = Slam(Camera(**camera), config)
+    with damaged(StateError, path):
+        camera = Camera(**meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])})
+        config = on_device(Config.model_validate_json(meta["config"]), device)
+    slam = Slam(camera, config)
     return restore(reader, slam, device=slam.device)
 
 

@@ -19,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from dudmap.errors import StateError
+from dudmap.errors import DatasetError, StateError
+from dudmap.geometry.camera import Camera
 from dudmap.input_files import DAMAGE
 from dudmap.kernels.backend import Backend
 from dudmap.kernels.cpu import CpuBackend
@@ -222,7 +223,7 @@ class TreeReader:
             if not schema.is_alike(value, current):
                 raise ValueError(f"found {type(value).__name__}; expected {type(current).__name__}")
             return value
-        except (*DAMAGE, MemoryError) as error:
+        except (*DAMAGE, DatasetError, MemoryError) as error:
             place = "".join(["state", *self._at])
             what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
             raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
@@ -351,6 +352,8 @@ class TreeReader:
             schema.check_value(cls, name, made, like.get(name))
             object.__setattr__(value, name, made)
             self._at.pop()
+        if isinstance(value, Camera):
+            value.__post_init__()  # its size decides how much memory is taken
         if "map" in node:
             self._load_map(value, node["map"], self._value(node["blocks"]))
         if "store" in node:
