@@ -131,7 +131,7 @@ def test_the_cameras_of_seven_scenes_need_its_name(tmp_path):
     scene = shutil.copytree(named, tmp_path / "other" / "redkitchen" / "seq-01")
     known = open_sequence(scene)
     assert known.format == "7-Scenes"
-    assert "named in the path" in known.sources["intrinsics"]
+    assert "by name" in known.sources["intrinsics"]
 
 
 def test_depth_camera_of_seven_scenes_as_3dmatch_packs_it(tmp_path):

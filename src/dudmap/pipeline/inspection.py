@@ -7,6 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import FrameError
+from dudmap.pipeline.focal_check import WRONG, focal_error
+from dudmap.sequences.intrinsics import BY_NAME
 
 if TYPE_CHECKING:
     from dudmap.frames.frame import Frame
@@ -168,7 +170,9 @@ def inspect(
         ground_truth=0 if truth is None else len(truth),
         unreadable=list(unreadable or []),
     )
+    named = found.sources.get("intrinsics", "").endswith(BY_NAME) and calibration is None
     found.warnings = [
+        *(_focal_warnings(sequence) if named else []),
         *_depth_warnings(found),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
@@ -247,6 +251,17 @@ def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | Non
     if np.any(np.diff(colors) < 0):
         out.append("the colour images are not in the order of the depth images: the times of the lists are mixed up")
     return out
+
+
+def _focal_warnings(sequence: "Sequence") -> list[str]:
+    error = focal_error(sequence)
+    if error is None or abs(error - 1) < WRONG:
+        return []
+    fx = sequence.camera.fx
+    return [
+        f"the focal length {fx:g} is that of {getattr(sequence, 'sources', {})['intrinsics']}, but pairs of frames are "
+        f"consistent with about {fx / error:.0f}; give the right intrinsics with --camera"
+    ]
 
 
 def _pairing_warnings(sequence: "Sequence") -> list[str]:

@@ -75,8 +75,12 @@ class SharedFrameFiles(FrameFiles):
             )
         if known is not None and (self.format != "7-Scenes" or Path(known.source).name != "camera-intrinsics.txt"):
             return known
-        depth = intrinsics.Intrinsics(SEVEN_SCENES_DEPTH, "7-Scenes, named in the path") if known is None else known
-        source = depth.source if known is None else f"{depth.source}; colour: 7-Scenes, named in the path"
+        depth = (
+            intrinsics.Intrinsics(SEVEN_SCENES_DEPTH, f"the 7-Scenes cameras{intrinsics.BY_NAME}")
+            if known is None
+            else known
+        )
+        source = depth.source if known is None else f"{depth.source}; colour: 7-Scenes{intrinsics.BY_NAME}"
         motion = se3.inverse(KINECT_COLOR_DEPTH)
         return intrinsics.Intrinsics(dict(depth.values), source, dict(SEVEN_SCENES_COLOR), motion)
 

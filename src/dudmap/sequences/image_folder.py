@@ -138,7 +138,7 @@ class ImageFolder(ABC):
         if self.published is None:
             return None
         name, values = self.published
-        return intrinsics.Intrinsics(dict(values), f"the {name} camera, by the layout")
+        return intrinsics.Intrinsics(dict(values), f"the {name} camera{intrinsics.BY_NAME}")
 
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""

@@ -89,6 +89,8 @@ def _by_key(*numbers: float) -> dict[str, float]:
     return dict(zip(KEYS, numbers, strict=False))
 
 
+BY_NAME = ", by name"
+"""End of a source of intrinsics that are known from the name or the layout of a data set, and in no file."""
 KNOWN = (
     (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", _by_key(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
     (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _by_key(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
@@ -102,7 +104,7 @@ def by_name(path: Path) -> Intrinsics | None:
     """Published intrinsics of the data set that the folder name of a recording in TUM layout matches."""
     for pattern, name, values in KNOWN:
         if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
-            return Intrinsics(values, f"the {name} camera, by the folder's name")
+            return Intrinsics(values, f"the {name} camera{BY_NAME}")
     return None
 
 

@@ -53,7 +53,7 @@ class RedwoodSequence(ImageFolder):
 
     def _published(self) -> intrinsics.Intrinsics | None:
         if self.timed or re.search(NAMES, self.path.resolve().as_posix(), flags=re.IGNORECASE):
-            return intrinsics.Intrinsics(dict(CAMERA), "the PrimeSense camera of the Redwood data sets, by name")
+            return intrinsics.Intrinsics(dict(CAMERA), f"the camera of Redwood{intrinsics.BY_NAME}")
         return None
 
     def _find_ground_truth(self) -> Trajectory | None:
