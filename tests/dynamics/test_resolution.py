@@ -19,6 +19,7 @@ from dudmap.dynamics.segments import MIN_PIXELS
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.slam import Slam
+from off_course import LIMIT, off_course
 
 FRAMES = 14
 FIRST = 5
@@ -47,6 +48,7 @@ def run(width: int, height: int, label_width: int) -> Run:
     slam = Slam(camera, Config().override([f"dynamics.width={label_width}"]))
     results = [slam.process(sequence[index]) for index in range(FRAMES)]
     assert all(result.state == "tracked" for result in results)
+    assert off_course(sequence.ground_truth.Ts_world_camera, [result.T_world_camera for result in results]) < LIMIT
     view = slice((width - height * 4 // 3) // 2, (width + height * 4 // 3) // 2)
     masks = [
         cv2.resize(result.dynamic_mask[:, view].astype(np.uint8), (WIDTH, HEIGHT), interpolation=cv2.INTER_NEAREST) > 0
