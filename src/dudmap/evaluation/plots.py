@@ -97,9 +97,8 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
     except DAMAGE as error:
         raise DatasetError(f"{residuals} does not hold edges, counts, prior and sigma of residuals: {error}") from error
     widths, r = np.diff(edges), np.linspace(edges[0], edges[-1], 600)
-    axes.bar(
-        edges[:-1], counts / max(counts.sum(), 1) / widths, widths, align="edge", color="#b9c4d0", label="residuals"
-    )
+    density = counts / max(counts.sum(), 1) / widths
+    axes.stairs(density, edges, fill=True, color="#b9c4d0", label="residuals")
     parts = [p * np.sqrt(2 / np.pi) / s * np.exp(-0.5 * (r / s) ** 2) for p, s in zip(prior, sigma, strict=True)]
     for part, name, color, p, s in zip(parts, ("static", "dynamic"), (SECOND, ESTIMATE), prior, sigma, strict=True):
         axes.plot(r, part, color=color, label=f"{name}: {100 * p:.1f} %, sigma {s:.2f}")

@@ -50,6 +50,7 @@ def _times(run: RunFiles) -> str:
     # a few frames may take very long, such as the first one, in which the kernels are loaded
     highest = 1.3 * max(float(np.percentile(np.sum([curve[1] for curve in curves], axis=0), 95)), 1e-3)
     with _drawing("times") as (figure, picture):
+        figure.subplots_adjust(right=0.72)  # room for the legend
         axes = figure.subplots()
         labels = [f"{printable(stage)[:30]}: {times[stage].mean():.1f} ms" for stage in ranked]
         axes.stackplot(curves[0][0], *(curve[1] for curve in curves), labels=labels, linewidth=0)
@@ -106,7 +107,8 @@ def _drawing(name: str) -> "Iterator[tuple[Figure, list[str]]]":
         "text.parse_math": False,
     }
     with matplotlib.rc_context(rc=cast("Any", style)):
-        figure = Figure(figsize=(7.2, 2.8), layout="constrained")
+        figure = Figure(figsize=(7.2, 2.8))
+        figure.subplots_adjust(left=0.09, right=0.98, bottom=0.17, top=0.96)
         FigureCanvasSVG(figure)
         yield figure, picture
         text = io.StringIO()
