@@ -36,7 +36,7 @@ class FrameResult:
         tracking: Full result of the registration; None for the first frame of a map.
         timings: Milliseconds per stage.
         relocalized: Whether the pose comes from a recognised place after tracking was lost.
-        find_movers: Finds the moving objects.
+        find_movers: Finds the moving objects; None where there are none to be found.
         submap: Number of the submap that the pose belongs to, 0 the first.
         corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
         blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
@@ -63,7 +63,7 @@ class FrameResult:
     tracking: TrackingResult | None
     timings: dict[str, float] = field(default_factory=dict)
     relocalized: bool = False
-    find_movers: Callable[[], tuple[Mover, ...]] = tuple
+    find_movers: Callable[[], tuple[Mover, ...]] | None = None
     submap: int = 0
     corrected: bool = False
     blind: bool = False
@@ -77,4 +77,4 @@ class FrameResult:
     @property
     def movers(self) -> tuple[Mover, ...]:
         """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""
-        return self.find_movers()
+        return () if self.find_movers is None else self.find_movers()

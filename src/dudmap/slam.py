@@ -392,7 +392,7 @@ class Slam(SlamResults):
         fused: bool = False,
         relocalized: bool = False,
         corrected: bool = False,
-        find_movers: Callable[[], tuple[Mover, ...]] = tuple,
+        find_movers: Callable[[], tuple[Mover, ...]] | None = None,
         uncertain: str = "",
         calibrated: bool = False,
         checks: Mapping[str, float] | None = None,
@@ -417,7 +417,7 @@ class Slam(SlamResults):
         if not rejected:
             self._last = replace(
                 result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False,
-                find_movers=tuple, corrected=False, blind=False, calibrated=False, uncertain="", checks={},
+                find_movers=None, corrected=False, blind=False, calibrated=False, uncertain="", checks={},
             )  # fmt: skip
         return result
 
