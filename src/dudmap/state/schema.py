@@ -20,8 +20,8 @@ from dudmap.state import wiring
 CLASSES = """
 bootstrap:StartFrame,Bootstrap calibration.adjustment:_State,_PairSystems,_System,Adjustment
 calibration.collector:KeyframeCollector calibration.depth_estimator:DepthView calibration.depth_model:DepthModel
-calibration.estimator:Estimate,_Trial,CalibrationEstimator calibration.keyframes:ColorKeyframe
-calibration.pairs:Pair calibration.self_calibration:SelfCalibration color_calibration:ColorCalibration
+calibration.estimator:Estimate,_Trial,CalibrationEstimator calibration.keyframes:ColorKeyframe calibration.pairs:Pair
+calibration.self_calibration:SelfCalibration color_calibration:ColorCalibration
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 dynamics.background_model:BackgroundModel dynamics.detector:_Comparison,DynamicDetector
 dynamics.dominant_motion:LabelledCorners,DominantMotion dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter
@@ -31,19 +31,17 @@ frames.frame:FrameArrays,Frame frames.observation:Observation,Level frames.prepr
 frames.pyramid:Pyramid frames.stream_check:Rejection,StreamCheck geometry.alignment:Alignment
 geometry.association:TimedFile geometry.calibration:Calibration geometry.camera:Camera geometry.lens:Lens
 geometry.mesh:Mesh geometry.other_view:OtherView geometry.trajectory:Trajectory
-kernels.block_index:IndexArrays,IndexCounts kernels.consensus:ConsensusParams,LinearizedMotions,Correspondences
-kernels.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise kernels.level_backend:FinerLevels
-kernels.links:Lazy kernels.mirror:Mirror
-kernels.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,Damping,Descent,MapSample,RaycastResult,MeshArrays
+kernels.consensus:ConsensusParams,LinearizedMotions,Correspondences kernels.descent:DescentRules,Descent
+kernels.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise kernels.mirror:Mirror
+kernels.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
 kernels.reprojection:ReprojectionTarget,Reprojection kernels.segmentation:SegmentSums,SegmentImage
-kernels.splatting:PointImage mapper:Mapper mapping.adaptive_volume:AdaptiveVolume mapping.block_index:BlockIndex
-mapping.block_pager:_Away,BlockPager mapping.block_tree:BlockTree mapping.block_window:BlockWindow
-mapping.fine_blocks:FineBlocks mapping.incremental_mesh:IncrementalMesh mapping.integrator:StorageScale,Integrator
-mapping.map_file:MapContent mapping.memory_limit:MemoryLimit mapping.paged_map:PagedMap
-mapping.refinement:Refinement mapping.region_store:RegionStore mapping.volume:TsdfVolume
-mapping.volume_mirror:VolumeMirror mapping.voxel_blocks:BlockRecords,VoxelBlocks
-objects.moving_objects:MovingObjects objects.object_fusion:ObjectFusion
-objects.object_map:RigidObject,ObjectVolume,ObjectTrack
+kernels.splatting:PointImage mapper:Mapper mapping.adaptive_volume:AdaptiveVolume mapping.block_pager:_Away,BlockPager
+mapping.block_tree:BlockTree mapping.block_window:BlockWindow mapping.fine_blocks:FineBlocks
+mapping.incremental_mesh:IncrementalMesh mapping.integrator:StorageScale,Integrator mapping.map_file:MapContent
+mapping.memory_limit:MemoryLimit mapping.paged_map:PagedMap mapping.refinement:Refinement
+mapping.region_store:RegionStore mapping.volume:TsdfVolume mapping.volume_mirror:VolumeMirror
+mapping.voxel_blocks:BlockRecords,VoxelBlocks objects.moving_objects:_Frame,MovingObjects
+objects.object_fusion:ObjectFusion objects.object_map:RigidObject,ObjectVolume,ObjectTrack
 objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker objects.object_view:ObjectView
 objects.regions:MovingPixels,Region objects.scene_flow:InstanceFrame pipeline.metrics:RunRecord
 places.atlas:TimedPose,Atlas places.features:ImageFeatures,SiftExtractor places.frame_file:FilePlace,FrameFile
@@ -51,15 +49,14 @@ places.frame_store:StoredFrame,RemovedFrames,FrameStore places.frame_thinning:Fr
 places.glimpse:Glimpse,Visibility places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
 places.loop_correction:LoopCorrector places.loop_verification:LoopQuery,LoopVerifier
 places.map_rebuilding:MapRebuilding places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase
-places.pose_graph:Edge places.prior_map:PriorMap
-places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews places.relocalizer:Relocalization,Relocalizer
-places.saved_map:SavedMap result:FrameResult slam:Slam stage_timer:StageTimer
-tracking.color_motion:RegisteredLevel,ColorMotion tracking.depth_noise:DepthNoise tracking.estimate:PoseEstimate
-tracking.frame_view:FrameView tracking.front_end:FrontEnd tracking.gradient_agreement:GradientAgreement
-tracking.image_consistency:ImageConsistency tracking.motion_model:MotionModel
-tracking.observability:Observability,GradientNoise tracking.pose_prediction:PosePrediction,PosePredictor
-tracking.quality_monitor:RegistrationHistory,QualityMonitor
-tracking.term_balance:TermBalance,Comparison,BalanceEstimator tracking.tracker:TrackingResult,Minimum,Tracker
+places.pose_graph:Edge places.prior_map:PriorMap places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews
+places.relocalizer:Relocalization,Relocalizer places.saved_map:SavedMap result:FrameResult slam:Slam
+stage_timer:StageTimer tracking.color_motion:RegisteredLevel,ColorMotion tracking.depth_noise:DepthNoise
+tracking.estimate:PoseEstimate tracking.frame_view:FrameView tracking.front_end:FrontEnd
+tracking.gradient_agreement:GradientAgreement tracking.image_consistency:ImageComparison,ImageConsistency
+tracking.motion_model:MotionModel tracking.observability:Observability,GradientNoise
+tracking.pose_prediction:PosePrediction,PosePredictor
+tracking.quality_monitor:RegistrationHistory,Verdict,QualityMonitor tracking.tracker:TrackingResult,Minimum,Tracker
 """
 """All classes whose objects may be stored, and made from what is stored: modules of this package and names in them."""
 NUMBERS = (bool, int, float, np.generic)
