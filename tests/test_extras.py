@@ -15,7 +15,7 @@ from bags import write_bag
 from dudmap.cli import app
 from dudmap.errors import MissingExtraError
 from dudmap.extras import STUDY, extra, need
-from dudmap.gpu.device import resolve
+from dudmap.gpu.device import _resolved
 from exported_runs import make_run
 from recordings import write_recording
 from run_folders import write_run
@@ -74,7 +74,7 @@ CASES = [
 def test_a_missing_library_is_one_sentence_that_names_its_extra(slam, where, monkeypatch, name, module, arguments):
     monkeypatch.chdir(where)
     monkeypatch.setitem(sys.modules, module, None)
-    resolve.cache_clear()
+    _resolved.cache_clear()
     done = CliRunner().invoke(app, arguments)
     assert done.exit_code == 1, done.output
     last = done.stderr.strip().splitlines()[-1]
