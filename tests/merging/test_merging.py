@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from dudmap.config import Config, VolumeConfig
 from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.fleet.two_runs import merge_runs
 from dudmap.frames.frame import Frame
 from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
@@ -19,7 +20,6 @@ from dudmap.merging.block_sums import BlockSums, block_sums, fused
 from dudmap.merging.map_fusion import fuse_maps
 from dudmap.merging.map_merging import compare_maps
 from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map, surface_points
-from dudmap.pipeline.merge import merge_runs
 from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
 

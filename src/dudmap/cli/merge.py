@@ -36,7 +36,7 @@ def merge(
     Tiles), world.json and the trajectories; it needs dudmap[fleet].
     """
     if len(runs) == 2 and not world:
-        from dudmap.pipeline.merge import merge_runs
+        from dudmap.fleet.two_runs import merge_runs
 
         report = merge_runs(runs[0], runs[1], out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}"))
         found = report.tree

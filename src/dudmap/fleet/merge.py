@@ -20,6 +20,7 @@ from dudmap.fleet.inputs import MapHeader, check_runs
 from dudmap.fleet.registration import RegisteredPair
 from dudmap.fleet.rounds import registered_runs
 from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
+from dudmap.fleet.two_runs import save_trajectories
 from dudmap.fleet.workers import Workers
 from dudmap.input_files import DAMAGE, describe, read_json
 from dudmap.mapping import morton
@@ -29,7 +30,6 @@ from dudmap.merging.map_fusion import FusedRange, joined
 from dudmap.merging.map_samples import sample_map
 from dudmap.merging.run_graph import RunGraph
 from dudmap.own_folder import remove_files
-from dudmap.pipeline.merge import run_trajectories
 
 WORLD_FILE, FORMAT = "world.json", "dudmap world 1"
 WORK_FOLDER = ".work"
@@ -173,14 +173,11 @@ def _write_world(
             write_tileset(root, like.config.voxel_size, out)
     finally:
         shutil.rmtree(work)
-    entries, number = [], 0
-    for run in runs:
-        names = []
-        for trajectory in run_trajectories(run.folder, run.T_world_run):
-            number += 1
-            names.append("trajectory.txt" if number == 1 else f"trajectory-{number}.txt")
-            trajectory.save(out / names[-1])
-        entries.append({"folder": str(run.folder), "T_world_run": run.T_world_run.tolist(), "trajectories": names})
+    trajectories = save_trajectories(out, [(run.folder, run.T_world_run) for run in runs])
+    entries = [
+        {"folder": str(run.folder), "T_world_run": run.T_world_run.tolist(), "trajectories": names}
+        for run, names in zip(runs, trajectories, strict=True)
+    ]
     kept = [result.entry for result in results if result.entry["blocks"]]
     return {
         "format": FORMAT, "voxel_size": like.config.voxel_size, "runs": entries, "ranges": kept,

@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from dudmap.fleet.inputs import MapHeader
 from dudmap.fleet.open_maps import keyframes_of, surface_of
 from dudmap.fleet.workers import Workers
-from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided, suggested_poses
+from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided
 from dudmap.merging.place_index import PARTNERS, TRAINING, described, learnt_words, similarity
-from dudmap.merging.relative_pose import Hypothesis
+from dudmap.merging.relative_pose import Hypothesis, relative_poses
 from dudmap.merging.run_graph import Join, drift_covariance
 from dudmap.places.saved_map import MAP_FILE
 
@@ -104,7 +104,9 @@ def _compare_two(a: Path, b: Path, guess: NDArray[np.float64] | None, header: Ma
         pair = decided(surface_of(a), surface_of(b), [Hypothesis(guess, 0, 0)], many=True)
         if pair.agreement is not None:
             return pair
-    found = suggested_poses(keyframes_of(a), keyframes_of(b), header.camera, header.sensor, many=True)
+    # a single recognised keyframe is enough: the features of a look-alike may outnumber those of the place itself, and
+    # the checks are stricter here
+    found = relative_poses(keyframes_of(a), keyframes_of(b), header.camera, sensor=header.sensor)
     if not found:
         return MapPair(None, NOT_RECOGNISED)
     return decided(surface_of(a), surface_of(b), found, many=True)

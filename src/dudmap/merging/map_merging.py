@@ -7,16 +7,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import SensorConfig
 from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
 from dudmap.mapping.volume import TsdfVolume
 from dudmap.merging.agreement import Agreement, agreement
-from dudmap.merging.map_fusion import check_voxel_sizes, fuse_maps
+from dudmap.merging.map_fusion import fuse_maps
 from dudmap.merging.map_samples import SurfacePoints, surface_points
 from dudmap.merging.relative_pose import Hypothesis, relative_poses
 from dudmap.merging.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
-from dudmap.places.place_recognition import Keyframe
 from dudmap.places.saved_map import SavedMap
 
 SURFACE_POINTS = 20_000
@@ -88,31 +85,16 @@ class MapSurface:
 
 
 def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
-    """Find the relative pose of two maps and decide whether they show the same place.
+    """Find the relative pose of two maps, whose voxels have one size, and decide whether they show the same place.
 
     Raises:
-        ConfigError: The voxels differ in size.
         MapError: A map has no surface.
     """
-    check_voxel_sizes([a.volume, b.volume])
-    found = suggested_poses(a.keyframes, b.keyframes, a.volume.camera, a.volume.sensor)
+    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
+    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
     if not found:
         return MapPair(None, NOT_RECOGNISED)
     return decided(MapSurface.of(a), MapSurface.of(b), found)
-
-
-def suggested_poses(
-    a: Sequence[Keyframe], b: Sequence[Keyframe], camera: Camera, sensor: SensorConfig, many: bool = False
-) -> list[Hypothesis]:
-    """Relative poses that enough features of two maps with these keyframes suggest, best first.
-
-    For two of many maps a single recognised keyframe is enough: the features of a look-alike may outnumber those of the
-    place itself, and the checks of ``decided`` are stricter then.
-    """
-    found = relative_poses(a, b, camera, sensor=sensor)
-    if many:
-        return found
-    return [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
 
 
 def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False) -> MapPair:

@@ -2,14 +2,17 @@
 
 import json
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from dudmap.atomic_file import write_bytes, write_text
-from dudmap.errors import DatasetError, DudmapError, MapError
+from dudmap.errors import DatasetError, MapError
+from dudmap.fleet.inputs import check_runs
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import damaged, read_bytes, read_json
 from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
@@ -42,30 +45,25 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     and the figures of all checks. Nothing is written if the maps are not to be joined.
 
     Raises:
-        MapError: A map is incomplete, or the maps are not to be joined; the message says why.
-        ConfigError: The voxels differ in size.
-        DudmapError: ``out`` is one of the runs or cannot be written.
+        MapError: The maps are not to be joined; the message says why.
+        DudmapError: As of ``check_runs``, or ``out`` cannot be written.
     """
     a, b, out = Path(a), Path(b), Path(out)
-    if out.resolve() in (a.resolve(), b.resolve()):
-        raise DudmapError(f"{out} is one of the runs to be merged; name another folder")
+    check_runs([a, b], out)
     maps = SavedMap.load(a), SavedMap.load(b)
     pair = compare_maps(*maps)
     if pair.T_a_b is None:
         raise MapError(f"{a} and {b} are not merged: {pair.reason}")
     merged = merged_map(*maps, pair.T_a_b)
-    trajectories = [*run_trajectories(a, np.eye(4)), *run_trajectories(b, pair.T_a_b)]
     prepare_run_folder(out, None, save_masks=False)
-    names = ["trajectory.txt", *(f"trajectory-{number}.txt" for number in range(2, len(trajectories) + 1))]
-    for name, trajectory in zip(names, trajectories, strict=True):
-        trajectory.save(out / name)
+    of_a, of_b = save_trajectories(out, [(a, np.eye(4)), (b, pair.T_a_b)])
     merged.volume.save(out / MAP_FILE)
     merged.save_keyframes(out / KEYFRAME_FILE)
     mesh = merged.volume.extract_mesh()
     mesh.save(out / "mesh.ply")
     if (a / "config.toml").is_file():
         write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
-    tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": names} | pair.tree()
+    tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": of_a + of_b} | pair.tree()
     tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
     tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
     finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
@@ -74,17 +72,24 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     return MergeReport(out, pair, tree)
 
 
-def run_trajectories(folder: Path, T: np.ndarray) -> list[Trajectory]:
-    """Trajectories in the world of the map of a run, moved by ``T`` (4, 4); a merged run has several.
+def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]]) -> list[list[str]]:
+    """Write the trajectories of runs, moved by the poses (4, 4) of their worlds, as trajectory.txt, trajectory-2.txt,
+    ...; names of the files of each run, since a merged run has several.
 
     Raises:
-        DatasetError: One of them, or the list of them in merge.json, is damaged.
+        DatasetError: A trajectory, or the list of them in merge.json, is damaged.
     """
-    names = ["trajectory.txt"]
-    if (folder / MERGE_FILE).is_file():
-        with damaged(DatasetError, folder / MERGE_FILE):
-            names = read_json(folder / MERGE_FILE)["trajectories"]
-            if not all(re.fullmatch(r"trajectory(-\d+)?\.txt", name) for name in names):
-                raise ValueError(f"it names {names} as its trajectories")
-    found = [Trajectory.load(folder / name) for name in names]
-    return [Trajectory(one.timestamps, T @ one.Ts_world_camera) for one in found]
+    names: list[list[str]] = []
+    for folder, T in runs:
+        known = ["trajectory.txt"]
+        if (folder / MERGE_FILE).is_file():
+            with damaged(DatasetError, folder / MERGE_FILE):
+                known = read_json(folder / MERGE_FILE)["trajectories"]
+                if not all(re.fullmatch(r"trajectory(-\d+)?\.txt", name) for name in known):
+                    raise ValueError(f"it names {known} as its trajectories")
+        first = 1 + sum(map(len, names))
+        names.append([f"trajectory-{n}.txt" if n > 1 else "trajectory.txt" for n in range(first, first + len(known))])
+        for source, name in zip(known, names[-1], strict=True):
+            found = Trajectory.load(folder / source)
+            Trajectory(found.timestamps, T @ found.Ts_world_camera).save(out / name)
+    return names
