@@ -77,7 +77,7 @@ class CommandGroup(TyperGroup):
 
 def not_enough_memory(error: MemoryError) -> str:
     """Sentence on what memory was missing for."""
-    return f"there is not enough memory ({str(error) or 'none is left'}); give the process more, or shorten what it works on"
+    return f"there is not enough memory ({str(error) or 'none is left'}); give the process more, or less to do"
 
 
 def fail(sentence: str, code: int = 1) -> None:
