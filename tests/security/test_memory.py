@@ -20,3 +20,13 @@ def test_too_little_memory(text, monkeypatch, tmp_path):
             f"dudmap: there is not enough memory ({text or 'none is left'}); give the process"
         )
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_library_that_finds_no_room(monkeypatch, tmp_path):
+    def fail(*arguments, **options):
+        raise ImportError("libgfortran.so.5: failed to map segment from shared object")
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("dudmap.sequences.open_sequence", fail)
+    found = CliRunner().invoke(app, ["info", "a"])
+    assert "there is not enough memory (libgfortran.so.5: failed to map" in found.stderr

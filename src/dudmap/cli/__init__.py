@@ -68,6 +68,8 @@ class CommandGroup(TyperGroup):
         except (typer.Exit, typer.Abort, _USAGE):
             raise
         except Exception as error:  # a defect of ours, whatever it is
+            if isinstance(error, ImportError) and "failed to map segment" in str(error):
+                fail(not_enough_memory(error))
             from dudmap.pipeline.crash_report import report_crash
 
             fail(str(report_crash(error, Path.cwd())))
@@ -75,10 +77,9 @@ class CommandGroup(TyperGroup):
             fail(str(interrupt) or "interrupted", code=130)
 
 
-def not_enough_memory(error: MemoryError) -> str:
+def not_enough_memory(error: MemoryError | ImportError) -> str:
     """Sentence on what memory was missing for."""
-    what = str(error) or "none is left"
-    return f"there is not enough memory ({what}); give the process more, or shorten what it works on"
+    return f"there is not enough memory ({str(error) or 'none is left'}); give the process more, or less to do"
 
 
 def fail(sentence: str, code: int = 1) -> None:

@@ -284,7 +284,7 @@ class TreeReader:
             if "class" not in node:
                 return tuple(items)
             cls: Any = schema.class_of(node["class"])
-            if not issubclass(cls, tuple) or len(items) != len(cls._fields):
+            if not issubclass(cls, tuple) or len(items) != len(getattr(cls, "_fields", ())):
                 raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
             return tuple.__new__(cls, items)
         items = self._items(node["frozenset"] if "frozenset" in node else node["set"])
@@ -339,7 +339,7 @@ class TreeReader:
         usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
         if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
             raise ValueError(f"{cls.__name__} is no class of plain objects")
-        value = self._use(node["id"], current if usable else object.__new__(cls))
+        value: Any = self._use(node["id"], current if usable else object.__new__(cls))
         content = node["attributes"]
         like = self._new.setdefault(cls, wiring.attributes(current)) if usable else self._new.get(cls, {})
         schema.check_attributes(cls, content, like)
@@ -352,7 +352,7 @@ class TreeReader:
             schema.check_value(cls, name, made, like.get(name))
             object.__setattr__(value, name, made)
             self._at.pop()
-        if isinstance(value, Camera):
+        if cls is Camera:
             value.__post_init__()  # its size decides how much memory is taken
         if "map" in node:
             self._load_map(value, node["map"], self._value(node["blocks"]))
