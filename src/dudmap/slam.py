@@ -97,7 +97,7 @@ class Slam(SlamResults):
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed, repeats_are_valid=config.sensor.repeats)
-        self.tracker = Tracker(config.tracker, config.sensor)
+        self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
         self.motion = MotionModel(config.tracker)
         self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)
@@ -119,7 +119,7 @@ class Slam(SlamResults):
         self.redundancy = RedundantViews(config)
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
-        self.balance = BalanceEstimator(config.sensor, config.preprocess)
+        self.balance = BalanceEstimator(config.sensor)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize

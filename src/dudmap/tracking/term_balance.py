@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import PreprocessConfig, SensorConfig
+from dudmap.config import SensorConfig
 from dudmap.frames.exposure import exposed
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import Pyramid
@@ -93,12 +93,10 @@ class BalanceEstimator:
 
     Args:
         sensor: Standard deviation of the time between colour and depth of a pixel.
-        preprocess: Width of the depth filter, within which noise is not independent.
     """
 
-    def __init__(self, sensor: SensorConfig, preprocess: PreprocessConfig) -> None:
+    def __init__(self, sensor: SensorConfig) -> None:
         self.sensor = sensor
-        self.preprocess = preprocess
         self._comparisons: deque[Comparison] = deque(maxlen=SAMPLES)
         self._frames = 0
         self._components = 1.0, 1.0
@@ -140,7 +138,7 @@ class BalanceEstimator:
         if min(np.trace(H_d), np.trace(H_c)) <= 0:
             return None
         inverse_d, inverse_c = _inverse(H_d), _inverse(H_c)
-        noise_d, noise_c = self._noise(distances, both, weights[1], tracker, fine)
+        noise_d, noise_c = self._noise(distances, both, weights[1], tracker, fine.camera.width / volume.camera.width)
         noise_d, noise_c = noise_d * inverse_d, noise_c * inverse_c
         parameters = tracker.parameters(volume.band)
         P_d, P_c = smooth_covariances(coarse, weights[0], parameters, velocity, self.sensor.color_time_sigma)
@@ -166,13 +164,14 @@ class BalanceEstimator:
         both: NormalEquations,
         weights: NDArray[np.float32],
         tracker: Tracker,
-        level: Level,
+        scale: float,
     ) -> tuple[float, float]:
         """Variances of a distance and of an intensity in the units of the two information matrices.
 
-        The filter makes the depth noise of the pixels within its area 4 pi sigma^2 one.
+        The filter makes the depth noise of the pixels within its area 4 pi sigma^2 one; ``scale`` is the width of the
+        image over that of the filtered one.
         """
-        area = 4 * np.pi * (self.preprocess.filter_sigma_px * level.camera.width / 640) ** 2
+        area = 4 * np.pi * (tracker.filter_px * scale) ** 2
         differences = both.residuals[1][weights > 0.5]
         differences = np.minimum(np.abs(differences[np.isfinite(differences)]), 2 * tracker.config.color_huber)
         color = float(np.mean(differences**2)) if len(differences) else 0.0
