@@ -75,6 +75,11 @@ class PreprocessConfig(ConfigSection):
     filter_radius: int = Field(default=6, ge=1, le=16)
     """Radius of the filter window, pixels."""
 
+    @property
+    def smoothing_px(self) -> float:
+        """Spatial standard deviation of the filter in use, pixels; 0 without one."""
+        return self.filter_sigma_px if self.filter == "bilateral" else 0.0
+
     @model_validator(mode="after")
     def _ordered(self) -> "PreprocessConfig":
         if self.depth_min >= self.depth_max:

@@ -103,7 +103,7 @@ class Slam(SlamResults):
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
-        self.tracker = Tracker(config.tracker, config.sensor)
+        self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
         self.motion = MotionModel(config.tracker, timed=timed)
         self.color_motion = ColorMotion(self.motion, given)
         self.detector = DynamicDetector(config.dynamics, config.sensor)

@@ -95,6 +95,16 @@ def lost_view(timestamp, depth=1.0):
     )
 
 
+def test_the_features_of_a_lost_frame_are_found_once():
+    subject = relocalizer(overrides=["submaps.patience=0.0", "dynamics.start_seconds=0"])
+    recover(subject, Registration())
+    subject.lost(5.0)
+    assert subject.wants_new_submap(lost_view(5.0))
+    assert len(subject.atlas.keyframes.masks) == 1
+    assert subject.wants_new_submap(lost_view(6.0))  # which nobody tried to recognise
+    assert len(subject.atlas.keyframes.masks) == 2
+
+
 def test_candidates_of_the_current_submap_come_first_and_the_atlas_stays():
     subject, register = relocalizer([match(0, 0.1), match(1, 0.2), match(0, 0.3), match(1, 0.4)]), Registration()
     assert recover(subject, register, accept=lambda tracking: False) is None

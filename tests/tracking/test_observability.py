@@ -11,14 +11,16 @@ from dudmap.geometry import se3
 from dudmap.geometry.camera import Camera
 from dudmap.kernels.descent import restricted_step
 from dudmap.mapping.volume import TsdfVolume
+from dudmap.slam import Slam
 from dudmap.tracking.checks import MAX_DRIFT
 from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.observability import FILTER_PX, INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
+from dudmap.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
 from dudmap.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]
 X, Y = (U - CAMERA.cx) / CAMERA.fx, (V - CAMERA.cy) / CAMERA.fy
+FILTER_PX = 4.0
 CONFIG = Config().override(["volume.voxel_size=0.03"])  # wider than a pixel on the farthest surfaces that count
 
 
@@ -119,6 +121,12 @@ def test_truncated_step_leaves_the_free_direction_alone():
     assert abs(restricted_step(J.T @ J, b, seen.observable) @ free) < 1e-9
 
 
+def test_the_noise_is_that_of_the_configured_filter():
+    for setting, width in (("filter_sigma_px=2", 2.0), ("filter=none", 0.0)):
+        slam = Slam(CAMERA, CONFIG.override([f"preprocess.{setting}"]))
+        assert slam.tracker.filter_px == slam.front_end.blind_tracker.filter_px == width
+
+
 @pytest.mark.parametrize("robust", ["huber", "tukey"])
 def test_noise_is_the_sum_over_the_readings(robust):
     rng = np.random.default_rng(4)
@@ -131,7 +139,7 @@ def test_noise_is_the_sum_over_the_readings(robust):
     volume = TsdfVolume(CAMERA, CONFIG.volume, config.sensor, 6.0)
     R = se3.exp_rotation(np.array([0.4, -0.3, 0.2]))
     parameters = Tracker(config.tracker, config.sensor).parameters(volume.band)
-    found = gradient_noise(level, residuals, weights, R, 0.03, CAMERA.width, parameters)
+    found = gradient_noise(level, residuals, weights, R, 0.03, CAMERA.width, FILTER_PX, parameters)
     distances, intensities, total = np.zeros((6, 6)), np.zeros((6, 6)), 0.0
     stride, t, scale = level.camera.width // 40, config.tracker, level.camera.width / CAMERA.width
     for v in range(stride // 2, shape[0], stride):

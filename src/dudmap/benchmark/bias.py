@@ -76,7 +76,7 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[P
         frames.append((Pyramid.of(observation, preprocess.camera, config).fine, T_truth))
     if len(frames) < 2:
         raise DatasetError(f"{sequence.name} has true poses for {len(frames)} frames; benchmark bias needs at least 2")
-    tracker = Tracker(config.tracker, config.sensor)
+    tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
     T_world_first = se3.inverse(frames[0][1])
     corrections: dict[str, list[NDArray[np.float64]]] = {"distances": [], "colour": [], "both": []}
     for level, T_truth in frames[::stride]:

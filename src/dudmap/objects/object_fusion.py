@@ -63,7 +63,7 @@ class ObjectFusion:
                 "color_weight": COLOR_SHARE * config.tracker.color_weight,
             }
         )
-        self.tracker = Tracker(tracker, config.sensor)
+        self.tracker = Tracker(tracker, config.sensor, config.preprocess.smoothing_px)
         self._volume_config = config.volume.model_copy(update={"voxel_size": config.movers.mesh_voxel_size})
         self._rng = np.random.default_rng(0)
         self._tracks: dict[int, ObjectTrack] = {}

@@ -56,6 +56,7 @@ class Relocalizer:
         self._crowded = False  # most of the view moved in the last tracked frame
         self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
         self._place_unknown = False
+        self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
 
     @property
     def is_lost(self) -> bool:
@@ -110,7 +111,9 @@ class Relocalizer:
         with view.timer("recognise"):
             keyframes = self.atlas.keyframes
             static_mask = None if view.known_dynamic is None else ~view.known_dynamic
-            candidates = keyframes.match(keyframes.extract(view.observation, static_mask))
+            features = keyframes.extract(view.observation, static_mask)
+            self._counted = view.observation.timestamp, len(features)
+            candidates = keyframes.match(features)
         candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
         candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
         num_readings = max(np.count_nonzero(view.labelled.depth), 1)
@@ -150,7 +153,10 @@ class Relocalizer:
             return False
         if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
             return False
-        if len(self.atlas.keyframes.extract(observation)) < self.config.relocalization.min_inliers:
+        timestamp, count = self._counted
+        if timestamp != observation.timestamp:  # relocalisation is off
+            count = len(self.atlas.keyframes.extract(observation))
+        if count < self.config.relocalization.min_inliers:
             return False
         if len(recent) < 2:
             return self._shows_static_world(recent[0] if recent else None, view)

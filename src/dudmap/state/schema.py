@@ -7,7 +7,7 @@ those of another class what its methods name, of the types that they have in a n
 import sys
 from collections import ChainMap, deque
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import is_dataclass
 from functools import cache
 from importlib import import_module
 from types import NoneType, UnionType
@@ -97,7 +97,7 @@ def class_of(name: object) -> type:
 def _names(cls: type) -> frozenset[str]:
     """Names that the attributes of an object may have."""
     if is_dataclass(cls):
-        return frozenset(field.name for field in fields(cls))
+        return frozenset(name for base in cls.__mro__ for name in vars(base).get("__annotations__", ()))
     codes = (getattr(one, "__code__", None) for base in cls.__mro__ for one in vars(base).values())
     return frozenset(name for code in codes if code is not None for name in code.co_names)
 

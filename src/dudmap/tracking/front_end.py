@@ -54,7 +54,7 @@ class FrontEnd:
         self.config = config
         self.tracker = tracker
         distances_only = config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
-        self.blind_tracker = Tracker(distances_only, config.sensor)
+        self.blind_tracker = Tracker(distances_only, config.sensor, config.preprocess.smoothing_px)
         self.detector = detector
         self.motion = motion
         self.monitor = monitor

@@ -10,9 +10,6 @@ from dudmap.frames.observation import Level
 from dudmap.kernels.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, noise_sums
 from dudmap.kernels.parameters import ImageStack, RegistrationParameters, single
 
-FILTER_PX = 4.0
-"""Spatial standard deviation of the depth filter (thesis section 4.3), pixels of the image that is filtered, with which
-the gradient noise of the distances is computed."""
 INTENSITY_SIGMA = 1 / 255
 """Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
 SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
@@ -130,6 +127,7 @@ def gradient_noise(
     R_world_camera: NDArray[np.float64],
     voxel_size: float,
     map_width: int,
+    filter_px: float,
     parameters: RegistrationParameters,
 ) -> GradientNoise | None:
     """What noise of the gradients contributes to H in a view.
@@ -149,6 +147,7 @@ def gradient_noise(
         R_world_camera: (3, 3).
         voxel_size: Metres.
         map_width: Width of the images that the map was made of, pixels.
+        filter_px: Spatial standard deviation of their depth filter, pixels.
         parameters: The weights of the residuals.
 
     Returns:
@@ -157,7 +156,7 @@ def gradient_noise(
     """
     camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
     scale = camera.width / map_width
-    sums, numbers = np.zeros(NUM_SUMS), (FILTER_PX * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
+    sums, numbers = np.zeros(NUM_SUMS), (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
     noise_sums(
         stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
         *numbers, sums,

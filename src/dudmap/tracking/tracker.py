@@ -5,7 +5,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.config import SensorConfig, TrackerConfig
+from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
 from dudmap.frames.exposure import chained, exposed, fit_exposure
 from dudmap.frames.observation import Level
 from dudmap.geometry import se3
@@ -106,11 +106,15 @@ class Tracker:
     Args:
         config: Residual weights, iterations, stop criteria, checks.
         sensor: Noise of the depth readings.
+        filter_px: Spatial standard deviation of the filter of the depth images, pixels.
     """
 
-    def __init__(self, config: TrackerConfig, sensor: SensorConfig) -> None:
+    def __init__(
+        self, config: TrackerConfig, sensor: SensorConfig, filter_px: float = PreprocessConfig().smoothing_px
+    ) -> None:
         self.config = config
         self.sensor = sensor
+        self.filter_px = filter_px
 
     def align(
         self,
@@ -193,7 +197,8 @@ class Tracker:
             return COMPLETE
         parameters = self.parameters(volume.band, color_weight)
         noise = gradient_noise(
-            level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, parameters
+            level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, self.filter_px,
+            parameters,
         )  # fmt: skip
         if noise is None or noise.is_exceeded(system.H, least):
             return COMPLETE
