@@ -10,7 +10,7 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.pipeline.replay import WAITING, Arrival, WaitingRoom, live, replay
+from dudmap.pipeline.replay import Arrival, WaitingRoom, live, replay
 from dudmap.pipeline.run import run
 from dudmap.sequences import open_sequence
 from fake_slam import FakeSlam
@@ -50,9 +50,13 @@ def test_frames_arrive_when_their_times_tell():
     np.testing.assert_allclose(times, [0, 0.1, 0.2, 2.0], atol=1e-9)
 
 
+def test_a_reader_that_is_late_for_a_moment_leaves_none_out():
+    assert replayed(3 + 0.04 * np.arange(6), 0.042)[0] == [0, 1, 2, 3, 4, 5]
+
+
 def test_a_reader_that_is_too_slow_leaves_frames_out():
-    indices, times = replayed(3 + 0.1 * np.arange(10), 0.25)
-    assert indices == [0, 1, 3, 5, 7, 8, 9]  # free again at 0.25, 0.5, ...: the latest three that are due are left
+    indices, times = replayed(3 + 0.1 * np.arange(10), 0.24)
+    assert indices == [0, 2, 4, 7, 9]  # free again at 0.24, 0.48, 0.72, 0.96
     np.testing.assert_allclose(times, 0.1 * np.array(indices), atol=1e-9)
 
 
@@ -62,19 +66,23 @@ def test_a_replay_ends_when_told():
     assert [arrival.number for arrival in offered] == [0]
 
 
-def test_a_few_frames_wait_and_the_newest_replaces_the_last_of_them():
+def test_only_frames_of_the_last_moment_wait():
     room = WaitingRoom()
-    for number in range(6):
-        room.put(number)
+    for number, arrived in enumerate([0.0, 0.2, 0.26, 0.29, 0.32]):
+        room.put(Arrival(number, "", arrived))
+    assert room.take().number == 2, "that at 0.2 is too old"
+    room.put(Arrival(5, "", 9.0))
     room.close()
-    assert [room.take() for _ in range(WAITING + 2)] == [0, 1, 5, None, None]
+    assert room.take().number == 5
+    assert room.take() is None
+    assert room.take() is None
 
 
 def test_a_consumer_waits_for_the_next():
     room, taken = WaitingRoom(), []
-    thread = threading.Thread(target=lambda: taken.append(room.take()))
+    thread = threading.Thread(target=lambda: taken.append(room.take().item))
     thread.start()
-    room.put("late")
+    room.put(Arrival(0, "late", 0.0))
     thread.join(timeout=5)
     assert taken == ["late"]
 
@@ -109,9 +117,9 @@ def test_other_work_is_done_while_no_frame_waits():
         return bool(left and left.pop())
 
     arrived = []
-    for arrival in live(0.1 * np.arange(4), str, idle):
+    for arrival in live(np.array([0.0, 0.2, 0.26, 0.3]), str, idle):
         arrived.append(arrival.number)
-        time.sleep(0.25 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
+        time.sleep(0.2 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
     assert arrived == [0, 1, 2, 3]
     assert not left
     assert 1 not in done
@@ -148,7 +156,7 @@ def test_a_live_run_counts_what_it_dropped(slam, recording, tmp_path, capsys, mo
     fast = FakeSlam.process
 
     def slow(self, frame):
-        time.sleep(0.12)
+        time.sleep(0.2)
         return fast(self, frame)
 
     monkeypatch.setattr(slam, "process", slow)

@@ -1,8 +1,10 @@
 """Calibration of the colour camera while it moves."""
 
+import os
+import sys
 from collections.abc import Callable
 from concurrent.futures import Future
-from threading import Thread
+from threading import Thread, get_native_id
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,9 @@ of hand-held motion that show every fault, and each time after twice as long, as
 DELAY = 60
 """Frames between the beginning of an estimation and the use of its result: the time that it takes beside the tracking,
 so that a recording, whose result must not depend on the machine, rarely has to wait for it."""
+
+PRIORITY = 10
+"""Priority of the thread of an estimation, as of ``nice``: a tenth of the share of the tracking on a busy core."""
 
 
 class SelfCalibration:
@@ -102,6 +107,8 @@ def _in_background(function: Callable[[], Estimate]) -> "Future[Estimate]":
     future: Future[Estimate] = Future()
 
     def work() -> None:
+        if sys.platform == "linux":  # where threads have priorities
+            os.setpriority(os.PRIO_PROCESS, get_native_id(), PRIORITY)
         try:
             future.set_result(function())
         except BaseException as error:  # raised where the result is asked for

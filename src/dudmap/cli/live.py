@@ -63,7 +63,7 @@ def live(
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene while a camera moves; Ctrl-C ends and writes the results.
 
-    The newest frame is processed; frames that arrive meanwhile are counted as dropped, but recorded with --record.
+    Frames wait for at most 0.1 s; those for which there is no time are counted as dropped, but recorded with --record.
     """
     from dudmap.cameras import open_camera
     from dudmap.geometry.calibration import Calibration

@@ -63,7 +63,7 @@ def write_map(path: str | Path, volume: "TsdfVolume") -> None:
     }
     shape = len(small["entries"]), BLOCK**3
     try:
-        with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, allowZip64=True) as archive:
+        with atomic_file(path) as file, zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED, compresslevel=2) as archive:
             for name, value in small.items():
                 array = np.asanyarray(value)
                 _write_array(archive, name, array.dtype, array.shape, iter([array]))

@@ -42,8 +42,8 @@ def run_live(
 ) -> RunReport:
     """Run the system on a camera until the stream ends, ``max_frames`` are processed, or Ctrl-C; write a run folder.
 
-    Up to three of the frames that arrive while one is processed wait; others are counted as ``dropped`` in metrics.json
-    and timings.csv. The folder is that of ``dudmap.pipeline.run.run``. The camera is closed
+    Of the frames that arrive while one is processed, those of the last 0.1 s wait; older ones are counted as
+    ``dropped`` in metrics.json and timings.csv. The folder is that of ``dudmap.pipeline.run.run``. The camera is closed
     at the end.
 
     Args:

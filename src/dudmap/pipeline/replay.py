@@ -26,18 +26,17 @@ class Arrival(NamedTuple, Generic[T]):
     time: float
 
 
-WAITING = 3
-"""Frames that may wait for their processing, 0.1 s at 30 Hz: one that takes twice as long as usual delays the next ones
-and drops none."""
+PATIENCE = 0.1
+"""Time for which a frame may wait for its processing, seconds: at 30 Hz one that takes three times as long as usual
+delays the next ones and drops none, and nothing is processed that is much older."""
 
 
 class WaitingRoom(Generic[T]):
-    """Thread-safe queue of ``WAITING`` items between a sensor and its consumer; where it is full, a new item replaces
-    the last one."""
+    """Thread-safe queue between a sensor and its consumer: of the newest item and those at most ``PATIENCE`` older."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._held: list[T] = []
+        self._held: list[Arrival[T]] = []
         self._closed = False
 
     @property
@@ -45,13 +44,13 @@ class WaitingRoom(Generic[T]):
         """Whether no item waits."""
         return not self._held
 
-    def put(self, item: T) -> None:
+    def put(self, item: Arrival[T]) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
-            self._held = [*self._held[: WAITING - 1], item]
+            self._held = [held for held in self._held if item.time - held.time <= PATIENCE] + [item]
             self._changed.notify()
 
-    def take(self) -> T | None:
+    def take(self) -> Arrival[T] | None:
         """Oldest item; waits for one that was not taken yet. None once the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._held or self._closed)
@@ -73,7 +72,8 @@ def replay(
 ) -> None:
     """Deliver the frames of a recording in real time: the first one now, the others at their timestamps.
 
-    Of the frames that become due while an earlier one is read, the latest ``WAITING`` are read; others are dropped.
+    Of the frames that become due while an earlier one is read, the latest and those due since ``PATIENCE`` are read;
+    the others are dropped.
 
     Args:
         timestamps: (N,) increasing timestamps, seconds.
@@ -88,7 +88,9 @@ def replay(
         while (early := start + timestamps[index] - now()) > 0:
             if wait(early):
                 return
-        index = max(index, int(np.searchsorted(timestamps, now() - start, side="right")) - WAITING)
+        elapsed = now() - start
+        latest = int(np.searchsorted(timestamps, elapsed, side="right")) - 1
+        index = max(index, min(latest, int(np.searchsorted(timestamps, elapsed - PATIENCE))))
         put(Arrival(index, read(index), start + timestamps[index]))
         index += 1
 
@@ -117,7 +119,7 @@ def arrivals(
         stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
         idle: Called while no item waits; does a few milliseconds of other work and returns True, or has none.
     """
-    waiting: WaitingRoom[Arrival[T]] = WaitingRoom()
+    waiting: WaitingRoom[T] = WaitingRoom()
     stopping = threading.Event()
 
     def sensor() -> None:
