@@ -56,7 +56,7 @@ class ImageFolder:
     color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
     depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
     pose_files: tuple[str, str] | None = None
-    """Folder, and pattern of the names of its numbered files: images, and true poses (camera to world, a matrix each)."""
+    """Folder, and pattern of the names of its numbered files: images, and true poses, a matrix camera to world each."""
     published: tuple[str, dict[str, float]] | None = None
     """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
 
