@@ -82,6 +82,7 @@ class FakeSlam:
         max_blocks=None,
         timed=True,
     ):
+        type(self).timed = timed
         self.localize = localize
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass

@@ -61,7 +61,7 @@ def camera_files(folder):
 def load_camera_file(path):
     from dudmap.sequences import camera_json
 
-    camera_json.load([path], 1000.0).camera(64, 48)
+    camera_json.load([path]).camera(64, 48)
 
 
 def load_intrinsics(path):

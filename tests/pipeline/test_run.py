@@ -220,3 +220,13 @@ def test_a_folder_that_cannot_be_written_is_found_before_the_work(slam, recordin
         go(recording, tmp_path / "file" / "below")
     with pytest.raises(DudmapError, match="cannot write into the run folder"):
         go(recording, "/proc/dudmap")
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_the_system_knows_whether_times_are_invented(slam, recording, tmp_path, timed):
+    sequence = open_sequence(recording)
+    sequence.timed = timed
+    run(sequence, Config(), tmp_path / "run", progress=False)
+    assert slam.timed is timed
+    assert metrics_of(tmp_path / "run")["sources"]["times"] == "the recording"
+    assert metrics_of(tmp_path / "run")["recording"]["path"] == str(recording.resolve())

@@ -184,6 +184,15 @@ def test_forms_of_poses(folder, form):
     np.testing.assert_allclose(open_sequence(folder).ground_truth.Ts_world_camera, expected, atol=1e-9)
 
 
+def test_times_of_the_truth_are_not_those_of_numbered_images(folder):
+    np.savetxt(folder / "K.txt", MATRIX)
+    truth = open_sequence(folder, fps=5).ground_truth
+    np.testing.assert_allclose(truth.timestamps, [0, 0.2, 0.4])
+    (folder / "poses.txt").unlink()
+    truth.save(folder / "groundtruth.txt")
+    np.testing.assert_allclose(open_sequence(folder, fps=5).ground_truth.timestamps, [0, 0.2, 0.4])
+
+
 @pytest.mark.parametrize(
     ("change", "sentence"),
     [

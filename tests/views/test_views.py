@@ -133,6 +133,12 @@ def test_bad_input_is_one_sentence(made, run, cleaned, tmp_path):
         clean_recording(run, later, tmp_path / "out")
 
 
+def test_only_the_first_frames_are_cleaned(made, run, tmp_path):
+    report = clean_recording(run, open_sequence(made[0] / "recording"), tmp_path / "out", max_frames=2)
+    assert (report.frames, report.left_out) == (2, ())
+    assert len(open_sequence(tmp_path / "out")) == 2
+
+
 # -- parts -------------------------------------------------------------------------------------------------------------
 
 

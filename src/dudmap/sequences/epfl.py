@@ -2,8 +2,7 @@
 
 from pathlib import Path
 
-from dudmap.geometry.association import TimedFile
-from dudmap.sequences.image_folder import ImageFolder, numbered_files
+from dudmap.sequences.image_folder import ImageFolder
 
 CAMERA = {
     "fx": 365.8046307762528, "fy": 365.80463336811664, "cx": 254.31510758228475, "cy": 206.98513348550657,
@@ -17,14 +16,9 @@ class EpflSequence(ImageFolder):
 
     format = "EPFL RGB-D Pedestrian"
     published = "EPFL", CAMERA
+    color_files, depth_files = ("", r"rgb(\d{6})\.png"), ("", r"depth(\d{6})\.png")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether a folder has this layout."""
         return path.is_dir() and all(any(path.glob(kind + "[0-9]" * 6 + ".png")) for kind in ("rgb", "depth"))
-
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        files = list(self.path.iterdir())
-        return self._pair_numbered(
-            numbered_files(files, r"rgb(\d{6})\.png"), numbered_files(files, r"depth(\d{6})\.png")
-        )

@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.geometry import se3
-from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import camera_files, images, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
-from dudmap.sequences.poses import read_matrices, read_matrix, rigid_trajectory
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder
+from dudmap.sequences.poses import read_matrices, rigid_trajectory
 
 NAME = r"frame-(\d+)"
 SEVEN_SCENES_DEPTH = {"fx": 585.0, "fy": 585.0, "cx": 320.0, "cy": 240.0, "width": 640, "height": 480}
@@ -37,14 +36,8 @@ LOST = 65535
 class FrameFiles(ImageFolder):
     """Base of the formats whose files are named ``frame-000000``; poses are camera to world, one file per frame."""
 
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        files = list(self.path.iterdir())
-        colors = numbered_files(files, NAME + r"\.(?:color|rgb)\.(?:png|jpe?g)")
-        return self._pair_numbered(colors, numbered_files(files, NAME + r"\.depth\.(?:png|pgm)"))
-
-    def _find_ground_truth(self) -> Trajectory | None:
-        poses = numbered_files(self.path.iterdir(), NAME + r"\.pose\.txt")
-        return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
+    color_files, depth_files = ("", NAME + r"\.(?:color|rgb)\.(?:png|jpe?g)"), ("", NAME + r"\.depth\.(?:png|pgm)")
+    pose_files = "", NAME + r"\.pose\.txt"
 
 
 class SharedFrameFiles(FrameFiles):

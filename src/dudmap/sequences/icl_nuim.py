@@ -7,7 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, FrameError
-from dudmap.geometry.association import TimedFile, read_rows
+from dudmap.geometry.association import read_rows
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import read_text
 from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
@@ -43,11 +43,6 @@ class IclNuimSequence(ImageFolder):
         named = re.search(r"(living|office)_?room|traj\d+n?_(frei|loop)", path.resolve().name, re.IGNORECASE)
         return named is not None or any(path.glob("*.gt.freiburg"))
 
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        colors = numbered_files((self.path / "rgb").iterdir(), r"(\d+)\.png")
-        depths = numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png")
-        return self._pair_numbered(colors, depths)
-
     def _find_ground_truth(self) -> Trajectory | None:
         file = _truth_file(self.path)
         return None if file is None else _freiburg(file)
@@ -62,16 +57,12 @@ class IclNuimLoopSequence(ImageFolder):
 
     format = "ICL-NUIM"
     published = "ICL-NUIM", CAMERA
+    color_files, depth_files = ("", SCENE_FILE + r"\.png"), ("", SCENE_FILE + r"\.depth")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether a folder has this layout."""
         return path.is_dir() and any(path.glob("scene_*_*.depth"))
-
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        files = list(self.path.iterdir())
-        colors = numbered_files(files, SCENE_FILE + r"\.png")
-        return self._pair_numbered(colors, numbered_files(files, SCENE_FILE + r"\.depth"))
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         try:

@@ -1,7 +1,6 @@
 """Recordings of pairs of image files: what all folder formats share."""
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sized
 from pathlib import Path
 
@@ -15,6 +14,7 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import damaged
 from dudmap.sequences import camera_files, images, intrinsics
+from dudmap.sequences.poses import read_matrix, rigid_trajectory
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""
@@ -22,11 +22,12 @@ FRAME_RATE = 30.0
 """Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
 
 
-class ImageFolder(ABC):
+class ImageFolder:
     """Base class of recordings whose frames are a colour file and a depth file each.
 
-    A format says how its files pair (``_find_pairs``) and optionally what its cameras are where no file says so
-    (``_published``), where the truth is (``_find_ground_truth``) and how an image is stored (``_read_depth``).
+    A format says what its files are called (``color_files`` and so on) or how they pair (``_find_pairs``), and
+    optionally its cameras where no file does (``published``), where the truth is (``_find_ground_truth``) and how an
+    image is stored (``_read_depth``).
 
     Args:
         path: The folder.
@@ -52,6 +53,10 @@ class ImageFolder(ABC):
     timed = True
     depth_scale = 1000.0
     """Depth units per metre where neither the recording nor the user says otherwise."""
+    color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
+    depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
+    pose_files: tuple[str, str] | None = None
+    """Folder, and pattern of the names of its numbered files: images, and true poses, a matrix camera to world each."""
     published: tuple[str, dict[str, float]] | None = None
     """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
 
@@ -118,9 +123,13 @@ class ImageFolder(ABC):
         """True dynamic mask (H, W) of a frame; this layout has none."""
         return None
 
-    @abstractmethod
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of all frames, by increasing time of the depth."""
+        return self._pair_numbered(self._numbered(self.color_files), self._numbered(self.depth_files))
+
+    def _numbered(self, files: tuple[str, str]) -> dict[int, Path]:
+        folder, pattern = files
+        return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         """Intrinsics of a file that lies there, else those of the data set.
@@ -142,7 +151,8 @@ class ImageFolder(ABC):
 
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""
-        return None
+        poses = self._numbered(self.pose_files) if self.pose_files else {}
+        return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
 
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None

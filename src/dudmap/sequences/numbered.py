@@ -73,6 +73,11 @@ class NumberedSequence(ImageFolder):
         first, second = (sorted(TimedFile(_seconds(n), f) for n, f in files.items()) for files in (colors, depths))
         return self._pair_timed(first, second)
 
+    def set_rate(self, fps: float) -> None:
+        """As for ``ImageFolder``; groundtruth.txt has times of its own."""
+        super().set_rate(fps)
+        self.ground_truth = self._find_ground_truth()
+
     def _find_ground_truth(self) -> Trajectory | None:
         if (self.path / "groundtruth.txt").is_file():
             return Trajectory.load(self.path / "groundtruth.txt")

@@ -2,9 +2,8 @@
 
 from pathlib import Path
 
-from dudmap.geometry.association import TimedFile
 from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
+from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder
 from dudmap.sequences.poses import read_matrices, rigid_trajectory
 
 CAMERA = {"fx": 600.0, "fy": 600.0, "cx": 599.5, "cy": 339.5, "width": 1200, "height": 680, "depth_scale": 6553.5}
@@ -20,16 +19,12 @@ class ReplicaSequence(ImageFolder):
     format = "Replica (NICE-SLAM)"
     depth_scale = CAMERA["depth_scale"]
     published = "NICE-SLAM's Replica", CAMERA
+    color_files, depth_files = ("results", r"frame(\d+)\.(?:jpe?g|png)"), ("results", r"depth(\d+)\.png")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether a folder has this layout."""
         return (path / "results").is_dir() and any((path / "results").glob("depth*.png"))
-
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        files = list((self.path / "results").iterdir())
-        colors = numbered_files(files, r"frame(\d+)\.(?:jpe?g|png)")
-        return self._pair_numbered(colors, numbered_files(files, r"depth(\d+)\.png"))
 
     def _find_ground_truth(self) -> Trajectory | None:
         file = self.path / "traj.txt"

@@ -7,11 +7,9 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError
 from dudmap.geometry import se3
-from dudmap.geometry.association import TimedFile
-from dudmap.geometry.trajectory import Trajectory
 from dudmap.sequences import images, intrinsics
-from dudmap.sequences.image_folder import FRAME_RATE, ImageFolder, numbered_files
-from dudmap.sequences.poses import read_matrix, rigid_trajectory
+from dudmap.sequences.image_folder import ImageFolder
+from dudmap.sequences.poses import read_matrix
 
 
 class ScanNetSequence(ImageFolder):
@@ -23,16 +21,13 @@ class ScanNetSequence(ImageFolder):
     """
 
     format = "ScanNet export"
+    color_files, pose_files = ("color", r"(\d+)\.(?:jpe?g|png)"), ("pose", r"(\d+)\.txt")
 
     @staticmethod
     def recognises(path: Path) -> bool:
         """Whether a folder has this layout."""
         folders = all((path / kind).is_dir() for kind in ("color", "depth", "pose"))
         return folders and _parameter(path, "intrinsic_depth.txt") is not None
-
-    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        colors = numbered_files((self.path / "color").iterdir(), r"(\d+)\.(?:jpe?g|png)")
-        return self._pair_numbered(colors, numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png"))
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
         depth = self._values("depth")
@@ -44,10 +39,6 @@ class ScanNetSequence(ImageFolder):
             color | {"width": width, "height": height},
             se3.inverse(self._extrinsic("depth")) @ self._extrinsic("color"),
         )
-
-    def _find_ground_truth(self) -> Trajectory | None:
-        poses = numbered_files((self.path / "pose").iterdir(), r"(\d+)\.txt")
-        return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
 
     def _values(self, kind: str) -> dict[str, float]:
         file = _parameter(self.path, f"intrinsic_{kind}.txt")
