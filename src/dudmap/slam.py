@@ -211,7 +211,7 @@ class Slam(SlamResults):
         estimate = relocalized or estimate
         if reason and not relocalized:
             return replace(self._lose(view, estimate, reason), checks=verdict.figures)
-        view = self.color_motion.registered(view, estimate.T_world_camera)
+        view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)

@@ -99,3 +99,15 @@ def test_registered_colour_is_taken_as_it_is_bit_for_bit():
     exact = recording()
     same = replace(Calibration.registered(SMALL), sigma=np.ones(13))
     assert np.array_equal(poses(exact, None), poses(exact, same))
+
+
+def test_the_frame_that_is_fused_is_the_one_that_was_registered():
+    faulty = recording(color_delay=0.03)
+    slam, made, given = Slam(SMALL, calibration=truth_of(faulty)), [], []
+    refined, registered = slam.color_motion.refined, slam.color_motion.registered
+    slam.color_motion.refined = lambda view, T: made.append(refined(view, T)) or made[-1]
+    slam.color_motion.registered = lambda view, T: given.append(view) or registered(view, T)
+    for index in range(5):
+        slam.process(faulty[index])
+    assert given[-1] is made[-1]
+    assert np.linalg.norm(made[-1].color_velocity) > 0

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from dudmap.dynamics.masks import Labels
 from dudmap.frames.observation import Level
 from dudmap.frames.pyramid import reduced
+from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.tracker import TrackingResult
 
 PREVIOUSLY_DYNAMIC_WEIGHT = 0.1
@@ -23,11 +24,13 @@ class PoseEstimate:
         labels: Static probabilities and dynamic pixels; None where labelling is switched off or the frame starts a map.
         unverified_mask: (h, w) bool, label resolution, pixels that ego-motion could not verify as static while most of
             the view moves; None for none.
+        view: The frame with the colours that were registered; None where those it was given with were.
     """
 
     tracking: TrackingResult
     labels: Labels | None = None
     unverified_mask: NDArray[np.bool_] | None = None
+    view: FrameView | None = None
 
     @classmethod
     def at_origin(cls) -> "PoseEstimate":

@@ -113,7 +113,7 @@ class FrontEnd:
             tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
         if view.blind:
             tracking = replace(tracking, color_residual=np.nan)
-        return PoseEstimate(tracking, labels, unverified)
+        return PoseEstimate(tracking, labels, unverified, view)
 
     def update(self, view: FrameView, estimate: PoseEstimate) -> None:
         """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""
