@@ -43,7 +43,7 @@ def calibrate_start(
     sequence: "Sequence",
     config: Config,
     max_frames: int | None = None,
-    notice: "Callable[[str], None]" = lambda text: None,
+    notice: "Callable[[str], None] | None" = None,
 ) -> Calibration | None:
     """Calibration estimated from the start of a recording; None where none was made.
 
@@ -55,6 +55,7 @@ def calibrate_start(
         max_frames: Number of frames that will be processed; None for all.
         notice: Receives sentences on what is being done and what was found.
     """
+    notice = notice or (lambda text: None)
     count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
     if config.preset == "thesis" or count < MIN_FRAMES:
         return None
