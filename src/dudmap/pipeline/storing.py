@@ -172,8 +172,8 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
         raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
     options, begun = meta.get("options"), any(key in meta for key in PLACE)
-    known = isinstance(meta.get("recording"), str) and isinstance(options, dict)
-    known = known and all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
+    options = options if isinstance(options, dict) and isinstance(meta.get("recording"), str) else {}
+    known = all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
     if not known or (begun and not all(schema.fits(meta.get(key), kind) for key, kind in PLACE.items())):
         raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
     return reader, meta

@@ -152,7 +152,7 @@ class RosBag(FileRecording):
         one_size = depth_size == color_size
         if given is not None:
             known = intrinsics.given(given)
-            depth_lens = Lens(known.camera(*depth_size, self._units()))
+            depth_lens = Lens(known.camera(depth_size[0], depth_size[1], self._units()))
             source = known.source
         else:
             info, beside = topics.depth_info, topics.depth
