@@ -35,6 +35,8 @@ class FakeResult:
     uncertain: str = ""
     calibrated: bool = False
     rejected: str = ""
+    repeats: str = ""
+    checks: dict = field(default_factory=dict)
     unobservable: np.ndarray = field(default_factory=lambda: np.empty((0, 6)))
     dynamic_mask: np.ndarray = field(default_factory=lambda: np.zeros((HEIGHT, WIDTH), bool))
     dynamic_share: float = 0.0

@@ -117,6 +117,7 @@ REQUIRED = {
     "tomli_w",
     "click",
     "PIL",
+    "yaml",
 }
 ELSEWHERE = {"open3d_slam.py"}
 """Scripts that another interpreter runs."""

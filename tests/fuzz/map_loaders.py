@@ -1,5 +1,8 @@
 """Maps, the stored state of a run, keyframes and depth models, each with a writer of a small valid one."""
 
+import tempfile
+from pathlib import Path
+
 import numpy as np
 
 
@@ -142,10 +145,11 @@ def merged_folder(folder):
 def load_merged_folder(path):
     from file_loaders import load_run_folder
 
-    from dudmap.pipeline.merge import run_trajectories
+    from dudmap.fleet.two_runs import save_trajectories
 
     load_run_folder(path)
-    run_trajectories(path, np.eye(4))
+    with tempfile.TemporaryDirectory() as out:
+        save_trajectories(Path(out), [(path, np.eye(4))])
 
 
 def world(folder):

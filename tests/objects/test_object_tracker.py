@@ -155,7 +155,7 @@ def test_lines_of_the_file(tmp_path):
             SimpleNamespace(
                 timestamp=stamp, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
                 blind=False, uncertain="", movers=found, dynamic_share=0.1, timings={}, labels=None,
-                unobservable=(), rejected="",
+                unobservable=(), rejected="", repeats="", checks={},
             ), 1.0, 1.0, None,
         )  # fmt: skip
     record.save_movers(tmp_path / "movers.jsonl")
@@ -192,7 +192,7 @@ def test_a_live_run_adds_movers_when_there_is_time():
     record = RunRecord(dropped=0)
     result = SimpleNamespace(
         timestamp=1.5, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
-        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="",
+        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="", repeats="", checks={},
         movers=(),
     )  # fmt: skip
     record.add(result, 1.0, 1.0, None)

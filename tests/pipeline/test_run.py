@@ -37,8 +37,8 @@ def test_the_run_folder(slam, recording, tmp_path):
     out = tmp_path / "deep" / "out"
     report = go(recording, out)
     assert sorted(path.name for path in out.iterdir()) == [
-        "calibration.toml", "config.toml", "keyframes.npz", "map.npz", "mesh.ply", "metrics.json", "movers.jsonl",
-        "timings.csv", "trajectory.txt",
+        "calibration.toml", "checks.csv", "config.toml", "keyframes.npz", "map.npz", "mesh.ply", "metrics.json",
+        "movers.jsonl", "timings.csv", "trajectory.txt",
     ]  # fmt: skip
     metrics = metrics_of(out)
     assert metrics == json.loads(json.dumps(report.metrics))

@@ -10,11 +10,12 @@ import time
 import tracemalloc
 import zlib
 
+import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError, DudmapError
+from dudmap.fleet.two_runs import save_trajectories
 from dudmap.input_files import DEEPEST, LARGEST_COUNT, inflated, parse_json, parse_toml
-from dudmap.pipeline.merge import run_trajectories
 from dudmap.pipeline.resume import resume
 from dudmap.sequences import open_sequence
 
@@ -122,7 +123,7 @@ def test_a_pipe_in_the_place_of_metrics_json_does_not_block(tmp_path, little):
 def test_merge_json_names_trajectories_of_its_folder_only(names, tmp_path):
     (tmp_path / "merge.json").write_text(json.dumps({"trajectories": names}))
     with pytest.raises(DudmapError, match=r"merge\.json"):
-        run_trajectories(tmp_path, None)
+        save_trajectories(tmp_path / "out", [(tmp_path, np.eye(4))])
 
 
 @pytest.mark.parametrize("file", ["/etc/passwd", "../../map.npz", "map/../../x.npz", 7, "map/0000000000001.npy"])
