@@ -252,6 +252,38 @@ def faults(
         raise typer.Exit(1)
 
 
+@app.command("wrong-input")
+def wrong_input(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room of boxes.")
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=4, help="Number of frames from the start.")] = 40,
+    width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
+    only: Annotated[str, typer.Option("--only", help="Comma-separated kinds of wrong input; default: all.")] = "",
+    as_json: JsonOption = False,
+) -> None:
+    """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
+    from dudmap import synthetic
+    from dudmap.benchmark.wrong_input import measure_wrong_input, spoilt_table
+    from dudmap.config import Config
+    from dudmap.sequences import open_sequence
+    from dudmap.synthetic.recording import DEFAULT_CAMERA
+
+    if recording is not None:
+        source = open_sequence(recording)
+    else:
+        camera = DEFAULT_CAMERA.resized(width, width * 3 // 4)
+        source = synthetic.sequence("box", frames=frames, camera=camera, noise="kinect")
+    names = [name for name in only.split(",") if name]
+    runs = list(measure_wrong_input(source, Config(), names, frames))
+    failed = [run.name for run in runs if run.fails]
+    tree = {"recording": source.name, "runs": [run._asdict() for run in runs], "failed": failed}
+    answer(tree, spoilt_table(runs), as_json=as_json)
+    if failed:
+        say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
+        raise typer.Exit(1)
+
+
 @app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
