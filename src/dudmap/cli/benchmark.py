@@ -255,30 +255,27 @@ def faults(
 @app.command("wrong-input")
 def wrong_input(
     recording: Annotated[
-        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room of boxes.")
+        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic desk and room.")
     ] = None,
     frames: Annotated[int, typer.Option("--frames", min=4, help="Number of frames from the start.")] = 40,
     width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
-    only: Annotated[str, typer.Option("--only", help="Comma-separated kinds of wrong input; default: all.")] = "",
     as_json: JsonOption = False,
 ) -> None:
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
-    from dudmap import synthetic
-    from dudmap.benchmark.wrong_input import measure_wrong_input, spoilt_table
+    from dudmap.benchmark.stream_faults import default_room
+    from dudmap.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
     from dudmap.config import Config
     from dudmap.sequences import open_sequence
-    from dudmap.synthetic.recording import DEFAULT_CAMERA
 
+    config, runs = Config(), []
     if recording is not None:
-        source = open_sequence(recording)
-    else:
-        camera = DEFAULT_CAMERA.resized(width, width * 3 // 4)
-        source = synthetic.sequence("box", frames=frames, camera=camera, noise="kinect")
-    names = [name for name in only.split(",") if name]
-    runs = list(measure_wrong_input(source, Config(), names, frames))
+        runs += measure_wrong_input(open_sequence(recording), config, SPOILT, frames)
+    else:  # too small a scale shows at a desk, too large a one in a room
+        at_desk = [name for name in SPOILT if name != LARGE]
+        runs += measure_wrong_input(default_room(frames, width, 0, "desk"), config, at_desk, frames)
+        runs += measure_wrong_input(default_room(frames, width, 0), config, [LARGE], frames)
     failed = [run.name for run in runs if run.fails]
-    tree = {"recording": source.name, "runs": [run._asdict() for run in runs], "failed": failed}
-    answer(tree, spoilt_table(runs), as_json=as_json)
+    answer({"runs": [run._asdict() for run in runs], "failed": failed}, spoilt_table(runs), as_json=as_json)
     if failed:
         say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
         raise typer.Exit(1)

@@ -17,16 +17,10 @@ WIDTH = 160
 """Width of the images whose edges are compared, pixels."""
 STEP, STEEPEST = 0.08, 4.0
 """Smallest depth edge, as a share of the depth, and largest colour edge, as a multiple of the mean gradient."""
-NOWHERE = 1e6
-"""Distance that stands for no reading, metres."""
 NEIGHBOURHOOD = 41
 """Width of the neighbourhood whose mean is taken off both edge images, pixels, so that only places count."""
-TURNED = {
-    "mirrored left-right": (slice(None), slice(None, None, -1)),
-    "upside down (mirrored up-down)": (slice(None, None, -1), slice(None)),
-    "rotated by 180 degrees": (slice(None, None, -1), slice(None, None, -1)),
-}
-"""Ways in which one of the two images may be turned: slices of its rows and columns."""
+TURNED = {"mirrored left-right": (1, -1), "upside down (mirrored up-down)": (-1, 1), "rotated by 180 degrees": (-1, -1)}
+"""Ways in which one of the two images may be turned: steps through its rows and columns."""
 GAIN, SIGNIFICANT = 0.04, 4.0
 """Smallest gain in the correlation of depth and colour edges by which a turn is believed, and how many standard errors
 over the frames it must exceed zero by."""
@@ -47,21 +41,16 @@ def image_warnings(frames: "Sequence[Frame]") -> list[str]:
         return []
     grays = [_gray(frame.color) for frame in frames]
     if all(gray.std() < TEXTURELESS for gray in grays):
-        out = ["the colour images have no texture (black or of one colour): the camera is tracked by distances alone"]
-        if _planes(frames) is not None:
-            out.append(
-                "the depth images show one plane without relief and the colour images no texture: how the camera moves "
-                "along the plane is not determined; expected depth images with relief, or colour with texture"
-            )
-        return out
+        plane = "" if _planes(frames) is None else ", which show one plane and not how the camera moves along it"
+        what = "the colour images have no texture (black or of one colour)"
+        return [f"{what}: the camera is tracked by distances alone{plane}"]
     return [*_plane_warnings(frames, grays), *_turn_warnings(frames, grays)]
 
 
 def _gray(color: NDArray[np.uint8]) -> NDArray[np.float32]:
     """Intensity (h, WIDTH) in 0..1 of a colour image."""
-    height = round(WIDTH * color.shape[0] / color.shape[1])
-    gray = cv2.cvtColor(color, cv2.COLOR_RGB2GRAY)
-    small = cv2.resize(gray, (WIDTH, height), interpolation=cv2.INTER_AREA)
+    size = WIDTH, round(WIDTH * color.shape[0] / color.shape[1])
+    small = cv2.resize(cv2.cvtColor(color, cv2.COLOR_RGB2GRAY), size, interpolation=cv2.INTER_AREA)
     return np.asarray(small, np.float32) / np.float32(255)
 
 
@@ -70,9 +59,11 @@ def _turn_warnings(frames: "Sequence[Frame]", grays: list[NDArray[np.float32]]) 
     gains = []
     for frame, gray in zip(frames, grays, strict=True):
         if frame.depth.shape == frame.color.shape[:2]:
-            steps, edges = _depth_edges(frame.depth, gray.shape), _color_edges(gray)
+            gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
+            edges = np.minimum(gradient / (gradient.mean() + 1e-5), STEEPEST)
+            steps = _depth_edges(frame.depth, gray.shape)
             given = _correlation(steps, edges)
-            gains.append([_correlation(steps[turn], edges) - given for turn in TURNED.values()])
+            gains.append([_correlation(steps[::rows, ::columns], edges) - given for rows, columns in TURNED.values()])
     if len(gains) < FEWEST:
         return []
     mean = np.mean(gains, axis=0)
@@ -90,14 +81,10 @@ def _depth_edges(depth: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[
     """1 beside a step between two readings, else 0."""
     small = cv2.resize(depth, (shape[1], shape[0]), interpolation=cv2.INTER_NEAREST)
     window = np.ones((3, 3), np.uint8)
-    near, far = cv2.erode(np.where(small > 0, small, NOWHERE).astype(np.float32), window), cv2.dilate(small, window)
-    return cv2.dilate(((far > (1 + STEP) * near) & (far > 0)).astype(np.float32), window)
-
-
-def _color_edges(gray: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Length of the gradient as a multiple of its mean, at most STEEPEST."""
-    gradient = np.hypot(cv2.Sobel(gray, cv2.CV_32F, 1, 0), cv2.Sobel(gray, cv2.CV_32F, 0, 1))
-    return np.minimum(gradient / (gradient.mean() + 1e-5), STEEPEST)
+    near = cv2.erode(np.where(small > 0, small, 1e6).astype(np.float32), window)  # no reading is far away
+    far = cv2.dilate(small, window)
+    step = cv2.dilate(((far > (1 + STEP) * near) & (far > 0)).astype(np.uint8), window)
+    return step.astype(np.float32)
 
 
 def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> float:

@@ -44,10 +44,8 @@ LATE = 0.015
 """Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
 RUN = 6
 """Number of frames in a row that are compared with each other at every sampled place."""
-SCALES = (1.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
-"""Depth scales in use, units per metre, of which one is proposed where the given one is implausible."""
-COMMON = (1000.0, 5000.0)
-"""Those proposed first."""
+SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
+"""Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
 USUAL = (0.4, 8.0)
 """Median depth, metres, that a proposed scale must give."""
 
@@ -222,9 +220,8 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[st
     if implausible or not NEAR <= median <= FAR:
         units = median * found.depth_scale
         fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
-        best = next((scale for scale in COMMON if scale in fitting), fitting[0] if fitting else None)
-        proposal = f"; {' or '.join(f'{scale:g}' for scale in fitting)} would be plausible" if fitting else ""
-        unit = "METRES" if best is None else f"{1 / best:.4g}, which is {best:g} per metre"
+        proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
+        unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
         out.append(
             f"the depth scale looks wrong: with {found.depth_scale:g} units per metre the median depth is "
             f"{median:.3g} m, and nine tenths of the readings lie from {near:.2g} to {far:.2g} m{proposal}: give "

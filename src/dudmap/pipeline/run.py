@@ -198,7 +198,8 @@ class Job:
                 if state.record.repeated:
                     display.note(_repeats(state.record))
                 if state.record.degenerate:
-                    display.note(_degenerate(state.record))
+                    counts = f"{state.record.degenerate} of {len(state.record.rows)} frames"
+                    display.note(f"{counts} do not show all directions of motion; they are not in the map")
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
             except KeyboardInterrupt:
@@ -316,14 +317,6 @@ def _repeats(record: RunRecord) -> str:
     }
     counts = ", ".join(text.format(record.repeated[kind]) for kind, text in what.items() if kind in record.repeated)
     return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
-
-
-def _degenerate(record: RunRecord) -> str:
-    """Sentence on the views that do not determine the motion of the camera."""
-    return (
-        f"{record.degenerate} of {len(record.rows)} frames do not show all directions of motion: there their poses "
-        "follow the frames before, and they are not in the map"
-    )
 
 
 def _of_second(finished: object) -> str:
