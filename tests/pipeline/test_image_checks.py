@@ -46,10 +46,11 @@ def test_depth_turned_instead_of_colour():
 
 
 def wall(number, *, moving, color):
-    """A wall at 2 m, seen by a camera at rest or one that comes 1 mm nearer from frame to frame."""
+    """A wall at 2 m, seen with changing exposure by a camera at rest or one that comes 1 mm nearer per frame."""
     rng = np.random.default_rng(number)
     depth = rng.normal(2.0 - 0.001 * number * moving, 0.004, (60, 80)).astype(np.float32)
-    return Frame(0.1 * number, depth, np.random.default_rng(color).integers(0, 255, (60, 80, 3), np.uint8))
+    texture = np.random.default_rng(color).integers(0, 200, (60, 80, 3)) * (1 - 0.05 * number)
+    return Frame(0.1 * number, depth, texture.astype(np.uint8))
 
 
 def test_a_wall_before_a_camera_that_rests_or_moves_is_no_fault():

@@ -31,8 +31,8 @@ FLAT = 0.01
 STILL = 0.2
 """Largest spread over the frames of the distance of a plane that does not move, in standard deviations of a reading:
 the planes of moving cameras differ by more, and those of thousands of independent readings by less."""
-CHANGED = 0.01
-"""Mean difference of intensities (0..1) from which two colour images are not the same."""
+CHANGED = 0.05
+"""Mean difference of intensities, as a share of their mean, from which images differ by more than exposure."""
 
 
 def image_warnings(frames: "Sequence[Frame]") -> list[str]:
@@ -97,7 +97,8 @@ def _correlation(first: NDArray[np.float32], second: NDArray[np.float32]) -> flo
 def _plane_warnings(frames: "Sequence[Frame]", grays: list[NDArray[np.float32]]) -> list[str]:
     """Whether the depth is that of one plane that rests against the camera while the colours change."""
     planes = _planes(frames)
-    changes = [np.abs(b - a).mean() for a, b in pairwise(grays) if a.shape == b.shape]
+    exposed = [gray / (gray.mean() + np.float32(1e-3)) for gray in grays]
+    changes = [np.abs(b - a).mean() for a, b in pairwise(exposed) if a.shape == b.shape]
     if planes is None or np.mean(changes or [0]) < CHANGED:
         return []
     distances, sigma = planes
