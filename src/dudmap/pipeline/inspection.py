@@ -223,8 +223,9 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[st
         proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
         unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
         out.append(
-            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre nine tenths of the readings lie from "
-            f"{near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: give --depth-unit {unit}"
+            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre nine tenths of the readings lie "
+            f"from {near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: "
+            f"give --depth-unit {unit}"
         )
     if found.valid_depth < FEW_READINGS:
         out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")
