@@ -198,8 +198,7 @@ class Job:
                 if state.record.repeated:
                     display.note(_repeats(state.record))
                 if state.record.degenerate:
-                    counts = f"{state.record.degenerate} of {len(state.record.rows)} frames"
-                    display.note(f"{counts} do not show all directions of motion; they are not in the map")
+                    display.note(f"{state.record.degenerate} frames do not show all directions of motion: not fused")
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
             except KeyboardInterrupt:
