@@ -95,6 +95,7 @@ FAKED = {
     "warmup": (["warmup"], {"dudmap.cli.warmup.steps": lambda: [("part", lambda: None)]}),
     "merge": (["merge", "a", "b"], {"dudmap.fleet.two_runs.merge_runs": lambda *_: merged()}),
     "calibrate": None,  # tests/calibration/test_self_calibration.py
+    "benchmark wrong-input": None,  # tests/pipeline/test_image_checks.py
     "benchmark gate": (
         ["benchmark", "gate"],
         {

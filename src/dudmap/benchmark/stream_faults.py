@@ -68,7 +68,7 @@ class FaultRun:
         return "skipped and counted" if self.rejected else "handled"
 
 
-class _Excerpt:
+class Excerpt:
     """The first frames of a recording, each of which is read once."""
 
     def __init__(self, recording: Sequence, frames: int) -> None:
@@ -86,16 +86,17 @@ class _Excerpt:
         return self._frames[index]
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame if known."""
         return self.recording.mask(index)
 
 
-def default_room(frames: int, width: int, seed: int) -> Sequence:
-    """A synthetic room with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
+    """A synthetic scene with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap import synthetic
 
     focal = 525 / 640 * width
     camera = Camera(focal, focal, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
-    return synthetic.sequence("room", frames=frames, seed=seed, camera=camera, noise="kinect")
+    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera, noise="kinect")
 
 
 def measure_stream_faults(
@@ -117,7 +118,7 @@ def measure_stream_faults(
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
-    kept = _Excerpt(recording, min(frames or len(recording), len(recording)))
+    kept = Excerpt(recording, min(frames or len(recording), len(recording)))
     streams = {name: FaultyStream(kept, name) for name in ["none", *(n for n in faults or FAULTS if n != "none")]}
     clean: FaultRun | None = None
     for name, stream in streams.items():

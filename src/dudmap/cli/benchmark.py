@@ -252,6 +252,35 @@ def faults(
         raise typer.Exit(1)
 
 
+@app.command("wrong-input")
+def wrong_input(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording with true poses; default: a synthetic desk and room.")
+    ] = None,
+    frames: Annotated[int, typer.Option("--frames", min=4, help="Number of frames from the start.")] = 40,
+    width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
+    as_json: JsonOption = False,
+) -> None:
+    """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
+    from dudmap.benchmark.stream_faults import default_room
+    from dudmap.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
+    from dudmap.config import Config
+    from dudmap.sequences import open_sequence
+
+    config, runs = Config(), []
+    if recording is not None:
+        runs += measure_wrong_input(open_sequence(recording), config, SPOILT, frames)
+    else:  # too small a scale shows at a desk, too large a one in a room
+        at_desk = [name for name in SPOILT if name != LARGE]
+        runs += measure_wrong_input(default_room(frames, width, 0, "desk"), config, at_desk, frames)
+        runs += measure_wrong_input(default_room(frames, width, 0), config, [LARGE], frames)
+    failed = [run.name for run in runs if run.fails]
+    answer({"runs": [run._asdict() for run in runs], "failed": failed}, spoilt_table(runs), as_json=as_json)
+    if failed:
+        say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
+        raise typer.Exit(1)
+
+
 @app.command()
 def gate(
     figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(

@@ -189,7 +189,8 @@ def run(
     resolve(parameters.device, adaptive=parameters.volume.adaptive)  # refused before anything takes time
     saved_map = None if saved is None else read_saved_map(saved, parameters, out)
     recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
-    for warning in inspect(recording).warnings:
+    warnings = inspect(recording).warnings
+    for warning in warnings:
         _print_notice(f"warning: {warning}")
     out = out or free_folder(Path("runs") / recording.name)
     given = None if calibration in ("auto", "given") else Calibration.load(Path(calibration))
@@ -203,6 +204,7 @@ def run(
             depth_model=depth_model, calibration=given, calibrate=calibration == "auto" and not live,
             saved_map=saved_map, localize=localize,
             max_memory=None if max_memory is None else memory_size(max_memory), observers=watching, storing=storing,
+            warnings=warnings,
         )  # fmt: skip
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 

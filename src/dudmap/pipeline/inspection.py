@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import FrameError
 from dudmap.pipeline.focal_check import WRONG, focal_error
+from dudmap.pipeline.image_checks import image_warnings
 from dudmap.sequences.intrinsics import BY_NAME
 
 if TYPE_CHECKING:
@@ -20,6 +21,11 @@ SAMPLES = 12
 """Number of evenly spread frames that are read."""
 NEAR, FAR = 0.1, 8.0
 """Plausible medians of the depth readings, metres: no depth camera measures nearer or farther most of the time."""
+NEAREST, FARTHEST = 0.2, 10.0
+"""Where the median lies beyond ``SEEN``: least plausible 5th and largest plausible 95th percentile of the readings,
+metres: few depth cameras measure nearer than 0.2 m, and those for rooms hardly beyond 10 m."""
+SEEN = (0.4, 4.0)
+"""Medians, metres, within which the scale is not doubted."""
 FEW_READINGS = 0.2
 """Share of pixels with a reading below which the depth is called sparse."""
 FIELD_OF_VIEW = (20.0, 130.0)
@@ -38,8 +44,8 @@ LATE = 0.015
 """Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
 RUN = 6
 """Number of frames in a row that are compared with each other at every sampled place."""
-SCALES = (1.0, 1000.0, 4000.0, 5000.0, 6553.5, 10000.0)
-"""Depth scales in use, units per metre, of which one is proposed where the given one is implausible."""
+SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
+"""Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
 USUAL = (0.4, 8.0)
 """Median depth, metres, that a proposed scale must give."""
 
@@ -173,7 +179,8 @@ def inspect(
     named = found.sources.get("intrinsics", "").endswith(BY_NAME) and calibration is None
     found.warnings = [
         *(_focal_warnings(sequence) if named else []),
-        *_depth_warnings(found),
+        *_depth_warnings(found, readings),
+        *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
         *_time_warnings(sequence.timestamps, colors),
@@ -200,7 +207,7 @@ def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
     return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
 
 
-def _depth_warnings(found: Inspection) -> list[str]:
+def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[str]:
     out = []
     if found.unreadable:
         out.append(
@@ -208,14 +215,17 @@ def _depth_warnings(found: Inspection) -> list[str]:
         )
     if found.median_depth is None:
         return [*out, "the sampled frames hold no depth reading"]
-    if not NEAR <= found.median_depth <= FAR:
-        units = found.median_depth * found.depth_scale
-        fitting = [f"{scale:g}" for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1]]
-        proposal = f"; {' or '.join(fitting)} would be plausible" if fitting else ""
-        unit = f"{1 / float(fitting[0]):.4g}, which is {fitting[0]} per metre" if fitting else "METRES"
+    median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
+    implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
+    if implausible or not NEAR <= median <= FAR:
+        units = median * found.depth_scale
+        fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
+        proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
+        unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
         out.append(
-            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre the median depth is "
-            f"{found.median_depth:.3g} m{proposal}: give --depth-unit {unit}"
+            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre nine tenths of the readings lie "
+            f"from {near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: "
+            f"give --depth-unit {unit}"
         )
     if found.valid_depth < FEW_READINGS:
         out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")

@@ -40,6 +40,7 @@ class RunRecord:
         postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
         fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
         degenerate: Number of tracked frames with unobservable directions of motion.
+        warnings: Sentences on what looked wrong in the recording before the run.
         masked: Number of frames with an external mask, None without external masks.
         dropped: Number of frames dropped by a live run, None otherwise.
     """
@@ -61,6 +62,7 @@ class RunRecord:
     blind: int = 0
     uncertain: int = 0
     degenerate: int = 0
+    warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
     _wall_start: float = field(default_factory=time.perf_counter)
@@ -207,6 +209,7 @@ class RunRecord:
             "cpu_s": round(time.process_time() - self._cpu_start, 3),
             "peak_rss_mb": peak_rss_mb(),
             "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
+            "warnings": self.warnings,
             "lost_frames": self.lost,
             "unreadable_frames": self.unreadable,
         } | self._occasional()

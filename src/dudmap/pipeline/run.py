@@ -1,7 +1,7 @@
 """Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -49,6 +49,7 @@ def run(
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
     storing: Storing | None = None,
+    warnings: Iterable[str] = (),
 ) -> RunReport:
     """Run the system over a recording and write a run folder.
 
@@ -90,6 +91,7 @@ def run(
         observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
         storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
+        warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
 
     Raises:
         ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
@@ -146,7 +148,7 @@ def run(
             localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
             timed=is_timed(sequence),
         )  # fmt: skip
-        record = RunRecord(masked=None if masks is None else 0, dropped=0 if live else None)
+        record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
         state = RunState(slam, record, calibration, model)
         if store is not None:
             store.begin(state)
@@ -195,6 +197,8 @@ class Job:
                     display.note(_unmerged_submaps(state.slam))
                 if state.record.repeated:
                     display.note(_repeats(state.record))
+                if state.record.degenerate:
+                    display.note(f"{state.record.degenerate} frames do not show all directions of motion: not fused")
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
             except KeyboardInterrupt:
@@ -223,7 +227,8 @@ class Job:
             if number > state.number:
                 state.finished = state.slam, state.record
                 masked = state.record.masked and 0
-                state.slam, state.record = self._system(state, state.slam), RunRecord(masked=masked, dropped=None)
+                state.slam = self._system(state, state.slam)
+                state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
                 state.number, state.next = number, 0
             last = number == self.passes - 1
             for observer in self.observers:

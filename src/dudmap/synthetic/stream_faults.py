@@ -188,7 +188,7 @@ def _frozen(times: NDArray[np.float64], *, depth: bool, color: bool) -> list[Del
 # -- alterations -------------------------------------------------------------------------------------------------------
 
 
-def _scaled(frame: Frame, factor: float) -> Frame:
+def scaled(frame: Frame, factor: float) -> Frame:
     """Depth in another unit, metres and 16-bit values alike."""
     return replace(frame, depth=frame.depth * np.float32(factor))
 
@@ -197,7 +197,8 @@ def _exposed(frame: Frame, gain: float) -> Frame:
     return replace(frame, color=np.clip(frame.color * gain, 0, 255).astype(np.uint8))
 
 
-def _black(frame: Frame) -> Frame:
+def black(frame: Frame) -> Frame:
+    """Colour without light."""
     return replace(frame, color=np.zeros_like(frame.color))
 
 
@@ -234,17 +235,17 @@ FAULTS: dict[str, StreamFault] = {
     "frozen": StreamFault("depth and colour repeat", partial(_frozen, depth=True, color=True)),
     "frozen depth": StreamFault("the depth image repeats", partial(_frozen, depth=True, color=False)),
     "frozen colour": StreamFault("the colour image repeats", partial(_frozen, depth=False, color=True)),
-    "no depth": StreamFault("all depths are 0", partial(_altered, alter=partial(_scaled, factor=0.0))),
+    "no depth": StreamFault("all depths are 0", partial(_altered, alter=partial(scaled, factor=0.0))),
     "depth missing": StreamFault("no depth image", partial(_altered, alter=partial(_absent, what="the depth"))),
     "colour missing": StreamFault("no colour image", partial(_altered, alter=partial(_absent, what="the colour"))),
-    "black": StreamFault("the colour image is black", partial(_altered, alter=_black)),
+    "black": StreamFault("the colour image is black", partial(_altered, alter=black)),
     "darker": StreamFault("the exposure falls to 35 %", partial(_altered, alter=partial(_exposed, gain=0.35))),
     "brighter": StreamFault("the exposure rises to 250 %", partial(_altered, alter=partial(_exposed, gain=2.5))),
     "invalid depth": StreamFault("NaN, inf, negative depth in 30 % of the pixels", partial(_altered, alter=_invalid)),
     "resolution": StreamFault("images of half the size", partial(_altered, alter=_half_size)),
-    "depth x 1000": StreamFault("millimetres for metres", partial(_altered, alter=partial(_scaled, factor=1000.0))),
-    "depth / 1000": StreamFault("metres for millimetres", partial(_altered, alter=partial(_scaled, factor=0.001))),
-    "depth x 5": StreamFault("unit of 1 mm for 0.2 mm", partial(_altered, alter=partial(_scaled, factor=5.0))),
-    "depth / 5": StreamFault("unit of 0.2 mm for 1 mm", partial(_altered, alter=partial(_scaled, factor=0.2))),
+    "depth x 1000": StreamFault("millimetres for metres", partial(_altered, alter=partial(scaled, factor=1000.0))),
+    "depth / 1000": StreamFault("metres for millimetres", partial(_altered, alter=partial(scaled, factor=0.001))),
+    "depth x 5": StreamFault("unit of 1 mm for 0.2 mm", partial(_altered, alter=partial(scaled, factor=5.0))),
+    "depth / 5": StreamFault("unit of 0.2 mm for 1 mm", partial(_altered, alter=partial(scaled, factor=0.2))),
 }  # fmt: skip
 """All faults by name; the first is a stream without any."""

@@ -173,11 +173,13 @@ def _losses(metrics: dict[str, Any]) -> Html:
     notes = [
         (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
         (metrics.get("blind"), "images without contrast were tracked by distances alone and are not in the map"),
-        (metrics.get("uncertain"), "frames with uncertain labels are not in the map"),
+        (metrics.get("uncertain"), "frames with uncertain poses or labels are not in the map"),
+        (metrics.get("degenerate"), "of them do not show all directions of motion"),
         (metrics.get("dropped"), "frames arrived too fast and were dropped"),
         ((metrics.get("maps") or 1) - 1, "submaps could not be joined with the main one"),
     ]
-    rows: list[object] = [f"{count} {text}" for count, text in notes if count]
+    rows: list[object] = [f"warning: {text}" for text in metrics.get("warnings", [])]
+    rows += [f"{count} {text}" for count, text in notes if count]
     reasons: dict[str, list[float]] = {}
     for row in lost:
         reasons.setdefault(str(row["reason"]), []).append(float(row["timestamp"]))
@@ -195,7 +197,7 @@ def _losses(metrics: dict[str, Any]) -> Html:
 
 
 def _table(metrics: dict[str, Any]) -> Html:
-    left_out = ("lost_frames", "unreadable_frames")
+    left_out = ("warnings", "lost_frames", "unreadable_frames")
     rows = joined(
         html("<tr><td>{key}</td><td>{value}</td></tr>", key=key, value=_text(value))
         for key, value in metrics.items()

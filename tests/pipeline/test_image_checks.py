@@ -1,0 +1,81 @@
+"""Wrong input that still runs is said: of a spoilt real excerpt, and by the command that repeats the table."""
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from dudmap.benchmark.wrong_input import LARGE, RIGHT, SPOILT, SpoiltSequence
+from dudmap.cli import app
+from dudmap.frames.frame import Frame
+from dudmap.pipeline.image_checks import image_warnings
+from dudmap.pipeline.inspection import inspect
+from dudmap.sequences import open_sequence
+
+EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
+SAID = {
+    RIGHT: [],
+    LARGE: ["give --depth-unit 0.0002, which is 5000 per metre"],
+    "depth five times too small": ["25000 units per metre"],
+    "colour mirrored left-right": ["seems to be mirrored left-right against the other"],
+    "colour upside down": ["seems to be upside down"],
+    "colour rotated by 180 degrees": ["seems to be rotated by 180 degrees against the other"],
+    "colour black": ["tracked by distances alone"],
+    "depth a flat wall of noise": ["show the same plane at 2 m, with 4.0 mm of noise"],
+    "the same, colour black": ["which show one plane and not how the camera moves along it"],
+}
+
+
+@pytest.mark.parametrize("name", SPOILT)
+def test_each_kind_of_wrong_input_has_one_warning(name):
+    warnings = inspect(SpoiltSequence(open_sequence(EXCERPT), name, 12)).warnings
+    assert len(warnings) == len(SAID[name])
+    for warning, part in zip(warnings, SAID[name], strict=True):
+        assert part in warning
+
+
+def test_depth_turned_instead_of_colour():
+    sequence = open_sequence(EXCERPT)
+    frames = [sequence[index] for index in range(len(sequence))]
+    assert image_warnings(frames) == []
+    (warning,) = image_warnings([replace(f, depth=np.ascontiguousarray(f.depth[:, ::-1])) for f in frames])
+    assert "mirrored left-right" in warning
+
+
+def wall(number, *, moving, color):
+    """A wall at 2 m, seen with changing exposure by a camera at rest or one that comes 1 mm nearer per frame."""
+    rng = np.random.default_rng(number)
+    depth = rng.normal(2.0 - 0.001 * number * moving, 0.004, (60, 80)).astype(np.float32)
+    texture = np.random.default_rng(color).integers(0, 200, (60, 80, 3)) * (1 - 0.05 * number)
+    return Frame(0.1 * number, depth, texture.astype(np.uint8))
+
+
+def test_a_wall_before_a_camera_that_rests_or_moves_is_no_fault():
+    assert image_warnings([wall(number, moving=False, color=7) for number in range(8)]) == []
+    assert image_warnings([wall(number, moving=True, color=number) for number in range(8)]) == []
+    (warning,) = image_warnings([wall(number, moving=False, color=number) for number in range(8)])
+    assert "the same plane at 2 m" in warning
+
+
+def test_the_command_repeats_the_table():
+    done = CliRunner().invoke(app, ["benchmark", "wrong-input", "--width", "80", "--frames", "6", "--json"])
+    assert done.exit_code == 0, done.output
+    runs = json.loads(done.stdout)["runs"]
+    assert {run["name"] for run in runs} == set(SPOILT)
+    assert [run["name"] for run in runs if not run["warnings"]] == [RIGHT]
+    assert runs[0]["ate"] < 0.02
+
+
+def test_warnings_are_in_the_metrics_and_the_report(tmp_path):
+    done = CliRunner().invoke(
+        app, ["run", str(EXCERPT), "--out", str(tmp_path / "run"), "--max-frames", "3", "--depth-unit", "0.001",
+              "--calibration", "given"],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    (warning,) = json.loads((tmp_path / "run" / "metrics.json").read_text())["warnings"]
+    assert "the depth scale looks wrong" in warning
+    assert f"warning: {warning}" in done.stderr
+    assert f"warning: {warning}" in (tmp_path / "run" / "report.html").read_text()
