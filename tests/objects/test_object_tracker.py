@@ -192,8 +192,8 @@ def test_a_live_run_adds_movers_when_there_is_time():
     record = RunRecord(dropped=0)
     result = SimpleNamespace(
         timestamp=1.5, state="tracked", fused=True, skipped_similar=False, relocalized=False, corrected=False,
-        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="", repeats="", checks={},
-        movers=(),
+        blind=False, uncertain="", dynamic_share=0.1, timings={}, labels=None, unobservable=(), rejected="",
+        repeats="", checks={}, movers=(),
     )  # fmt: skip
     record.add(result, 1.0, 1.0, None)
     assert "movers" not in record.rows[0]

@@ -1,10 +1,12 @@
 """Place recognition: alignment, RANSAC and keyframes against ground truth, and the recovery of a kidnapped camera."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import dudmap.synthetic
-from dudmap.config import RelocalizationConfig
+from dudmap.config import Config, RelocalizationConfig
 from dudmap.frames.frame import Frame
 from dudmap.frames.preprocess import Preprocessor
 from dudmap.geometry import se3
@@ -13,7 +15,8 @@ from dudmap.geometry.camera import Camera
 from dudmap.geometry.trajectory import Trajectory
 from dudmap.places.place_recognition import KeyframeDatabase
 from dudmap.slam import Slam
-from dudmap.synthetic.recording import SyntheticSequence
+from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.synthetic.ring_corridor import ring_corridor
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
@@ -178,6 +181,19 @@ def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found(yaw):
     assert [i for i, (result, _) in enumerate(rows) if result.relocalized] == [30]
     assert not any(result.fused for result, _ in rows[15:30])
     assert max(error for _, error in rows if error is not None) < 0.017  # of 117 mm
+
+
+def test_a_camera_that_went_on_in_the_dark_is_not_tracked_elsewhere_in_a_corridor():
+    """The walls fit everywhere along it: neither they nor the last frame's depth say how far the camera has come."""
+    corridor = ring_corridor(20, speed=1.2, camera=DEFAULT_CAMERA.resized(160, 120))
+    slam, truth = Slam(corridor.camera, Config().override(["preprocess.depth_max=3"])), corridor.ground_truth
+    for index in range(54):
+        frame = corridor[index]
+        dark = 30 <= index < 44  # 0.5 m
+        result = slam.process(replace(frame, depth=np.zeros_like(frame.depth)) if dark else frame)
+        if result.T_world_camera is not None and result.submap == 0:
+            true = se3.inverse(truth.Ts_world_camera[0]) @ truth.Ts_world_camera[index]
+            assert np.linalg.norm(result.T_world_camera[:3, 3] - true[:3, 3]) < 0.05, index
 
 
 def test_a_map_of_six_frames_is_enough_to_be_found_in():

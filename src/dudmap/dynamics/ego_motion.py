@@ -158,13 +158,10 @@ class EgoMotionSegmenter:
         pyramid: Pyramid,
         segmentation: Segmentation,
         T_expected: NDArray[np.float64] | None = None,
-        *,
-        again: bool = False,
     ) -> DominantMotion | None:
         """Motion of the static world since the last frame; None if it cannot be determined.
 
-        The result is kept: a second call with the same timestamp returns the same object, unless the images are to be
-        compared ``again`` with another expected motion.
+        The result is kept: a second call with the same timestamp returns the same object.
 
         Args:
             timestamp: Seconds, of the new frame.
@@ -174,7 +171,7 @@ class EgoMotionSegmenter:
         """
         if self._last is None:
             return None
-        if again or self._compared is None or self._compared[0] != timestamp:
+        if self._compared is None or self._compared[0] != timestamp:
             last, segmentation_last, moving = self._last
             motion = dominant_motion(last, pyramid, (segmentation_last, segmentation), moving, T_expected)
             self._compared = timestamp, motion

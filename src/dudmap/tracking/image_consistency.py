@@ -23,9 +23,8 @@ from dudmap.tracking.estimate import PoseEstimate
 from dudmap.tracking.frame_view import FrameView
 from dudmap.tracking.motion_model import MotionModel
 
-ImagePose = Callable[..., NDArray[np.float64] | None]
-"""Pose (4, 4) that the ego-motion between two images predicts, looked for near the predicted pose or near a given one;
-None if it is not known."""
+ImagePose = Callable[[], NDArray[np.float64] | None]
+"""Pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
 CLEARLY_LESS = 0.5
 """Another motion explains two images clearly better if its misregistration is below this share of the other: both are
 known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
@@ -54,8 +53,13 @@ class ImageComparison:
 
     @property
     def confirms(self) -> bool:
-        """Whether both frames show the same surface; what the images say of it is another question."""
+        """Whether both frames show the same surface: their depths agree."""
         return self.share >= CONFIRMED_SHARE and self.share_of_seen >= CONFIRMED_OF_SEEN
+
+    @property
+    def is_same_view(self) -> bool:
+        """Whether depths and images agree. In a corridor the depths do wherever the camera is."""
+        return self.confirms and self.shift <= MAX_IMAGE_SHIFT
 
 
 class ImageConsistency:
@@ -88,10 +92,9 @@ class ImageConsistency:
         """Whether the images are compatible with the pose of a frame.
 
         They are not if the last one lies more than MAX_IMAGE_SHIFT beside this one, and the corners of the two follow
-        no common motion, not even where the pose has them, or one that explains the images clearly better. Where the
-        depths confirm the pose and not that motion, colour and depth were taken at different times, and the pose is
-        that of the depth. Blur alone moves corners and images alike. That corners are not found again where the
-        exposure has changed suddenly says nothing.
+        no common motion, or one that explains the images clearly better. Where the depths confirm the pose and not that
+        motion, colour and depth were taken at different times, and the pose is that of the depth. Blur alone moves
+        corners and images alike. That corners are not found again where the exposure has changed suddenly says nothing.
 
         Args:
             view: The frame.
@@ -102,8 +105,6 @@ class ImageConsistency:
         if not seen.shift > MAX_IMAGE_SHIFT:
             return True
         T_image = image_pose()
-        if T_image is None:
-            T_image = image_pose(estimate.T_world_camera)
         if T_image is None:
             change = estimate.exposure[0] / self._gain
             return len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN

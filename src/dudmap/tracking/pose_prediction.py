@@ -30,7 +30,6 @@ class PosePrediction:
     Attributes:
         T_world_camera: (4, 4).
         image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
-            Given a pose, it looks for the corners of the previous image where that pose has them.
         moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
         moving_before: (h, w) bool, the same for the first image of the map where it is compared with that; else None.
         unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
@@ -103,7 +102,7 @@ class PosePredictor:
         if self._known_poses and not self.ego_motion.started:
             self.ego_motion.start(timestamp)
         T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
-        by_velocity = PosePrediction(T_expected, lambda T=None: self._image_pose(self._ego_motion(view, T)))
+        by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
         if not self.ego_motion.active:
             return by_velocity
         with view.timer("parallax"):
@@ -162,16 +161,13 @@ class PosePredictor:
         slow = self.ego_motion.slow_motion(view.timestamp, T_world_camera, view.pyramid, view.segmentation())
         return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
 
-    def _ego_motion(self, view: FrameView, T_world_camera: NDArray[np.float64] | None = None) -> DominantMotion | None:
-        """Motion of the static world from the previous image to this one, looked for near the predicted pose or near
-        another one (4, 4)."""
+    def _ego_motion(self, view: FrameView) -> DominantMotion | None:
+        """Motion of the static world from the previous image to this one."""
         if self.ego_motion.seconds == 0:
             return None
         with view.timer("parallax"):
-            T_near = self.motion.predict(view.timestamp) if T_world_camera is None else T_world_camera
-            T_expected = se3.inverse(T_near) @ self.motion.T_world_camera
-            again = T_world_camera is not None
-            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected, again=again)
+            T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
+            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
 
     def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
         return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)

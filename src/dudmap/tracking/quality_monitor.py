@@ -111,10 +111,9 @@ class QualityMonitor:
                 "confirmed_share": seen.share,
             }
             crowded = share > 0.5
-            supported = partial(self.images.supported, view, estimate, seen, image_pose)
             evidence = {
-                "last frame": lambda: not crowded and seen.confirms and supported(),
-                "corners": supported,
+                "last frame": lambda: not crowded and seen.is_same_view,
+                "corners": partial(self.images.supported, view, estimate, seen, image_pose),
             }
             mode = "recovering" if self.recovering else "crowded" if crowded else "tracking"
             return Verdict(first_failure(CHECKS, figures, self.limits(mode, crowded=crowded), evidence), figures)
