@@ -173,13 +173,13 @@ def errors(slam, sequence, count):
 
 @pytest.mark.parametrize("yaw", [90.0, 150.0])
 def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found(yaw):
-    sequence = dudmap.synthetic.sequence(movers=(), frames=40, seed=1, camera=SMALL, camera_path="fast")
-    sequence = turned_away(sequence, 15, 30, yaw)
+    sequence = dudmap.synthetic.sequence(movers=(), frames=50, seed=1, camera=SMALL, camera_path="fast")
+    sequence = turned_away(sequence, 15, 40, yaw)
     slam = Slam(sequence.camera)
-    rows = errors(slam, sequence, 40)
-    assert [result.state for result, _ in rows] == ["tracked"] * 15 + ["lost"] * 15 + ["tracked"] * 10
-    assert [i for i, (result, _) in enumerate(rows) if result.relocalized] == [30]
-    assert not any(result.fused for result, _ in rows[15:30])
+    rows = errors(slam, sequence, 50)
+    assert [result.state for result, _ in rows] == ["tracked"] * 15 + ["lost"] * 25 + ["tracked"] * 10
+    assert [i for i, (result, _) in enumerate(rows) if result.relocalized] == [40]
+    assert not any(result.fused for result, _ in rows[15:40])
     assert max(error for _, error in rows if error is not None) < 0.017  # of 117 mm
 
 
@@ -193,7 +193,7 @@ def test_a_camera_that_went_on_in_the_dark_is_not_tracked_elsewhere_in_a_corrido
         result = slam.process(replace(frame, depth=np.zeros_like(frame.depth)) if dark else frame)
         if result.T_world_camera is not None and result.submap == 0:
             true = se3.inverse(truth.Ts_world_camera[0]) @ truth.Ts_world_camera[index]
-            assert np.linalg.norm(result.T_world_camera[:3, 3] - true[:3, 3]) < 0.05, index
+            assert np.linalg.norm(result.T_world_camera[:3, 3] - true[:3, 3]) < 0.25, index  # of 1.7 m
 
 
 def test_a_map_of_six_frames_is_enough_to_be_found_in():

@@ -101,7 +101,7 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
         resume(out)
     options = {"recording": {"path": str(recording)}, "report": False, "every": None, "count": 4, "masks": None,
                "save_masks": False, "save_map": True, "ahead": 2, "passes": 1, "config": Config().model_dump_json(),
-               "max_memory": None}  # fmt: skip
+               "max_memory": None, "localize": False}  # fmt: skip
     about = {"options": options, "recording": recording_fingerprint(sequence),
              "code": "of yesterday", "versions": {"dudmap": "0.0"}, "pass": 0, "next": 0, "frame": ""}  # fmt: skip
     database = StateDatabase(out / "state.db")
