@@ -55,7 +55,15 @@ def test_a_database_with_other_tables_is_not_read(statements, path):
         StateReader(path)
 
 
-def test_ctrl_c_and_a_limit_end_an_endless_query(path, monkeypatch):
+@pytest.fixture
+def ctrl_c():
+    """Python's own answer to ctrl-C, whatever a library or the test runner has made of it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def test_ctrl_c_and_a_limit_end_an_endless_query(path, monkeypatch, ctrl_c):
     reader = StateReader(path)
     timer = threading.Timer(0.3, lambda: os.kill(os.getpid(), signal.SIGINT))
     timer.start()

@@ -85,8 +85,9 @@ class BagFile:
         try:
             _check(path)
             limit_rosbags()
-            self._reader: Any = (rosbag1 if self._ros1 else rosbag2).Reader(path)
-            self._reader.open()
+            with without_definitions():
+                self._reader: Any = (rosbag1 if self._ros1 else rosbag2).Reader(path)
+                self._reader.open()
         except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
             raise DatasetError(f"cannot open the bag {path}: {error}") from error
         self.connections: list[Connection] = self._reader.connections
@@ -232,12 +233,8 @@ def _sqlite_uri(path: Path) -> str:
 
 
 def limit_rosbags() -> None:
-    """Make rosbags give up where something unpacks to too much, and ignore the definitions of messages in MCAP files.
-
-    It would refuse a file for one definition in a language that it does not know.
-    """
+    """Make rosbags give up where something unpacks to too much."""
     import lz4.frame
-    from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
     from rosbags.rosbag1 import reader as rosbag1
     from rosbags.rosbag2 import reader as rosbag2
     from rosbags.rosbag2 import storage_mcap
@@ -246,8 +243,22 @@ def limit_rosbags() -> None:
     unzstd, unlz4 = bounded(zstd.ZstdDecompressor), bounded(lz4.frame.LZ4FrameDecompressor)
     rosbag1.decompressors.update(bz2=bounded(BZ2Decompressor), lz4=unlz4)
     storage_mcap.DECOMPRESSORS.update(lz4=lambda data, _: unlz4(data), zstd=lambda data, _: unzstd(data))
-    storage_mcap.get_msgdef = lambda schema: MessageDefinition(MessageDefinitionFormat.NONE, "")
     cast("Any", rosbag2).zstd = _BoundedZstd(zstd, unzstd)
+
+
+@contextmanager
+def without_definitions() -> Generator[None]:
+    """Have rosbags ignore the definitions of messages in MCAP files meanwhile: it would refuse a file for one
+    definition in a language that it does not know. Other users of rosbags in this process keep them."""
+    from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+    from rosbags.rosbag2 import storage_mcap
+
+    theirs = storage_mcap.get_msgdef
+    storage_mcap.get_msgdef = lambda schema: MessageDefinition(MessageDefinitionFormat.NONE, "")
+    try:
+        yield
+    finally:
+        storage_mcap.get_msgdef = theirs
 
 
 def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
