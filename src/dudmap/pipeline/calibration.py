@@ -31,7 +31,7 @@ START_FRAMES, MIN_FRAMES = 300, 90
 """Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
 estimator compares pairs of keyframes from both halves of the time."""
 
-WIDTH, INTERVAL = 320, 1 / 15
+WIDTH, INTERVAL = 320, 1 / 30
 """Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
 at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
 noise of the poses and more of the camera's shaking enter, the longer they are."""
