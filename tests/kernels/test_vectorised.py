@@ -114,4 +114,6 @@ def test_one_scalar_loop_is_caught(signatures, module_name):
     way_out = f"{indent}    if T[{index} % 3, {index} % 4] > 1e30:\n{indent}        break\n"
     variant = source[: heart.start(3)] + way_out + source[heart.start(3) :]
     caught = scalar_loops(compiled(signatures, {name: variant}))
-    assert any(" packed" in sentence or " loops" in sentence for sentence in caught), caught  # by the processor
+    assert any(" loops" in sentence for sentence in caught), caught
+    if name == "linearize_rows":  # of the other, the compiler for some processors packs what is left nevertheless
+        assert any(" packed" in sentence for sentence in caught), caught
