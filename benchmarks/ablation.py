@@ -9,11 +9,11 @@ part and writes ablation.md, .csv and .json.
 import argparse
 from pathlib import Path
 
-from dudmap.benchmark.entries import Entry, local_entries
-from dudmap.benchmark.measure import Job, Row, measure_all
-from dudmap.benchmark.table import grid, save
+from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
-from dudmap.pipeline.environment import machine, versions
+from dudmap.lab.benchmark.entries import Entry, local_entries
+from dudmap.lab.benchmark.measure import Job, Row, measure_all
+from dudmap.lab.benchmark.table import grid, save
 
 PARTS: dict[str, tuple[str, ...]] = {
     "default": (),
@@ -31,7 +31,7 @@ PARTS: dict[str, tuple[str, ...]] = {
     "no relocalisation": ("relocalization.enabled=false",),
     "no dynamics": ("dynamics.method=none",),
 }
-"""Names and differences from the default configuration; for ``two-passes`` see ``benchmark/systems.py``."""
+"""Names and differences from the default configuration; for ``two-passes`` see ``lab/benchmark/systems.py``."""
 SMALL = (320, 240)
 WORLDS = (
     Entry("two people", parameters={"movers": ("people",), "frames": 90, "camera": SMALL}),

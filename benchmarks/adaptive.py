@@ -22,18 +22,18 @@ from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
 from dudmap import Config, Slam
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import Surface, moved
 from dudmap.evaluation.trajectory import ate
-from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
-from dudmap.mapping.adaptive_volume import make_volume
-from dudmap.sequences import open_sequence
-from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
-from dudmap.synthetic.scene import BOX
-from dudmap.synthetic.setup import sequence
+from dudmap.io.sequences import open_sequence
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.scene import BOX
+from dudmap.lab.synthetic.setup import sequence
 
 SYSTEMS = {
     "uniform 1 cm": ["volume.voxel_size=0.01"],

@@ -18,14 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import KDTree
 
-from dudmap.benchmark.table import grid
 from dudmap.config import Config
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import open_sequence
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence as synthetic_sequence
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.io.sequences import open_sequence
+from dudmap.lab.benchmark.table import grid
+from dudmap.lab.synthetic import sequence as synthetic_sequence
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 SEEDS = 4
 FRAMES = 12

@@ -10,14 +10,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.synthetic.furniture import CARDBOARD, DARK_WOOD, METAL, WOOD, plant
-from dudmap.synthetic.motion import FloorPath
-from dudmap.synthetic.movers import SyntheticMover, person_on
-from dudmap.synthetic.person import Figure
-from dudmap.synthetic.recording import SyntheticSequence
-from dudmap.synthetic.scene import Light, Material, Primitive, Scene, box, capsule, look_at, pose
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.lab.synthetic.furniture import CARDBOARD, DARK_WOOD, METAL, WOOD, plant
+from dudmap.lab.synthetic.motion import FloorPath
+from dudmap.lab.synthetic.movers import SyntheticMover, person_on
+from dudmap.lab.synthetic.person import Figure
+from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.scene import Light, Material, Primitive, Scene, box, capsule, look_at, pose
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 FPS = 15.0

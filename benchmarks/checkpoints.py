@@ -14,16 +14,16 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap import synthetic
+from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.pipeline.storing import RunState
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import restore, take_snapshot
 from dudmap.config import Config
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.pipeline.metrics import RunRecord
-from dudmap.pipeline.storing import RunState
-from dudmap.places.atlas import TimedPose
-from dudmap.slam import Slam
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import restore, take_snapshot
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.atlas import TimedPose
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 TRACKED = 40

@@ -20,14 +20,14 @@ from pathlib import Path
 
 import numpy as np
 
-from dudmap import synthetic
+from dudmap.app.pipeline.run import run
+from dudmap.app.views.cleaning import Cleaner
 from dudmap.config import Config
-from dudmap.exporting.run_content import RunContent
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
-from dudmap.views.cleaning import Cleaner
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.sequences import open_sequence
+from dudmap.lab import synthetic
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240, depth_scale=5000.0)
 WORLDS = {

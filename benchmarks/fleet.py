@@ -18,16 +18,16 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parent))
 from building import CEILING, FLOORS, STOREY, Walk, building, recording, walks
 
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.merge import FleetReport, merge_fleet
 from dudmap.fleet.registration import register_pairs
+from dudmap.fleet.run_graph import Join
 from dudmap.fleet.workers import Workers
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.run_graph import Join
-from dudmap.pipeline.run import run
 
 FALSE_DISTANCE, FALSE_ANGLE_DEG = 0.25, 5.0
 """A join whose relative pose is farther off than this (m, deg) joins what is not the same place."""

@@ -21,9 +21,9 @@ from collections import Counter
 from pathlib import Path
 from typing import Any
 
-from dudmap.study.conduct import conduct
-from dudmap.study.plan import Plan, make_plan
-from dudmap.study.store import StudyFolder
+from dudmap.lab.study.conduct import conduct
+from dudmap.lab.study.plan import Plan, make_plan
+from dudmap.lab.study.store import StudyFolder
 
 RUNS = 8
 """Runs of a study."""
@@ -42,11 +42,11 @@ def plan() -> Plan:
 
 def work(folder: Path, address: str) -> None:
     """Do the study, or what is left of it."""
-    from dudmap.study.executor import Executor, LocalExecutor
+    from dudmap.lab.study.executor import Executor, LocalExecutor
 
     executor: Executor
     if address:
-        from dudmap.study.cluster import RayExecutor
+        from dudmap.lab.study.cluster import RayExecutor
 
         executor = RayExecutor(address)
     else:

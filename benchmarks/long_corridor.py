@@ -13,14 +13,14 @@ from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 
+from dudmap.app.pipeline.environment import machine, peak_rss_mb
 from dudmap.cli.run import memory_size
 from dudmap.config import Config
+from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
+from dudmap.core.slam import Slam
 from dudmap.evaluation.trajectory import accuracy
-from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
-from dudmap.pipeline.environment import machine, peak_rss_mb
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import DEFAULT_CAMERA
-from dudmap.synthetic.ring_corridor import ring_corridor
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.synthetic.ring_corridor import ring_corridor
 
 NEAR = 0.02
 """A surface of the scene is in the map if the map has one within this distance along the ray, metres."""

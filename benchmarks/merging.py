@@ -18,9 +18,9 @@ from pathlib import Path
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.geometry import se3
-from dudmap.merging.map_merging import compare_maps
-from dudmap.slam import Slam
+from dudmap.core.geometry import se3
+from dudmap.core.slam import Slam
+from dudmap.fleet.map_merging import compare_maps
 
 sys.path.insert(0, str(Path(__file__).parent.parent / "tests"))
 from rendered_places import CAMERA, TrueMap, looking_elsewhere, rearranged, record, retextured, true_map

@@ -11,10 +11,10 @@ import time
 
 import numpy as np
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.evaluation.reconstruction import compare_surfaces, error_mesh
 from dudmap.evaluation.surface import moved, register
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
 
 
 def waves(side: int, noise: float, seed: int) -> Mesh:

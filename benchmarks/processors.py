@@ -171,8 +171,8 @@ def measure(out: Path) -> None:
     import cv2
 
     from dudmap import Config, Slam, Trajectory, open_sequence
-    from dudmap.benchmark.score import score_trajectory
-    from dudmap.synthetic import sequence
+    from dudmap.lab.benchmark.score import score_trajectory
+    from dudmap.lab.synthetic import sequence
 
     if os.environ.get("DUDMAP_OPENCV_OPTIMIZED") == "0":
         cv2.setUseOptimized(False)

@@ -12,13 +12,13 @@ default, the registration with and without the colour term, and the better of th
 import argparse
 from pathlib import Path
 
-from dudmap.benchmark.color_columns import color_table, measure_columns
-from dudmap.benchmark.entries import local_entries
-from dudmap.benchmark.measure import Job, Row, measure_all
-from dudmap.benchmark.systems import systems
-from dudmap.benchmark.table import COLUMNS, Column, grid, markdown, save
+from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
-from dudmap.pipeline.environment import machine, versions
+from dudmap.lab.benchmark.color_columns import color_table, measure_columns
+from dudmap.lab.benchmark.entries import local_entries
+from dudmap.lab.benchmark.measure import Job, Row, measure_all
+from dudmap.lab.benchmark.systems import systems
+from dudmap.lab.benchmark.table import COLUMNS, Column, grid, markdown, save
 
 TWINS = {"fr1_xyz_confusao": "fr1_xyz_static"}
 """Recordings of the same frames without people."""

@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 from numba import njit
 
-from dudmap.benchmark.table import grid
+from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
-from dudmap.kernels.threads import num_threads
-from dudmap.pipeline.environment import machine, versions
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
+from dudmap.core.backends.threads import num_threads
+from dudmap.core.slam import Slam
+from dudmap.lab.benchmark.table import grid
+from dudmap.lab.synthetic import sequence
 
 FLOPS_PER_PIXEL = 300
 """One linearisation: counted in the unvectorised code that the compiler makes of it; comparisons are free."""

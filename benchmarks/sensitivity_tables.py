@@ -8,9 +8,9 @@ import sys
 import numpy as np
 import pandas as pd
 
-from dudmap.benchmark.table import grid
-from dudmap.study.report import shown
-from dudmap.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT
+from dudmap.lab.benchmark.table import grid
+from dudmap.lab.study.report import shown
+from dudmap.lab.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT
 
 CHOSEN = {HUBER: 0.01, DAMPING: 0.02, VOXEL: 0.01, WEIGHT: 0.1}
 """Best point of table 6.1 of the thesis."""

@@ -18,20 +18,20 @@ from typing import Any
 
 import numpy as np
 
-from dudmap import synthetic
+from dudmap.app.pipeline.environment import machine
+from dudmap.app.pipeline.frame_source import FrameRead
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
 from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.map.memory_limit import resident_bytes
+from dudmap.core.result import FrameResult
+from dudmap.core.slam import Slam
 from dudmap.evaluation.trajectory import accuracy
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.mapping.memory_limit import resident_bytes
-from dudmap.pipeline.environment import machine
-from dudmap.pipeline.frame_source import FrameRead
-from dudmap.pipeline.observer import RunObserver
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.result import FrameResult
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 
 MORE = 1.1
 """Largest growth of time and memory from the second tenth to the last."""

@@ -20,11 +20,11 @@ from typing import Any
 
 import numpy as np
 
-from dudmap.study.conduct import conduct
-from dudmap.study.executor import Executor
-from dudmap.study.plan import Plan, Run, make_plan
-from dudmap.study.store import StudyFolder
-from dudmap.study.worker import Job, Outcome, perform
+from dudmap.lab.study.conduct import conduct
+from dudmap.lab.study.executor import Executor
+from dudmap.lab.study.plan import Plan, Run, make_plan
+from dudmap.lab.study.store import StudyFolder
+from dudmap.lab.study.worker import Job, Outcome, perform
 
 ROW = {f"figure_{n}": n / 7 for n in range(40)}
 """Figures of a run, as many as a real one has."""
@@ -111,7 +111,7 @@ def of_driver(count: int, address: str) -> None:
     """Processor time per run of the process that hands the runs out."""
     executor: Executor = Instant()
     if address:
-        from dudmap.study.cluster import RayExecutor
+        from dudmap.lab.study.cluster import RayExecutor
 
         executor = RayExecutor(address)
     plan = empty_plan(count)

@@ -24,11 +24,12 @@ import numpy as np
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 
 from browsers import SOFTWARE, find_chromium
-from dudmap import Mesh, export_run, synthetic
+from dudmap import Mesh, export_run
+from dudmap.app.pipeline.run import run
+from dudmap.app.viewing.report import write_report
 from dudmap.config import Config
 from dudmap.errors import MissingExtraError
-from dudmap.pipeline.run import run
-from dudmap.viewing.report import write_report
+from dudmap.lab import synthetic
 from run_folders import write_run
 
 SIDE = 708
@@ -81,8 +82,8 @@ def page_seconds(browser, report, rounds):
 
 def view_ms(browser, frames, rounds):
     """Mean processor time of --view per frame in the thread of the run; median times per frame without and with it."""
-    from dudmap.viewing.live_view import LiveView
-    from dudmap.viewing.window import Window
+    from dudmap.app.viewing.live_view import LiveView
+    from dudmap.app.viewing.window import Window
 
     class Measured(LiveView):
         taken: list[float] = []  # noqa: RUF012 - of all rounds

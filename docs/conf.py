@@ -48,7 +48,7 @@ def _read(app: Any, name: str, source: list[str]) -> None:
 
 
 def _public(app: Any, env: Any, node: Any, text: Any) -> Any:
-    """Link a public name that a signature gives with its module, such as dudmap.slam.Slam."""
+    """Link a public name that a signature gives with its module, such as dudmap.core.slam.Slam."""
     name = node.get("reftarget", "").rpartition(".")[2]
     if node.get("refdomain") != "py" or name not in dudmap.__all__:
         return None

@@ -15,10 +15,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from dudmap import Camera, Config, synthetic
-from dudmap.exporting.run_content import RunContent
-from dudmap.pipeline.run import run
-from dudmap.views.cleaning import Cleaner
+from dudmap import Camera, Config
+from dudmap.app.pipeline.run import run
+from dudmap.app.views.cleaning import Cleaner
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.lab import synthetic
 
 TARGET = Path(__file__).parent / "images" / "people.webp"
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

@@ -15,13 +15,14 @@ from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
 from PIL import Image
 
-from dudmap import Camera, Slam, synthetic
-from dudmap.geometry import se3
-from dudmap.kernels.evidence import BINS, MAX_RESIDUAL
-from dudmap.mapping.volume import FREE, TsdfVolume
-from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map
-from dudmap.places.pose_graph import Edge, optimize
-from dudmap.result import FrameResult
+from dudmap import Camera, Slam
+from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import FREE, TsdfVolume
+from dudmap.core.places.pose_graph import Edge, optimize
+from dudmap.core.result import FrameResult
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map
+from dudmap.lab import synthetic
 
 IMAGES = Path(__file__).parent / "images"
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

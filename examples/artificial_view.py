@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from dudmap import Camera, TsdfVolume, synthetic
+from dudmap import Camera, TsdfVolume
+from dudmap.lab import synthetic
 
 camera = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 sequence = synthetic.sequence("room", movers=(), frames=6, camera=camera)

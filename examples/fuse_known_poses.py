@@ -2,7 +2,8 @@
 
 import sys
 
-from dudmap import TsdfVolume, synthetic
+from dudmap import TsdfVolume
+from dudmap.lab import synthetic
 
 out = sys.argv[1] if len(sys.argv) > 1 else "fused.ply"
 sequence = synthetic.sequence("room", movers=(), frames=8)

@@ -5,7 +5,8 @@ from pathlib import Path
 
 import cv2
 
-from dudmap import Camera, Slam, synthetic
+from dudmap import Camera, Slam
+from dudmap.lab import synthetic
 
 out = Path(sys.argv[1] if len(sys.argv) > 1 else ".")
 camera = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

@@ -43,10 +43,10 @@ def float_errors_are_errors():
 
 @pytest.fixture
 def slam(monkeypatch):
-    """Replace ``dudmap.slam.Slam`` by ``FakeSlam``; tests set ``slam.script``."""
+    """Replace ``dudmap.core.slam.Slam`` by ``FakeSlam``; tests set ``slam.script``."""
     fake = type("Slam", (FakeSlam,), {"script": {}})
-    module = types.ModuleType("dudmap.slam")
+    module = types.ModuleType("dudmap.core.slam")
     module.Slam = fake
-    monkeypatch.setitem(sys.modules, "dudmap.slam", module)
-    monkeypatch.setattr("dudmap.state.checkpoints.Checkpoints.take", lambda *args, **options: None)
+    monkeypatch.setitem(sys.modules, "dudmap.core.slam", module)
+    monkeypatch.setattr("dudmap.app.state.checkpoints.Checkpoints.take", lambda *args, **options: None)
     return fake

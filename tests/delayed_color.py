@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from dudmap.calibration import self_calibration
-from dudmap.calibration.estimator import CalibrationEstimator, Estimate
-from dudmap.synthetic.faults import SensorFaults
+from dudmap.core.calibration import self_calibration
+from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate
+from dudmap.lab.synthetic.faults import SensorFaults
 
 DELAY = 0.03
 """Seconds."""

@@ -2,14 +2,14 @@
 
 from pathlib import Path
 
-from dudmap import synthetic
+from dudmap.app.pipeline.run_folder import save_mask
 from dudmap.config import VolumeConfig
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.pipeline.run_folder import save_mask
-from dudmap.synthetic.folder import write_folder
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.folder import write_folder
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
 VOXEL = 0.02

@@ -1,4 +1,4 @@
-"""Fake of ``dudmap.slam.Slam`` with scripted results, for tests of the pipeline and the command line."""
+"""Fake of ``dudmap.core.slam.Slam`` with scripted results, for tests of the pipeline and the command line."""
 
 from dataclasses import dataclass, field
 from types import SimpleNamespace
@@ -6,10 +6,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.kernels.parameters import SensorNoise
+from dudmap.core.backends.parameters import SensorNoise
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH
 
 TRIANGLE = Mesh(

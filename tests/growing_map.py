@@ -4,10 +4,10 @@ import types
 
 import numpy as np
 
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.pipeline.frame_source import FrameRead
+from dudmap.app.pipeline.frame_source import FrameRead
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 from fake_slam import FakeResult
 from run_folders import CAMERA
 from wavy_wall import CAMERA as WALL_CAMERA

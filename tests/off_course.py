@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.geometry import se3
+from dudmap.core.geometry import se3
 
 LIMIT = 0.15
 """Largest share of the motion that an error in a test may have."""

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.geometry.camera import Camera
+from dudmap.core.geometry.camera import Camera
 
 
 def fuse(

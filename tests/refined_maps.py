@@ -3,9 +3,9 @@
 import numpy as np
 
 from dudmap.config import VolumeConfig
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.adaptive_volume import AdaptiveVolume
-from dudmap.mapping.fine_blocks import OCTANTS
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.adaptive_volume import AdaptiveVolume
+from dudmap.core.map.fine_blocks import OCTANTS
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 LOCAL = np.stack(np.meshgrid(*[np.arange(8)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)

@@ -6,16 +6,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.place_recognition import KeyframeDatabase
-from dudmap.places.saved_map import SavedMap
-from dudmap.synthetic.recording import SyntheticSequence
-from dudmap.synthetic.scene import Scene
-from dudmap.synthetic.setup import sequence
-from dudmap.tracking.quality_monitor import RegistrationHistory
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.tracking.quality_monitor import RegistrationHistory
+from dudmap.lab.synthetic.recording import SyntheticSequence
+from dudmap.lab.synthetic.scene import Scene
+from dudmap.lab.synthetic.setup import sequence
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 SMALL_THING = 2.0

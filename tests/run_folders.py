@@ -5,9 +5,9 @@ import json
 import numpy as np
 
 from dudmap import __version__
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.viewing.snapshot import KINDS, jpeg
+from dudmap.app.viewing.snapshot import KINDS, jpeg
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 
 FRAMES = 12
 CAMERA = {"fx": 60.0, "fy": 60.0, "cx": 31.5, "cy": 23.5, "width": 64, "height": 48, "depth_scale": 1000.0}

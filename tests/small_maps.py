@@ -3,9 +3,9 @@
 from dataclasses import replace
 
 from dudmap.config import VolumeConfig
-from dudmap.gpu.device import make_backend
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.core.backends.device import make_backend
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 # Focal lengths that no voxel size divides: at the identity, where a map begins, the voxels of a lattice would else
 # project exactly onto the borders between pixels, where the last bit of a rounding decides.

@@ -15,7 +15,7 @@ import typer
 
 from dudmap.cli import COMMANDS
 from dudmap.config import Config, keys
-from dudmap.sequences import readers
+from dudmap.io.sequences import readers
 
 ROOT = Path(__file__).parent.parent
 PAGES = [ROOT / "README.md", ROOT / "CHANGELOG.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]

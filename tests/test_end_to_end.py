@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.pipeline.run import run
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.io.sequences import open_sequence
 
 EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
 

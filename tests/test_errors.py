@@ -8,9 +8,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from dudmap import doctor, errors
+from dudmap import errors
+from dudmap.app import doctor
 from dudmap.cli import app
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from fake_slam import FakeVolume
 from recordings import write_recording
 

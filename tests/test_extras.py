@@ -13,9 +13,9 @@ from typer.testing import CliRunner
 import dudmap
 from bags import write_bag
 from dudmap.cli import app
+from dudmap.core.backends.device import _resolved
 from dudmap.errors import MissingExtraError
 from dudmap.extras import STUDY, extra, need
-from dudmap.gpu.device import _resolved
 from exported_runs import make_run
 from recordings import write_recording
 from run_folders import write_run
@@ -150,15 +150,15 @@ def test_optional_libraries_are_imported_in_one_way_only():
     """Inside of ``with extra(...)``, or behind it: a study asks for all of its extra at once, rosbags
     is asked for when a bag is opened, and Warp when a device is chosen."""
     behind = {
-        "gpu": {"warp"},
-        "benchmark": {"warp"},
-        "study": set(STUDY),
-        "sequences": {"rosbags", "lz4"},
-        "cameras": {"rosbags"},
+        "core/backends": {"warp"},
+        "lab/benchmark": {"warp"},
+        "lab/study": set(STUDY),
+        "io/sequences": {"rosbags", "lz4"},
+        "io/cameras": {"rosbags"},
     }
     root = Path(dudmap.__file__).parent
     for path in root.rglob("*.py"):
-        package = path.relative_to(root).parts[0]
+        package = "/".join(path.relative_to(root).parts[:2])
         if path.name not in ELSEWHERE:
             found = optional_imports(ast.parse(path.read_text(encoding="utf-8")))
             assert [(top, line) for top, line in found if top not in behind.get(package, set())] == [], path

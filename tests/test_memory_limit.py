@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
+from dudmap.core.geometry.mesh import Mesh, joined
+from dudmap.core.geometry.mesh_pieces import load_simplified, save_pieces
+from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
+from dudmap.core.map.voxel_blocks import VoxelBlocks
+from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError
-from dudmap.geometry.mesh import Mesh, joined
-from dudmap.geometry.mesh_pieces import load_simplified, save_pieces
-from dudmap.mapping.memory_limit import MemoryLimit, resident_bytes
-from dudmap.mapping.voxel_blocks import VoxelBlocks
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import DEFAULT_CAMERA
-from dudmap.synthetic.ring_corridor import ring_corridor
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.synthetic.ring_corridor import ring_corridor
 from triangles import triangles
 
 FRAMES = 80
@@ -84,7 +84,7 @@ def test_a_mesh_written_in_pieces_is_their_union(tmp_path):
 
 
 def test_a_large_mesh_is_simplified_as_it_is_read(tmp_path, monkeypatch):
-    monkeypatch.setattr("dudmap.geometry.mesh_pieces.FACES_AT_ONCE", 2000)
+    monkeypatch.setattr("dudmap.core.geometry.mesh_pieces.FACES_AT_ONCE", 2000)
     pieces = [grid(0.01, 0.0), grid(0.01, 0.39), grid(0.01, 2.0)]
     save_pieces(iter(pieces), tmp_path / "mesh.ply")
     small = load_simplified(tmp_path / "mesh.ply", 1000)

@@ -60,7 +60,7 @@ def test_the_wheel_holds_the_package_with_its_data_and_nothing_else(unpacked):
         for path in PACKAGE.rglob("*") if path.is_file() and path.suffix in DATA
     }  # fmt: skip
     assert {name for name in inside if not name.startswith(f"dudmap-{dudmap.__version__}.dist-info/")} == expected
-    assert "dudmap/viewing/page/three.min.js" in inside
+    assert "dudmap/app/viewing/page/three.min.js" in inside
     assert f"dudmap-{dudmap.__version__}.dist-info/licenses/LICENSE" in inside
 
 

@@ -11,11 +11,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline import environment
+from dudmap.app.viewing.window import _check_port
+from dudmap.core.backends import threads
 from dudmap.errors import DudmapError
-from dudmap.kernels import threads
-from dudmap.pipeline import environment
-from dudmap.study.executor import LocalExecutor, usable_cores
-from dudmap.viewing.window import _check_port
+from dudmap.lab.study.executor import LocalExecutor, usable_cores
 
 SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py"))
 POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}
@@ -101,8 +101,8 @@ def test_output_that_the_terminal_cannot_show_is_no_error(tmp_path):
 
 
 def test_a_recording_in_a_folder_with_any_name(tmp_path):
-    from dudmap import synthetic
-    from dudmap.synthetic.folder import write_folder
+    from dudmap.lab import synthetic
+    from dudmap.lab.synthetic.folder import write_folder
 
     folder = write_folder(synthetic.sequence("room", movers=(), frames=1), tmp_path / "größe ✓", surface=False)
     from dudmap import open_sequence

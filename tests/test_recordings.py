@@ -15,12 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.slam import Slam
 from dudmap.evaluation.trajectory import ate
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.run import run
-from dudmap.sequences import is_recording, open_sequence
-from dudmap.slam import Slam
+from dudmap.io.sequences import is_recording, open_sequence
 
 DATA = os.environ.get("DUDMAP_DATA", "")
 FOLDERS = [path for path in sorted(Path(DATA).iterdir()) if path.is_dir() and is_recording(path)] if DATA else []

@@ -5,9 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import Config, Slam, synthetic
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
+from dudmap import Config, Slam
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.lab import synthetic
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 CONFIG = Config().override(["volume.voxel_size=0.02", "sensor.self_calibration=false"])

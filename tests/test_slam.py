@@ -12,13 +12,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dudmap import synthetic
 from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
 from dudmap.errors import DatasetError
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.slam import Slam
+from dudmap.lab import synthetic
 from off_course import LIMIT, off_course
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)

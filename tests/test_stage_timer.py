@@ -2,8 +2,8 @@
 
 import pytest
 
-from dudmap import stage_timer
-from dudmap.stage_timer import StageTimer
+from dudmap.core import stage_timer
+from dudmap.core.stage_timer import StageTimer
 
 
 def test_no_time_counts_twice(monkeypatch):

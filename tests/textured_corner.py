@@ -3,11 +3,11 @@
 import numpy as np
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 
 CAMERA = Camera(80.0, 80.0, 39.5, 29.5, 80, 60)
 SENSOR = SensorConfig()

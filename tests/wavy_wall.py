@@ -3,8 +3,8 @@
 import numpy as np
 
 from dudmap.config import VolumeConfig
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 CONSTANT = VolumeConfig(voxel_size=0.05, truncation_noise=0, weighting="constant", carve_rate=1)

@@ -16,9 +16,9 @@ from std_srvs.srv import SetBool, Trigger
 from tf2_ros import TransformBroadcaster
 from visualization_msgs.msg import Marker, MarkerArray
 
+from dudmap.core.geometry.mesh_simplification import simplified
 from dudmap.errors import DudmapError
-from dudmap.exporting import ros_messages as ros
-from dudmap.geometry.mesh_simplification import simplified
+from dudmap.io.exporting import ros_messages as ros
 from dudmap_ros.session import Session, config_of, default_parameters
 
 SETTINGS = {

@@ -5,13 +5,13 @@ from pathlib import Path
 from typing import Any
 
 from dudmap.config import Config, keys
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+from dudmap.core.result import FrameResult
+from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DatasetError, MapError
-from dudmap.exporting import ros_messages as ros
-from dudmap.frames.frame import Frame
-from dudmap.geometry.mesh import Mesh
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
-from dudmap.result import FrameResult
-from dudmap.slam import Slam
+from dudmap.io.exporting import ros_messages as ros
 
 
 def default_parameters() -> dict[str, Any]:

@@ -6,28 +6,30 @@ from typing import TYPE_CHECKING
 __version__ = "0.1.0"
 
 _HOMES = {
-    "Calibration": "geometry.calibration",
-    "Camera": "geometry.camera",
+    "Calibration": "core.geometry.calibration",
+    "Camera": "core.geometry.camera",
     "CameraError": "errors",
     "Config": "config",
     "ConfigError": "errors",
     "DatasetError": "errors",
     "DudmapError": "errors",
-    "Frame": "frames.frame",
+    "Frame": "core.frames.frame",
     "FrameError": "errors",
-    "FrameResult": "result",
+    "FrameResult": "core.result",
     "MapError": "errors",
-    "Mesh": "geometry.mesh",
+    "Mesh": "core.geometry.mesh",
     "MissingExtraError": "errors",
-    "Mover": "objects.object_tracker",
-    "RunObserver": "pipeline.observer",
-    "Sequence": "sequences",
-    "Slam": "slam",
-    "Trajectory": "geometry.trajectory",
-    "TsdfVolume": "mapping.volume",
-    "export_run": "exporting.exporters",
-    "open_sequence": "sequences",
-    "run": "pipeline.run",
+    "Mover": "core.objects.object_tracker",
+    "RunObserver": "app.pipeline.observer",
+    "Sequence": "io.sequences",
+    "Slam": "core.slam",
+    "Trajectory": "core.geometry.trajectory",
+    "TsdfVolume": "core.map.volume",
+    "export_run": "io.exporting.exporters",
+    "open_sequence": "io.sequences",
+    "resume_system": "app.state.system",
+    "run": "app.pipeline.run",
+    "save_system": "app.state.system",
 }
 
 __all__ = [
@@ -53,11 +55,25 @@ __all__ = [
     "__version__",
     "export_run",
     "open_sequence",
+    "resume_system",
     "run",
+    "save_system",
 ]
 
 if TYPE_CHECKING:
+    from dudmap.app.pipeline.observer import RunObserver
+    from dudmap.app.pipeline.run import run
+    from dudmap.app.state.system import resume_system, save_system
     from dudmap.config import Config
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.geometry.mesh import Mesh
+    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.core.map.volume import TsdfVolume
+    from dudmap.core.objects.object_tracker import Mover
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
     from dudmap.errors import (
         CameraError,
         ConfigError,
@@ -67,19 +83,8 @@ if TYPE_CHECKING:
         MapError,
         MissingExtraError,
     )
-    from dudmap.exporting.exporters import export_run
-    from dudmap.frames.frame import Frame
-    from dudmap.geometry.calibration import Calibration
-    from dudmap.geometry.camera import Camera
-    from dudmap.geometry.mesh import Mesh
-    from dudmap.geometry.trajectory import Trajectory
-    from dudmap.mapping.volume import TsdfVolume
-    from dudmap.objects.object_tracker import Mover
-    from dudmap.pipeline.observer import RunObserver
-    from dudmap.pipeline.run import run
-    from dudmap.result import FrameResult
-    from dudmap.sequences import Sequence, open_sequence
-    from dudmap.slam import Slam
+    from dudmap.io.exporting.exporters import export_run
+    from dudmap.io.sequences import Sequence, open_sequence
 
 
 def __getattr__(name: str) -> object:

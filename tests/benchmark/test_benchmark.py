@@ -9,17 +9,17 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.benchmark import limits, measure, report
-from dudmap.benchmark.entries import Entry
-from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
-from dudmap.benchmark.published import published
-from dudmap.benchmark.suites import SUITES, find_suite
-from dudmap.benchmark.systems import systems
-from dudmap.benchmark.table import markdown
 from dudmap.cli import app
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.geometry import se3
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.lab.benchmark import limits, measure, report
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
+from dudmap.lab.benchmark.published import published
+from dudmap.lab.benchmark.suites import SUITES, find_suite
+from dudmap.lab.benchmark.systems import systems
+from dudmap.lab.benchmark.table import markdown
 from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
 

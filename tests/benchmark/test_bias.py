@@ -6,10 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from dudmap import Config, synthetic
-from dudmap.benchmark.bias import bias_table, measure_pulls
+from dudmap import Config
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
-from dudmap.geometry.camera import Camera
+from dudmap.lab import synthetic
+from dudmap.lab.benchmark.bias import bias_table, measure_pulls
 
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 

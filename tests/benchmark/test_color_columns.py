@@ -1,13 +1,13 @@
 import pytest
 
-from dudmap.benchmark import color_columns
-from dudmap.benchmark.color_columns import Measurement, color_table, is_within
-from dudmap.benchmark.entries import Entry
-from dudmap.benchmark.suites import SENSORS, sensor_entries
-from dudmap.benchmark.table import Column
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.synthetic.cameras import CAMERAS
+from dudmap.lab.benchmark import color_columns
+from dudmap.lab.benchmark.color_columns import Measurement, color_table, is_within
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.suites import SENSORS, sensor_entries
+from dudmap.lab.benchmark.table import Column
+from dudmap.lab.synthetic.cameras import CAMERAS
 
 TINY = {"scene": "box", "movers": (), "frames": 2, "camera": (64, 48), "noise": "none"}
 

@@ -5,10 +5,10 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.benchmark import gate
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import ConfigError
+from dudmap.lab.benchmark import gate
 
 HERE = Path(__file__).parents[1]
 RECORDED = gate.load_figures(HERE / "gate.toml")

@@ -5,10 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from dudmap.benchmark import gpu
 from dudmap.errors import ConfigError, DeviceError
-from dudmap.synthetic import sequence
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.benchmark import gpu
+from dudmap.lab.synthetic import sequence
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
 def test_runs_on_the_cpu_and_says_that_no_gpu_was_measured(monkeypatch):

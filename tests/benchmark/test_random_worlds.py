@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.benchmark import random_worlds
-from dudmap.benchmark.entries import Entry
-from dudmap.benchmark.random_worlds import draw_world, measure_worlds, report, synth_command
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.synthetic import names
+from dudmap.lab.benchmark import random_worlds
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.random_worlds import draw_world, measure_worlds, report, synth_command
+from dudmap.lab.synthetic import names
 
 
 def row(world, ate, lost=0, frames=100):
@@ -39,7 +39,7 @@ def test_worlds_are_varied_and_of_known_parts():
 @pytest.mark.parametrize("number", [0, 8, 32])
 def test_a_world_opens_and_its_command_writes_the_same(number, monkeypatch):
     written = []
-    monkeypatch.setattr("dudmap.synthetic.folder.write_folder", lambda sequence, out, **_: written.append(sequence))
+    monkeypatch.setattr("dudmap.lab.synthetic.folder.write_folder", lambda sequence, out, **_: written.append(sequence))
     world = draw_world(2, number) | {"frames": 2, "camera": (64, 48)}
     recording = Entry("world", parameters=world).open()
     made = CliRunner().invoke(app, [*shlex.split(synth_command(world))[1:], "--quiet"])

@@ -6,10 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dudmap.benchmark import speed
-from dudmap.benchmark.passage import LAP, passage
 from dudmap.errors import DudmapError
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.benchmark import speed
+from dudmap.lab.benchmark.passage import LAP, passage
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
 def test_the_table_says_what_is_reached():
@@ -55,7 +55,7 @@ def test_the_first_and_the_last_tenth_of_the_passage_see_the_same():
 
 def test_the_first_frame_may_need_more_blocks_than_the_table_was_made_for():
     from dudmap.config import SensorConfig, VolumeConfig
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.map.volume import TsdfVolume
 
     volume = TsdfVolume(DEFAULT_CAMERA, VolumeConfig(voxel_size=0.005), SensorConfig(), 4.0)
     volume.look_at(np.eye(4))
@@ -91,8 +91,8 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     import sys
     from pathlib import Path
 
-    from dudmap.benchmark import interleaved
-    from dudmap.benchmark.entries import Entry
+    from dudmap.lab.benchmark import interleaved
+    from dudmap.lab.benchmark.entries import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))
     entry = Entry("room-static", parameters={"movers": (), "frames": 12, "camera": (160, 120)})
@@ -110,7 +110,7 @@ def _instead_of(read_text, name, text):
 def test_a_python_without_open3d_is_refused(tmp_path):
     import sys
 
-    from dudmap.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.interleaved import find_open3d
 
     with pytest.raises(DudmapError, match="cannot run"):
         find_open3d(tmp_path / "nothing")

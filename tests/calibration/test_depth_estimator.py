@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap.calibration.depth_estimator import DepthView, estimate_distortion
-from dudmap.calibration.depth_model import TERMS, DepthModel, image_extent, terms
+from dudmap.core.calibration.depth_estimator import DepthView, estimate_distortion
+from dudmap.core.calibration.depth_model import TERMS, DepthModel, image_extent, terms
+from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError
-from dudmap.geometry import se3
 from textured_corner import CAMERA, SENSOR, corner
 
 TRUTH = {(0, 2, 1): 0.010, (0, 3, 0): -0.006, (0, 0, 2): 0.008, (1, 1, 1): 0.004}

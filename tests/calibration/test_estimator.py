@@ -5,19 +5,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap.calibration.adjustment import Adjustment, _State
-from dudmap.calibration.collector import KeyframeCollector
-from dudmap.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
-from dudmap.calibration.pairs import Pair
+from dudmap.app.pipeline.calibration import INTERVAL, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
-from dudmap.frames.color_registration import color_projection
-from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import PARAMETERS, Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.pipeline.calibration import INTERVAL, _enlarged, _Excerpt, calibrate_sequence
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.calibration.adjustment import Adjustment, _State
+from dudmap.core.calibration.collector import KeyframeCollector
+from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
+from dudmap.core.calibration.pairs import Pair
+from dudmap.core.frames.color_registration import color_projection
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import PARAMETERS, Calibration
+from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(130.0, 130.0, 79.5, 59.5, 160, 120)
 FPS, FRAMES = 30.0, 80

@@ -6,17 +6,17 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.calibration import self_calibration
-from dudmap.calibration.estimator import Estimate
-from dudmap.calibration.self_calibration import SelfCalibration
 from dudmap.config import Config, SensorConfig
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
-from dudmap.synthetic.faults import SensorFaults
+from dudmap.core.calibration import self_calibration
+from dudmap.core.calibration.estimator import Estimate
+from dudmap.core.calibration.self_calibration import SelfCalibration
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.lab.synthetic import sequence
+from dudmap.lab.synthetic.faults import SensorFaults
 
 SMALL = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
 FRAMES, FIRST, LATER = 24, 12, 4

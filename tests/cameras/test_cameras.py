@@ -6,9 +6,9 @@ from types import ModuleType, SimpleNamespace
 import numpy as np
 import pytest
 
-from dudmap.cameras import CAMERAS, CameraFrame, LiveCamera, open_camera
+from dudmap.core.frames.frame import Frame
 from dudmap.errors import CameraError, DatasetError, FrameError, MissingExtraError
-from dudmap.frames.frame import Frame
+from dudmap.io.cameras import CAMERAS, CameraFrame, LiveCamera, open_camera
 
 DRIVERS = {
     "realsense": "pyrealsense2",
@@ -104,7 +104,7 @@ def test_without_a_name_all_are_tried_and_their_reasons_told(monkeypatch):
         def close(self):
             pass
 
-    modules = {f"dudmap.cameras.{entry.split(':')[0]}": entry.split(":")[1] for entry in CAMERAS.values()}
+    modules = {f"dudmap.io.cameras.{entry.split(':')[0]}": entry.split(":")[1] for entry in CAMERAS.values()}
     for name, attribute in modules.items():
         fake = ModuleType(name)
         setattr(fake, attribute, Kind)

@@ -6,13 +6,13 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.cameras import open_camera
+from dudmap.app.pipeline.live import run_live
 from dudmap.config import Config
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import CameraError
-from dudmap.geometry.camera import Camera
-from dudmap.pipeline.live import run_live
-from dudmap.sequences import open_sequence
-from dudmap.sequences.lens import Lens
+from dudmap.io.cameras import open_camera
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.lens import Lens
 from recordings import HEIGHT, WIDTH
 from software_device import COLOR_WIDTH, T_COLOR_DEPTH, color, millimetres, record
 

@@ -6,13 +6,13 @@ import time
 import numpy as np
 import pytest
 
-from dudmap.cameras.recorder import AHEAD, Recorder
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import CameraError
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import open_sequence
+from dudmap.io.cameras.recorder import AHEAD, Recorder
+from dudmap.io.sequences import open_sequence
 from recordings import HEIGHT, WIDTH, color_image, depth_image
 
 CAMERA = Camera(60, 61, 31.5, 23.5, WIDTH, HEIGHT)

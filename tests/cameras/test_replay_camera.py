@@ -5,10 +5,10 @@ import time
 
 import numpy as np
 
-from dudmap.cameras import open_camera
-from dudmap.cameras.replay import ReplayCamera
 from dudmap.errors import FrameError
-from dudmap.sequences import open_sequence
+from dudmap.io.cameras import open_camera
+from dudmap.io.cameras.replay import ReplayCamera
+from dudmap.io.sequences import open_sequence
 from recordings import cut, depth_image, write_recording
 
 

@@ -8,8 +8,8 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.cli import app
-from dudmap.exporting.exporters import EXPORTERS
-from dudmap.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.io.exporting.exporters import EXPORTERS
 from exported_runs import make_run
 from run_folders import write_run
 

@@ -14,7 +14,7 @@ import dudmap
 from dudmap.cli import COMMANDS, app
 from dudmap.cli.config import commented
 from dudmap.config import PRESETS, Config
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.core.geometry.trajectory import Trajectory
 from recordings import HEIGHT, WIDTH, cut, write_recording
 
 

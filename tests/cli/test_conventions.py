@@ -99,76 +99,82 @@ FAKED = {
     "benchmark gate": (
         ["benchmark", "gate"],
         {
-            "dudmap.benchmark.gate.load_figures": lambda _: {},
-            "dudmap.benchmark.gate.gate_entries": lambda _: [],
-            "dudmap.benchmark.gate.measure_gate": lambda *_: [],
-            "dudmap.benchmark.gate.compare": lambda *_: [],
+            "dudmap.lab.benchmark.gate.load_figures": lambda _: {},
+            "dudmap.lab.benchmark.gate.gate_entries": lambda _: [],
+            "dudmap.lab.benchmark.gate.measure_gate": lambda *_: [],
+            "dudmap.lab.benchmark.gate.compare": lambda *_: [],
         },
     ),
     "benchmark sensors": (
         ["benchmark", "sensors", "--only", "kinect_v1", "--out", "sensors"],
         {
-            "dudmap.benchmark.color_columns.measure_columns": lambda *_: [],
-            "dudmap.benchmark.color_columns.color_table": lambda *_: "",
+            "dudmap.lab.benchmark.color_columns.measure_columns": lambda *_: [],
+            "dudmap.lab.benchmark.color_columns.color_table": lambda *_: "",
         },
     ),
     "benchmark random": (
         ["benchmark", "random", "--out", "."],
         {
-            "dudmap.benchmark.random_worlds.measure_worlds": lambda *_: [],
-            "dudmap.benchmark.random_worlds.report": lambda *_: "",
+            "dudmap.lab.benchmark.random_worlds.measure_worlds": lambda *_: [],
+            "dudmap.lab.benchmark.random_worlds.report": lambda *_: "",
         },
     ),
     "benchmark limits": (
         ["benchmark", "limits", "--out", "limits"],
         {
-            "dudmap.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.benchmark.heatmaps.save_heat_maps": lambda *_: None,
-            "dudmap.benchmark.heatmaps.limits_table": lambda *_: "",
-            "dudmap.benchmark.heatmaps.cells_table": lambda *_: "",
+            "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
+            "dudmap.lab.benchmark.heatmaps.save_heat_maps": lambda *_: None,
+            "dudmap.lab.benchmark.heatmaps.limits_table": lambda *_: "",
+            "dudmap.lab.benchmark.heatmaps.cells_table": lambda *_: "",
         },
     ),
     "benchmark gpu": (
         ["benchmark", "gpu", "--out", "gpu"],
-        {"dudmap.benchmark.gpu.recordings": lambda *_: [], "dudmap.benchmark.gpu.table": lambda _: ""},
+        {"dudmap.lab.benchmark.gpu.recordings": lambda *_: [], "dudmap.lab.benchmark.gpu.table": lambda _: ""},
     ),
     "benchmark faults": (
         ["benchmark", "faults"],
         {
-            "dudmap.benchmark.stream_faults.default_room": lambda *_: SimpleNamespace(name="room"),
-            "dudmap.benchmark.stream_faults.measure_stream_faults": lambda *_: [],
+            "dudmap.lab.benchmark.stream_faults.default_room": lambda *_: SimpleNamespace(name="room"),
+            "dudmap.lab.benchmark.stream_faults.measure_stream_faults": lambda *_: [],
         },
     ),
     "benchmark speed": (
         ["benchmark", "speed", "--out", "speed"],
-        {"dudmap.benchmark.speed.speed_figures": lambda *_: []},
+        {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
-        {"dudmap.benchmark.bias.measure_pulls": lambda *_: [], "dudmap.synthetic.sequence": lambda *_, **__: None},
+        {
+            "dudmap.lab.benchmark.bias.measure_pulls": lambda *_: [],
+            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
+        },
     ),
     "benchmark first-second": (
         ["benchmark", "first-second", "--seeds", 1],
         {
-            "dudmap.benchmark.first_second.measure_first_second": lambda *_: [],
-            "dudmap.benchmark.first_second.first_second_table": lambda _: "",
-            "dudmap.synthetic.sequence": lambda *_, **__: None,
+            "dudmap.lab.benchmark.first_second.measure_first_second": lambda *_: [],
+            "dudmap.lab.benchmark.first_second.first_second_table": lambda _: "",
+            "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
         },
     ),
     "study run": (
         ["study", "design.toml"],
         {
-            "dudmap.study.plan.load_plan": lambda _: None,
-            "dudmap.study.study.run_study": lambda *_, **__: "an outcome",
+            "dudmap.lab.study.plan.load_plan": lambda _: None,
+            "dudmap.lab.study.study.run_study": lambda *_, **__: "an outcome",
         },
     ),
     "study tune": (
         ["study", "tune", "design.toml"],
-        {"dudmap.study.plan.load_plan": lambda _: None, "dudmap.study.tune.run_tune": lambda *_, **__: "an outcome"},
+        {
+            "dudmap.lab.study.plan.load_plan": lambda _: None,
+            "dudmap.lab.study.tune.run_tune": lambda *_, **__: "an outcome",
+        },
     ),
     "study thesis": (
         ["study", "thesis", "--published", "--out", "published"],
-        {"dudmap.study.thesis.published_report": lambda _: "an outcome"},
+        {"dudmap.lab.study.thesis.published_report": lambda _: "an outcome"},
     ),
 }
 """Long commands, with their measurements replaced."""
@@ -199,7 +205,7 @@ def test_every_reporting_command_was_called():
 
 def test_json_of_suites(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dudmap.benchmark.report.measure_all", lambda *_: [])
+    monkeypatch.setattr("dudmap.lab.benchmark.report.measure_all", lambda *_: [])
     done = call("benchmark", "synthetic", "--quick", "--json", "--out", "out")
     assert done.exit_code == 0, done.output
     assert json.loads(done.stdout)["rows"] == []

@@ -10,7 +10,7 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.cli import app
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from recordings import write_recording
 
 

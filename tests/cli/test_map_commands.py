@@ -7,7 +7,7 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.places.saved_map import SavedMap
+from dudmap.core.places.saved_map import SavedMap
 from recordings import write_recording
 
 

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.background_model import BackgroundModel
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
+from dudmap.core.dynamics.background_model import BackgroundModel
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 V, U = np.indices(CAMERA.shape)

@@ -5,14 +5,14 @@ from collections import deque
 import numpy as np
 import pytest
 
-from dudmap import synthetic
-from dudmap.benchmark.systems import systems
 from dudmap.config import Config
-from dudmap.dynamics.mixture import Mixture, fit_mixture
-from dudmap.geometry.camera import Camera
-from dudmap.kernels import labeling
-from dudmap.kernels.evidence import BINS, MAX_RESIDUAL
-from dudmap.slam import Slam
+from dudmap.core.backends.cpu import labeling
+from dudmap.core.backends.cpu.evidence import BINS, MAX_RESIDUAL
+from dudmap.core.dynamics.mixture import Mixture, fit_mixture
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
+from dudmap.lab.benchmark.systems import systems
 from oracle import half_normal_mixture_em
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)

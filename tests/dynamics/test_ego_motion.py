@@ -6,23 +6,23 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap import synthetic
 from dudmap.config import Config, TrackerConfig
-from dudmap.dynamics import dominant_motion as dominant
-from dudmap.dynamics import ego_motion
-from dudmap.dynamics.dominant_motion import dominant_motion
-from dudmap.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
-from dudmap.frames.optical_flow import consistent_with_static
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.kernels import consensus, labeling
-from dudmap.mapper import Mapper
-from dudmap.slam import Slam
-from dudmap.tracking.checks import RELATIVE, first_failure
-from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import TrackingResult
+from dudmap.core.backends.cpu import consensus, labeling
+from dudmap.core.dynamics import dominant_motion as dominant
+from dudmap.core.dynamics import ego_motion
+from dudmap.core.dynamics.dominant_motion import dominant_motion
+from dudmap.core.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
+from dudmap.core.frames.optical_flow import consistent_with_static
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.mapper import Mapper
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.checks import RELATIVE, first_failure
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.lab import synthetic
 
 CAMERA = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 

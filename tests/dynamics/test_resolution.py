@@ -11,14 +11,14 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap import synthetic
 from dudmap.config import Config
-from dudmap.dynamics.label_scale import REFERENCE_WIDTH
-from dudmap.dynamics.masks import full_size
-from dudmap.dynamics.segments import MIN_PIXELS
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.slam import Slam
+from dudmap.core.dynamics.label_scale import REFERENCE_WIDTH
+from dudmap.core.dynamics.masks import full_size
+from dudmap.core.dynamics.segments import MIN_PIXELS
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 from off_course import LIMIT, off_course
 
 FRAMES = 14

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-from dudmap import synthetic
 from dudmap.config import DynamicsConfig
-from dudmap.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
-from dudmap.dynamics.temporal_memory import TemporalMemory
-from dudmap.frames.observation import Level
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.evidence import segment_counts
-from dudmap.slam import Slam
+from dudmap.core.backends.cpu.evidence import segment_counts
+from dudmap.core.dynamics.segments import SegmentEvidence, classify_segments, segment, split_mixed_segments
+from dudmap.core.dynamics.temporal_memory import TemporalMemory
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 
 CAMERA = Camera(131, 131, 79.5, 59.5, 160, 120)
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)

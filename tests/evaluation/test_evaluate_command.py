@@ -8,10 +8,10 @@ import pytest
 from typer.testing import CliRunner
 
 from dudmap.cli import app
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.evaluation.files import find_reference, load_reference, tracked_share
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
 from layouts import bonn, pose, replica, tum_line, write
 
 

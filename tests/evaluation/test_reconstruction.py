@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import trimesh
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, MapError
 from dudmap.evaluation.reconstruction import compare_surfaces, distance_colors, error_mesh
 from dudmap.evaluation.surface import Surface, moved, point_triangle_distances, register
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
 
 
 def mesh_of(vertices, faces):

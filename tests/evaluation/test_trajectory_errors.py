@@ -10,10 +10,10 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.evaluation.trajectory import ate, pair_poses, rpe
-from dudmap.geometry import se3
-from dudmap.geometry.trajectory import Trajectory
 
 RNG_SEED = 7
 

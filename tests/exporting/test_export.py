@@ -8,13 +8,13 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh_simplification import simplified
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.exporting import ros_messages as ros
-from dudmap.exporting.exporters import EXPORTERS, export_run
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.mesh_simplification import simplified
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.io.exporting import ros_messages as ros
+from dudmap.io.exporting.exporters import EXPORTERS, export_run
 
 
 def grid_mesh(n=40, step=0.01):

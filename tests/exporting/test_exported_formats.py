@@ -20,14 +20,14 @@ from typer.testing import CliRunner
 
 import dudmap
 from dudmap.cli import app
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, MapError
-from dudmap.exporting.exporters import EXPORTERS, export_run
-from dudmap.exporting.gltf import linear_light
-from dudmap.exporting.gravity import find_floor
-from dudmap.exporting.options import ExportOptions
-from dudmap.exporting.run_content import RunContent
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.io.exporting.exporters import EXPORTERS, export_run
+from dudmap.io.exporting.gltf import linear_light
+from dudmap.io.exporting.gravity import find_floor
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
 from exported_runs import CAMERA, VOXEL, make_run
 
 

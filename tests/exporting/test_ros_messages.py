@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from rosbags.typesys import Stores, get_typestore
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import DatasetError
-from dudmap.exporting import ros_messages as ros
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.mesh import Mesh
+from dudmap.io.exporting import ros_messages as ros
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 TYPES = ros.MessageTypes(STORE.types.__getitem__)

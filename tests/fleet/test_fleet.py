@@ -12,22 +12,22 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from dudmap.config import VolumeConfig
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.evaluation.surface import Surface
 from dudmap.fleet import fusion
 from dudmap.fleet.fusion import PlacedRun, RangeJob, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.map_fusion import FusedRange, fuse_maps, joined
 from dudmap.fleet.merge import load_part, merge_fleet, read_world
 from dudmap.fleet.tiles import T_GLTF_MAP, write_tile, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_fusion import FusedRange, fuse_maps, joined
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from rendered_places import record, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)

@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from dudmap.core.geometry import se3
 from dudmap.fleet import rounds
+from dudmap.fleet.agreement import Agreement
+from dudmap.fleet.map_merging import NOT_RECOGNISED, MapPair
 from dudmap.fleet.registration import RegisteredPair
+from dudmap.fleet.relative_pose import Hypothesis
 from dudmap.fleet.rounds import predicted_overlap, registered_runs
+from dudmap.fleet.sdf_alignment import SdfAlignment
 from dudmap.fleet.workers import Workers
-from dudmap.geometry import se3
-from dudmap.merging.agreement import Agreement
-from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair
-from dudmap.merging.relative_pose import Hypothesis
-from dudmap.merging.sdf_alignment import SdfAlignment
 
 RUNS, RADIUS = 12, 5.0
 TRUE = [se3.exp(np.array([0, 0, 0, 0, 0, 2 * np.pi * k / RUNS])) for k in range(RUNS)]

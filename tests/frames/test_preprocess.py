@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from dudmap.config import PreprocessConfig
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import halved
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
-from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.frames.pyramid import halved
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 

@@ -30,14 +30,14 @@ def load_config(path):
 def calibration():
     import tomli_w
 
-    from dudmap.geometry.calibration import Calibration
-    from dudmap.geometry.camera import Camera
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.geometry.camera import Camera
 
     return tomli_w.dumps(Calibration(Camera(60, 60, 31.5, 23.5, 64, 48, distortion=(0.1, 0, 0, 0, 0))).tree())
 
 
 def load_calibration(path):
-    from dudmap.geometry.calibration import Calibration
+    from dudmap.core.geometry.calibration import Calibration
 
     Calibration.load(path)
 
@@ -47,7 +47,7 @@ def trajectory():
 
 
 def load_trajectory(path):
-    from dudmap.geometry.trajectory import Trajectory
+    from dudmap.core.geometry.trajectory import Trajectory
 
     loaded = Trajectory.load(path)
     assert np.isfinite(loaded.Ts_world_camera).all()
@@ -59,13 +59,13 @@ def camera_files(folder):
 
 
 def load_camera_file(path):
-    from dudmap.sequences import camera_json
+    from dudmap.io.sequences import camera_json
 
     camera_json.load([path]).camera(64, 48)
 
 
 def load_intrinsics(path):
-    from dudmap.sequences import intrinsics
+    from dudmap.io.sequences import intrinsics
 
     found = intrinsics.from_file(path)
     found.camera(64, 48)
@@ -89,7 +89,7 @@ def image(kind, folder):
 
 
 def load_image(path):
-    from dudmap.sequences import images
+    from dudmap.io.sequences import images
 
     for read in (images.read_color, partial(images.read_depth, depth_scale=1000.0), images.read_mask):
         try:
@@ -104,13 +104,13 @@ def array(folder):
 
 
 def load_array(path):
-    from dudmap.sequences import images
+    from dudmap.io.sequences import images
 
     images.read_depth_array(path)
 
 
 def mesh(extension, folder):
-    from dudmap.geometry.mesh import Mesh
+    from dudmap.core.geometry.mesh import Mesh
 
     corners = np.array([[0, 0, 1], [1, 0, 1], [0, 1, 1], [1, 1, 2]], np.float32)
     made = Mesh(corners, np.array([[0, 1, 2], [1, 3, 2]], np.int32), np.full((4, 3), 90, np.uint8), corners)
@@ -119,7 +119,7 @@ def mesh(extension, folder):
 
 
 def load_mesh(path):
-    from dudmap.geometry.mesh import Mesh
+    from dudmap.core.geometry.mesh import Mesh
 
     Mesh.load(path).area()
 
@@ -151,10 +151,10 @@ def run_folder(folder):
 
 
 def load_run_folder(path):
+    from dudmap.app.viewing.run_files import RunFiles
+    from dudmap.app.viewing.stored_view import frames_of
     from dudmap.evaluation.files import tracked_share
-    from dudmap.exporting.run_content import RunContent
-    from dudmap.viewing.run_files import RunFiles
-    from dudmap.viewing.stored_view import frames_of
+    from dudmap.io.exporting.run_content import RunContent
 
     def content():
         run = RunContent.load(path)
@@ -173,11 +173,11 @@ def load_run_folder(path):
 
 def write_into_run_folder(path):
     """What a run does with a folder that exists, and what going on with a run does."""
+    from dudmap.app.pipeline.run_folder import locked, prepare_run_folder, save_mask
+    from dudmap.app.pipeline.storing import stored_options
+    from dudmap.app.viewing.thumbnails import Thumbnails
+    from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.errors import DudmapError
-    from dudmap.geometry.trajectory import Trajectory
-    from dudmap.pipeline.run_folder import locked, prepare_run_folder, save_mask
-    from dudmap.pipeline.storing import stored_options
-    from dudmap.viewing.thumbnails import Thumbnails
 
     try:
         with locked(path):

@@ -17,30 +17,30 @@ from pathlib import Path
 
 import atheris
 
-import dudmap.kernels
+import dudmap.core.backends.cpu
 
 sys.path[:0] = [str(Path(__file__).parent), str(Path(__file__).parents[1])]
 
-for kernels in pkgutil.iter_modules(dudmap.kernels.__path__):  # compiled from the code as it is
-    importlib.import_module(f"dudmap.kernels.{kernels.name}")
+for kernels in pkgutil.iter_modules(dudmap.core.backends.cpu.__path__):  # compiled from the code as it is
+    importlib.import_module(f"dudmap.core.backends.cpu.{kernels.name}")
 
 with atheris.instrument_imports(include=["dudmap", "rosbags"]):
-    import dudmap.calibration.depth_model
+    import dudmap.app.state.database
+    import dudmap.app.state.system
+    import dudmap.app.viewing.run_files
     import dudmap.config
+    import dudmap.core.calibration.depth_model
+    import dudmap.core.geometry.mesh
+    import dudmap.core.map.adaptive_volume
+    import dudmap.core.map.volume
+    import dudmap.core.places.saved_map
     import dudmap.evaluation.files
-    import dudmap.exporting.run_content
-    import dudmap.geometry.mesh
-    import dudmap.mapping.adaptive_volume
-    import dudmap.mapping.volume
-    import dudmap.places.saved_map
-    import dudmap.sequences
-    import dudmap.sequences.camera_json
-    import dudmap.sequences.masks
-    import dudmap.state.database
-    import dudmap.state.system
-    import dudmap.viewing.run_files
+    import dudmap.io.exporting.run_content
+    import dudmap.io.sequences
+    import dudmap.io.sequences.camera_json
+    import dudmap.io.sequences.masks
 
-    dudmap.sequences.readers()
+    dudmap.io.sequences.readers()
 
 from trial import Subject
 

@@ -9,9 +9,9 @@ import numpy as np
 def volume(content=True):
     """A small map of a wall, or an empty one."""
     from dudmap.config import SensorConfig, VolumeConfig
-    from dudmap.frames.frame import Frame
-    from dudmap.geometry.camera import Camera
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.map.volume import TsdfVolume
 
     made = TsdfVolume(Camera(20, 20, 15.5, 11.5, 32, 24), VolumeConfig(voxel_size=0.1), SensorConfig(), 3.0)
     frame = Frame(0.0, np.full((24, 32), 1.5, np.float32), np.full((24, 32, 3), 90, np.uint8))
@@ -28,9 +28,9 @@ def map_file(folder):
 def adaptive_map_file(folder):
     """A small map of two walls that meet, with smaller voxels at their edge."""
     from dudmap.config import SensorConfig, VolumeConfig
-    from dudmap.frames.frame import Frame
-    from dudmap.geometry.camera import Camera
-    from dudmap.mapping.adaptive_volume import AdaptiveVolume
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.map.adaptive_volume import AdaptiveVolume
 
     config = VolumeConfig(voxel_size=0.1, adaptive=True, adaptive_bend=0.1)
     made = AdaptiveVolume(Camera(20, 20, 15.5, 11.5, 32, 24), config, SensorConfig(), 3.0)
@@ -43,7 +43,7 @@ def adaptive_map_file(folder):
 
 
 def load_map(path):
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.map.volume import TsdfVolume
 
     loaded = TsdfVolume.load(path)
     loaded.extract_mesh()
@@ -55,9 +55,9 @@ def parts(content=True):
     from collections import deque
 
     from dudmap.config import Config
-    from dudmap.geometry.camera import Camera
-    from dudmap.places.atlas import TimedPose
-    from dudmap.places.place_recognition import Keyframe, PlacedFeatures
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.places.atlas import TimedPose
+    from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
 
     rng = np.random.default_rng(0)
     features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
@@ -70,8 +70,8 @@ def parts(content=True):
 
 
 def state(folder):
-    from dudmap.state.database import StateDatabase
-    from dudmap.state.system import take_snapshot
+    from dudmap.app.state.database import StateDatabase
+    from dudmap.app.state.system import take_snapshot
 
     database = StateDatabase(folder / "state.db")
     database.write(take_snapshot(parts(), database), {"next": 1})
@@ -80,8 +80,8 @@ def state(folder):
 
 
 def load_state(path):
-    from dudmap.state.database import StateReader
-    from dudmap.state.system import restore
+    from dudmap.app.state.database import StateReader
+    from dudmap.app.state.system import restore
 
     try:
         reader = StateReader(path)
@@ -102,8 +102,8 @@ def load_state(path):
 
 
 def keyframes(folder):
-    from dudmap.places.place_recognition import Keyframe, PlacedFeatures
-    from dudmap.places.saved_map import SavedMap
+    from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
+    from dudmap.core.places.saved_map import SavedMap
 
     rng = np.random.default_rng(0)
     features = PlacedFeatures(rng.random((5, 128), np.float32), rng.random((5, 3)))
@@ -113,13 +113,13 @@ def keyframes(folder):
 
 
 def load_keyframe_file(path):
-    from dudmap.places.saved_map import load_keyframes
+    from dudmap.core.places.saved_map import load_keyframes
 
     load_keyframes(path)
 
 
 def depth_model(folder):
-    from dudmap.calibration.depth_model import TERMS, DepthModel
+    from dudmap.core.calibration.depth_model import TERMS, DepthModel
 
     n = len(TERMS)
     DepthModel(np.zeros(n), np.eye(n), np.ones(2), 3).save(folder / "depth_model.npz")
@@ -127,7 +127,7 @@ def depth_model(folder):
 
 
 def load_depth_model(path):
-    from dudmap.calibration.depth_model import DepthModel
+    from dudmap.core.calibration.depth_model import DepthModel
 
     DepthModel.load(path).correction  # noqa: B018
 

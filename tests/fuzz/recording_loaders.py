@@ -9,7 +9,7 @@ from verdict import Loader, check_sentence
 
 import layouts
 from dudmap.errors import FrameError
-from dudmap.sequences import corbs, epfl, frame_files, icl_nuim, intrinsics, open_sequence, redwood
+from dudmap.io.sequences import corbs, epfl, frame_files, icl_nuim, intrinsics, open_sequence, redwood
 
 CAMERA = "60,60,31.5,23.5,64,48"
 
@@ -101,8 +101,8 @@ def masks(folder):
 
 
 def load_masks(path):
-    from dudmap.geometry.camera import Camera
-    from dudmap.sequences.masks import MaskFolder
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.io.sequences.masks import MaskFolder
 
     folder = MaskFolder(path, np.array([100.0, 100.1, 100.2]), Camera(60, 60, 31.5, 23.5, 64, 48))
     for index in range(3):

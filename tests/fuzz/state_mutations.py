@@ -8,10 +8,12 @@ from contextlib import closing
 from functools import lru_cache
 
 CLASSES = (
-    "dudmap.mapping.voxel_blocks:VoxelBlocks", "dudmap.mapping.volume:TsdfVolume",
-    "dudmap.places.place_recognition:Keyframe",
-    "dudmap.kernels.parameters:VoxelGrid", "dudmap.config:Config", "dudmap.slam:Slam", "dudmap.geometry.camera:Camera",
-    "dudmap.mapping.memory_limit:MemoryLimit", "subprocess:Popen", "os:system", "builtins:eval", "dudmap.slam:np", 7,
+    "dudmap.core.map.voxel_blocks:VoxelBlocks", "dudmap.core.map.volume:TsdfVolume",
+    "dudmap.core.places.place_recognition:Keyframe",
+    "dudmap.core.backends.parameters:VoxelGrid", "dudmap.config:Config", "dudmap.core.slam:Slam",
+    "dudmap.core.geometry.camera:Camera",
+    "dudmap.core.map.memory_limit:MemoryLimit", "subprocess:Popen", "os:system", "builtins:eval",
+    "dudmap.core.slam:np", 7,
 )  # fmt: skip
 VALUES = (
     None, True, -1, 0, 1, 7, 10**9, 10**40, 1.5, float("nan"), "", "x" * 50, [], {}, [[]], [None] * 40, {"a": 1},
@@ -24,11 +26,12 @@ VALUES = (
     {"scalar": "<f8", "value": "1"}, {"scalar": "nonsense", "value": 1},
     {"random": {"bit_generator": "MT19937"}, "id": 99},
     {"random": 3, "id": 100}, {"set": [[]], "id": 101}, {"frozenset": [1, 1], "id": 102}, {"result": 3, "id": 103},
-    {"tuple": [10**9], "class": "dudmap.mapping.voxel_blocks:VoxelBlocks", "id": 104}, {"records": 0}, {"call": 3},
-    {"object": "dudmap.mapping.voxel_blocks:VoxelBlocks", "id": 105, "attributes": {"table": 3}},
-    {"list": {"columns": "dudmap.places.atlas:TimedPose", "names": ["a"], "values": [[1]], "count": 1}, "id": 106},
-    {"model": "dudmap.config:Config", "json": "{", "id": 107}, {"model": "dudmap.slam:Slam", "json": "{}", "id": 108},
-    {"map": 0, "blocks": 3, "object": "dudmap.mapping.volume:TsdfVolume", "id": 109, "attributes": {}},
+    {"tuple": [10**9], "class": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 104}, {"records": 0}, {"call": 3},
+    {"object": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 105, "attributes": {"table": 3}},
+    {"list": {"columns": "dudmap.core.places.atlas:TimedPose", "names": ["a"], "values": [[1]], "count": 1}, "id": 106},
+    {"model": "dudmap.config:Config", "json": "{", "id": 107},
+    {"model": "dudmap.core.slam:Slam", "json": "{}", "id": 108},
+    {"map": 0, "blocks": 3, "object": "dudmap.core.map.volume:TsdfVolume", "id": 109, "attributes": {}},
 )  # fmt: skip
 
 

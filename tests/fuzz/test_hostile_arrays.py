@@ -18,7 +18,7 @@ from dudmap.input_files import load_array, open_arrays
      ("depth_max", lambda a: np.array(-1.0)), ("config", lambda a: np.array('{"voxel_size": 1e-9}'))],
 )  # fmt: skip
 def test_maps_whose_arrays_do_not_fit(array, change, tmp_path, subjects):
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.map.volume import TsdfVolume
 
     with open_arrays(subjects("map").path) as found:
         content = {name: np.array(found[name]) for name in found}
@@ -35,7 +35,7 @@ def test_maps_whose_arrays_do_not_fit(array, change, tmp_path, subjects):
      ("geometry1", lambda a: a[:, :7]), ("colors1", lambda a: a.astype(np.float32))],
 )  # fmt: skip
 def test_smaller_voxels_that_do_not_fit_their_map(array, change, tmp_path, subjects):
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.map.volume import TsdfVolume
 
     with open_arrays(subjects("adaptive map").path) as found:
         content = {name: np.array(found[name]) for name in found}
@@ -48,7 +48,7 @@ def test_an_archive_of_arrays_that_is_a_bomb(tmp_path):
     header = "{'descr': '|u1', 'fortran_order': False, 'shape': (300000000,), }"
     path = npz(tmp_path / "map.npz", {"format": npy(header, bytes(300_000_000))})
     assert path.stat().st_size < 400_000
-    from dudmap.mapping.volume import TsdfVolume
+    from dudmap.core.map.volume import TsdfVolume
 
     refused(lambda: TsdfVolume.load(path), MapError, "unpack to 300000")
 

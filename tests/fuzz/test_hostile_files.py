@@ -13,7 +13,7 @@ from mutations import png
 import layouts
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import parse_json, parse_toml, read_text
-from dudmap.sequences import images, open_sequence
+from dudmap.io.sequences import images, open_sequence
 
 
 @pytest.mark.parametrize("what", ["fifo", "/dev/zero", "loop", "folder"])

@@ -12,7 +12,7 @@ from hostile import refused
 from recording_loaders import CAMERA
 
 from dudmap.errors import DatasetError
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 
 
 @pytest.mark.parametrize("suffix", [".klg", ".sens", ".r3d", ".bag", ".db3", ".mcap", ".zip", ".tar", ".tgz"])
@@ -50,7 +50,7 @@ def test_bombs_in_bags(monkeypatch):
     from rosbags.rosbag1 import reader as ros1
     from rosbags.rosbag2 import storage_mcap
 
-    from dudmap.sequences import bag_file
+    from dudmap.io.sequences import bag_file
 
     monkeypatch.setattr(bag_file, "LARGEST_CHUNK", 2**20)
     bag_file.limit_rosbags()
@@ -67,7 +67,7 @@ def test_bombs_in_bags(monkeypatch):
 
 def test_a_bomb_in_a_phone_recording():
     lzfse = pytest.importorskip("lzfse")
-    from dudmap.sequences.record3d import largest_unpacked
+    from dudmap.io.sequences.record3d import largest_unpacked
 
     for data in (b"", b"a", np.linspace(0, 1, 20_000, dtype=np.float32).tobytes(), bytes(100_000), os.urandom(30_000)):
         assert largest_unpacked(lzfse.compress(data)) >= len(data)

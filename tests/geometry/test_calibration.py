@@ -3,12 +3,12 @@
 import numpy as np
 import pytest
 
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.frames.color_registration import color_projection, register_color
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError
-from dudmap.frames.color_registration import color_projection, register_color
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.cpu import CpuBackend
 
 DEPTH = Camera(100.0, 102.0, 47.5, 35.5, 96, 72)
 COLOR = Camera(120.0, 121.0, 66.0, 48.0, 128, 96, distortion=(0.05, -0.02, 0.002, -0.001, 0.01))

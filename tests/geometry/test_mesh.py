@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import MapError
-from dudmap.geometry.mesh import Mesh
 
 
 def tetrahedron() -> Mesh:

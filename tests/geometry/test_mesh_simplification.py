@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.mesh_simplification import clustered, simplified
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh_simplification import clustered, simplified
 
 
 def sheet(n=60, z=0.0, up=1.0):

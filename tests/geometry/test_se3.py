@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from dudmap.geometry import se3
+from dudmap.core.geometry import se3
 
 number = st.floats(-1.0, 1.0)
 twists = st.builds(lambda v, omega: np.array([*v, *omega]), st.tuples(*[number] * 3), st.tuples(*[number] * 3))

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
-from dudmap.geometry import se3
-from dudmap.geometry.trajectory import Trajectory
 
 
 def path(count: int = 5) -> Trajectory:

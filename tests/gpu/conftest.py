@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from dudmap.gpu.device import make_backend
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.synthetic import sequence
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.device import make_backend
+from dudmap.lab.synthetic import sequence
 from small_maps import CAMERA, integrated
 
 

@@ -5,12 +5,12 @@ from importlib import import_module
 
 import pytest
 
-from dudmap.gpu.device import make_backend
+from dudmap.core.backends.device import make_backend
 
 wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
-from dudmap.gpu import ahead
+from dudmap.core.backends.warp import ahead
 
 DOUBLE = {"images", "surface"}
 """Modules with sums in float64, or intensities."""

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.gpu.device import obstacle
-from dudmap.slam import Slam
+from dudmap.core.backends.device import obstacle
+from dudmap.core.slam import Slam
 from small_maps import CAMERA
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")

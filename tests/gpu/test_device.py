@@ -8,11 +8,12 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
+from dudmap.core.backends import device
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.warp import faults
+from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DeviceError, MissingExtraError
-from dudmap.gpu import device, faults
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 
 @pytest.fixture

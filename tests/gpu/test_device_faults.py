@@ -7,16 +7,17 @@ pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has 
 
 from failing import FULL, LOST, Device
 
-from dudmap import synthetic
+from dudmap import resume_system, save_system
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
 from dudmap.config import Config
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.device import make_backend, start_failure
+from dudmap.core.backends.warp import faults
+from dudmap.core.slam import Slam
 from dudmap.errors import DeviceError
-from dudmap.gpu import faults
-from dudmap.gpu.device import make_backend, start_failure
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.pipeline.observer import RunObserver
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.slam import Slam
+from dudmap.lab import synthetic
 from small_maps import CAMERA, integrated
 
 SETTINGS = Config().override(["volume.voxel_size=0.03", "sensor.self_calibration=false", "device=warp-cpu"])
@@ -104,8 +105,8 @@ def test_a_run_goes_on_from_its_last_checkpoint(device, tmp_path, capfd):
     slam = Slam(CAMERA, SETTINGS)
     for index in range(10):
         if index == again:
-            slam.save(tmp_path / "slam.db")
-            slam = Slam.resume(tmp_path / "slam.db", "cpu")
+            save_system(slam, tmp_path / "slam.db")
+            slam = resume_system(tmp_path / "slam.db", "cpu")
         slam.process(recording[index])
     assert np.array_equal(report.trajectory.Ts_world_camera, slam.trajectory.Ts_world_camera)
 

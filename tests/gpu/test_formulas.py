@@ -3,14 +3,15 @@
 import numpy as np
 import pytest
 
-from dudmap.gpu.device import make_backend
+from dudmap.core.backends.device import make_backend
 
 wp = pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 make_backend("warp-cpu")
 
-from dudmap.gpu.kernels import formulas
-from dudmap.gpu.kernels.structs import FusionParameters, struct
-from dudmap.kernels import parameters, residual, voxel
+from dudmap.core.backends import parameters
+from dudmap.core.backends.warp.kernels import formulas
+from dudmap.core.backends.warp.kernels.structs import FusionParameters, struct
+from dudmap.core.formulas import residual, voxel
 
 PARAMETERS = parameters.FusionParameters(
     parameters.TruncationBand(0.04, 0.04, 3.0, 0.3, parameters.SensorNoise(0.001, 0.0019)),

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from dudmap.kernels.parameters import FilterParameters
+from dudmap.core.backends.parameters import FilterParameters
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 

@@ -5,18 +5,18 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dudmap.config import Config
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.frames.pyramid import Pyramid
-from dudmap.geometry import se3
-from dudmap.gpu.device import make_backend
-from dudmap.kernels.parameters import RegistrationParameters
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.tracker import Tracker
+from dudmap.core.backends.device import make_backend
+from dudmap.core.backends.parameters import RegistrationParameters
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.tracker import Tracker
 from small_maps import CAMERA, CONFIG, integrated, voxels
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 
-from dudmap.gpu import memory
+from dudmap.core.backends.warp import memory
 
 
 def registration(volume, tukey):

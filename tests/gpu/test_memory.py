@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from dudmap.kernels.mirror import Mirror
+from dudmap.core.backends.mirror import Mirror
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 
-from dudmap.gpu.memory import resident, wrote
+from dudmap.core.backends.warp.memory import resident, wrote
 
 NAME, ROWS = "warp-cpu", np.array([1, 3], dtype=np.int32)
 

@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial import cKDTree
 
 from dudmap.config import Config
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
+from dudmap.core.slam import Slam
+from dudmap.lab.synthetic import sequence
 from small_maps import CAMERA
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")

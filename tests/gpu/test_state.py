@@ -8,18 +8,19 @@ from typer.testing import CliRunner
 
 pytest.importorskip("warp", reason="Warp (dudmap[gpu]) is not installed, or has no wheel for this platform")
 
-from dudmap import synthetic
+from dudmap import resume_system, save_system
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
+from dudmap.app.state.database import StateDatabase
+from dudmap.app.state.system import differences, take_snapshot
 from dudmap.cli import app
 from dudmap.config import Config
-from dudmap.gpu.backend import WarpBackend
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.pipeline.observer import RunObserver
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.slam import Slam
-from dudmap.state.database import StateDatabase
-from dudmap.state.system import differences, take_snapshot
-from dudmap.synthetic.folder import write_folder
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.warp.backend import WarpBackend
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.folder import write_folder
 from small_maps import CAMERA, voxels
 
 SAVED_AFTER, FRAMES = 4, 7
@@ -39,7 +40,7 @@ def saved(request, frames, tmp_path_factory):
     slam = Slam(CAMERA, Config().override([f"device={request.param}", "volume.voxel_size=0.03"]))
     for number, frame in enumerate(frames):
         if number == SAVED_AFTER:
-            slam.save(path)
+            save_system(slam, path)
         slam.process(frame)
     return request.param, slam, path
 
@@ -52,7 +53,7 @@ def snapshot(slam, tmp_path, name):
 def test_a_system_is_continued_on_either_device(saved, frames, device):
     """On the same device bit for bit, on the other within the tolerance of a registration."""
     written_on, whole, path = saved
-    slam = Slam.resume(path, device)
+    slam = resume_system(path, device)
     kind = KIND[device]
     assert type(slam.volume.backend) is type(slam.preprocess._backend) is kind
     for frame in frames[SAVED_AFTER:]:
@@ -71,7 +72,7 @@ def test_a_system_is_continued_on_either_device(saved, frames, device):
 def test_the_state_of_a_device_is_that_of_the_cpu(saved, tmp_path):
     """Restored on both devices, one state gives the same tree, voxels and frames, bit for bit."""
     _, _, path = saved
-    both = (snapshot(Slam.resume(path, device), tmp_path, f"{device}.db") for device in KIND)
+    both = (snapshot(resume_system(path, device), tmp_path, f"{device}.db") for device in KIND)
     assert differences(*both) == []
 
 
@@ -83,7 +84,7 @@ class Interrupt(RunObserver):
 
 @pytest.mark.parametrize(("first", "second"), [("warp-cpu", "cpu"), ("cpu", "warp-cpu")])
 def test_a_run_is_continued_on_the_other_device(first, second, tmp_path):
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
 
     sequence = synthetic.sequence("room", frames=FRAMES, camera=CAMERA, noise="kinect")
     recording = write_folder(sequence, tmp_path / "room", surface=False)

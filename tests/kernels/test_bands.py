@@ -6,7 +6,7 @@ import threading
 
 import pytest
 
-from dudmap.kernels import threads
+from dudmap.core.backends import threads
 
 
 @pytest.fixture(autouse=True)

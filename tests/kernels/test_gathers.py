@@ -4,10 +4,10 @@ import numpy as np
 from numba import njit
 
 from dudmap.config import VolumeConfig
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.gathers import LANES, load_pairs
-from dudmap.mapping.volume import TsdfVolume
+from dudmap.core.backends.cpu.gathers import LANES, load_pairs
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 
 
 @njit

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dudmap.kernels.gathers import LANES
-from dudmap.kernels.neighbors import load_corners, load_row
+from dudmap.core.backends.cpu.gathers import LANES
+from dudmap.core.backends.cpu.neighbors import load_corners, load_row
 
 SHAPE = np.array([3, 2, 4], dtype=np.int64)  # blocks
 

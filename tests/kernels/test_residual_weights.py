@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import dudmap
-from dudmap.kernels.parameters import RegistrationParameters, SensorNoise, TruncationBand
-from dudmap.kernels.residual import residual_weights
+from dudmap.core.backends.parameters import RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.core.formulas.residual import residual_weights
 
 BAND = TruncationBand(0.05, 0.05, 3.0, 0.3, SensorNoise(0.001, 0.0019))
 
@@ -34,17 +34,17 @@ def test_weights_are_those_of_the_thesis(tukey, noisy):
 
 OWNERS = {
     ("huber", "tukey", "color_huber", "noise_weighting", "sigma_at_one_metre"): {
-        "kernels/residual.py",
-        "tracking/tracker.py:parameters",  # hands them on
-        "tracking/tracker.py:_judge",  # asks whether the weights have the noise
+        "core/formulas/residual.py",
+        "core/tracking/tracker.py:parameters",  # hands them on
+        "core/tracking/tracker.py:_judge",  # asks whether the weights have the noise
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
-        "mapping/integrator.py:of",  # hands them on, as do all that follow
-        "tracking/tracker.py:_chi_square",
-        "dynamics/detector.py:_noise_parameters",
-        "dynamics/detector.py:distance_sigma",
-        "calibration/adjustment.py:_linearize_pairs",
+        "core/map/integrator.py:of",  # hands them on, as do all that follow
+        "core/tracking/tracker.py:_chi_square",
+        "core/dynamics/detector.py:_noise_parameters",
+        "core/dynamics/detector.py:distance_sigma",
+        "core/calibration/adjustment.py:_linearize_pairs",
     },
 }
 """Parameters of a formula, and the files or functions that may name them; everybody else calls the formula."""

@@ -18,10 +18,10 @@ from pathlib import Path
 import pytest
 
 from dudmap.config import Config
-from dudmap.kernels import filtering, integration, labeling, registration, sampling
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
-from dudmap.synthetic.recording import DEFAULT_CAMERA
+from dudmap.core.backends.cpu import filtering, integration, labeling, registration, sampling
+from dudmap.core.slam import Slam
+from dudmap.lab.synthetic import sequence
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
     (registration, "linearize_rows"): {"loops": 3, "fma": 48, "packed": 140, "converted": 2},

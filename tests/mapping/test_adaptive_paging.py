@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import restore, take_snapshot
 from dudmap.config import SensorConfig
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import joined
+from dudmap.core.map.adaptive_volume import AdaptiveVolume
+from dudmap.core.map.incremental_mesh import IncrementalMesh
+from dudmap.core.map.region_store import RegionStore
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.errors import MapError
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import joined
-from dudmap.mapping.adaptive_volume import AdaptiveVolume
-from dudmap.mapping.incremental_mesh import IncrementalMesh
-from dudmap.mapping.region_store import RegionStore
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import restore, take_snapshot
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 

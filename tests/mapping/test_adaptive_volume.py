@@ -3,16 +3,16 @@
 import numpy as np
 import pytest
 
-from dudmap import synthetic
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.adaptive_volume import AdaptiveVolume
-from dudmap.mapping.incremental_mesh import IncrementalMesh
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.mapping.volume_mirror import VolumeMirror
-from dudmap.places.saved_map import MAP_FILE
-from dudmap.slam import Slam
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.adaptive_volume import AdaptiveVolume
+from dudmap.core.map.incremental_mesh import IncrementalMesh
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume_mirror import VolumeMirror
+from dudmap.core.places.saved_map import MAP_FILE
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 from refined_maps import analytic_map, sphere
 from triangles import triangles
 

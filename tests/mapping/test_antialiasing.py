@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from dudmap.kernels.antialiasing import LARGEST_RADIUS
-from dudmap.kernels.cpu import CpuBackend
+from dudmap.core.backends.cpu.antialiasing import LARGEST_RADIUS
+from dudmap.core.backends.cpu.backend import CpuBackend
 
 
 def window_means(color, depth, by_depth, tolerance):

@@ -7,15 +7,15 @@ import time
 import numpy as np
 import pytest
 
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import restore, take_snapshot
+from dudmap.core.geometry import se3
+from dudmap.core.map.block_pager import MAX_PENDING, REGION, BlockPager
+from dudmap.core.map.incremental_mesh import IncrementalMesh
+from dudmap.core.map.region_store import RegionStore
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.voxel_blocks import VoxelBlocks
 from dudmap.errors import MapError
-from dudmap.geometry import se3
-from dudmap.mapping.block_pager import MAX_PENDING, REGION, BlockPager
-from dudmap.mapping.incremental_mesh import IncrementalMesh
-from dudmap.mapping.region_store import RegionStore
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.mapping.voxel_blocks import VoxelBlocks
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import restore, take_snapshot
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 

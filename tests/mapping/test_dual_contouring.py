@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy.spatial import KDTree
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import joined
+from dudmap.core.map.incremental_mesh import IncrementalMesh
 from dudmap.evaluation.surface import point_triangle_distances
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import joined
-from dudmap.mapping.incremental_mesh import IncrementalMesh
 from refined_maps import CAMERA, analytic_map, box, sphere
 
 VOXEL = 0.02

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dudmap.geometry import se3
-from dudmap.mapping.incremental_mesh import EDGE, IncrementalMesh
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.mapping.volume_mirror import VolumeMirror
+from dudmap.core.geometry import se3
+from dudmap.core.map.incremental_mesh import EDGE, IncrementalMesh
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.volume_mirror import VolumeMirror
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
 

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.visibility import SETTLED
+from dudmap.core.backends.parameters import SensorNoise
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.integrator import FRONTAL_WEIGHT
+from dudmap.core.map.volume import FREE, TsdfVolume
+from dudmap.core.map.voxel_blocks import MAX_LOAD
 from dudmap.errors import MapError
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.kernels import hashing
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.kernels.parameters import SensorNoise
-from dudmap.kernels.visibility import SETTLED
-from dudmap.mapping.integrator import FRONTAL_WEIGHT
-from dudmap.mapping.volume import FREE, TsdfVolume
-from dudmap.mapping.voxel_blocks import MAX_LOAD
 from oracle import fuse, trilinear
 from wavy_wall import CAMERA, CONSTANT, wall
 

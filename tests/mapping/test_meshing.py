@@ -6,8 +6,8 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from dudmap.kernels import meshing, tables
-from dudmap.kernels.parameters import MeshParameters
+from dudmap.core.backends.cpu import meshing, tables
+from dudmap.core.backends.parameters import MeshParameters
 
 UNIT = 0.3 / 32767
 

@@ -8,19 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
-from dudmap import synthetic
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.parameters import FusionParameters
-from dudmap.kernels.threads import kernel
-from dudmap.kernels.voxel import fuse_color, fuse_voxel, pack_pixel_color, pack_reading
-from dudmap.mapping.block_window import LOCAL_GRID
-from dudmap.mapping.integrator import DEPTH_MIN, StorageScale
-from dudmap.merging.block_sums import MAX_COUNT, BlockSums, fused
-from dudmap.slam import Slam
-from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.tracker import TrackingResult
+from dudmap.core.backends.parameters import FusionParameters
+from dudmap.core.backends.threads import kernel
+from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, pack_pixel_color, pack_reading
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.block_window import LOCAL_GRID
+from dudmap.core.map.integrator import DEPTH_MIN, StorageScale
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.tracker import TrackingResult
+from dudmap.fleet.block_sums import MAX_COUNT, BlockSums, fused
+from dudmap.lab import synthetic
 
 CONFIG = Config().override(["volume.voxel_size=0.02"])
 MAX_STEPS = 32767
@@ -46,7 +46,7 @@ def parameters(volume, sensor):
         max_weight=volume.max_weight, max_readings=volume.max_readings, carve_rate=volume.carve_rate,
         depth_min=DEPTH_MIN, depth_max=DEPTH_MAX,
     )  # fmt: skip
-    from dudmap.kernels.cpu import single
+    from dudmap.core.backends.cpu.backend import single
 
     return single(numbers)
 

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.parameters import RaycastParameters, VoxelGrid
-from dudmap.kernels.raycasting import raycast
+from dudmap.core.backends.cpu.raycasting import raycast
+from dudmap.core.backends.parameters import RaycastParameters, VoxelGrid
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
 
 VOXEL = 0.01
 UNIT = 0.3 / 32767

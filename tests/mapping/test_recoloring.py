@@ -2,10 +2,10 @@
 
 import numpy as np
 
-import dudmap.synthetic
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
+import dudmap.lab.synthetic
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
 
@@ -20,7 +20,7 @@ def voxels(volume: TsdfVolume) -> dict[tuple[int, ...], tuple[np.ndarray, np.nda
 
 
 def test_colours_are_those_of_the_other_map_and_the_geometry_stays():
-    room = dudmap.synthetic.sequence(movers=(), frames=2, camera=CAMERA, noise="none")
+    room = dudmap.lab.synthetic.sequence(movers=(), frames=2, camera=CAMERA, noise="none")
     T = room.ground_truth.Ts_world_camera
     here, other = TsdfVolume(CAMERA), TsdfVolume(CAMERA)
     for n in (0, 0, 1):

@@ -8,19 +8,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from dudmap.config import Config, VolumeConfig
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import ConfigError, DudmapError, MapError
+from dudmap.fleet.agreement import agreement
+from dudmap.fleet.block_sums import BlockSums, block_sums, fused
+from dudmap.fleet.map_fusion import fuse_maps
+from dudmap.fleet.map_merging import compare_maps
+from dudmap.fleet.map_samples import EMPTY, OBSERVED, sample_map, surface_points
 from dudmap.fleet.two_runs import merge_runs
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.agreement import agreement
-from dudmap.merging.block_sums import BlockSums, block_sums, fused
-from dudmap.merging.map_fusion import fuse_maps
-from dudmap.merging.map_merging import compare_maps
-from dudmap.merging.map_samples import EMPTY, OBSERVED, sample_map, surface_points
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from rendered_places import looking_elsewhere, rearranged, record, retextured, true_map
 
 SMALL = Camera(fx=60.0, fy=60.0, cx=31.5, cy=23.5, width=64, height=48)

@@ -6,20 +6,20 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.frames.observation import Level
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.frames.pyramid import halved
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.objects.object_fusion import ObjectFusion
-from dudmap.objects.object_map import ObjectVolume, RigidObject
-from dudmap.objects.object_tracker import Mover
-from dudmap.pipeline.run import run
-from dudmap.slam import Slam
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import halved
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.objects.object_fusion import ObjectFusion
+from dudmap.core.objects.object_map import ObjectVolume, RigidObject
+from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.slam import Slam
 
 SMALL = Camera(262.5, 262.5, 159.5, 119.5, 320, 240)
 ON = Config().override(["movers.meshes=true"])
@@ -87,7 +87,7 @@ def test_the_window_stays_around_the_object_and_is_small():
 
 
 def test_a_cleared_map_is_empty_and_can_be_filled_again():
-    sequence = dudmap.synthetic.sequence("box", [], frames=1, camera=SMALL, camera_path="still", noise="none")
+    sequence = dudmap.lab.synthetic.sequence("box", [], frames=1, camera=SMALL, camera_path="still", noise="none")
     volume = ObjectVolume(SMALL, VolumeConfig(voxel_size=0.02), SensorConfig(), 6.0)
     T = np.eye(4)
     T[2, 3] = -float(np.median(sequence[0].depth))  # the object's origin lies on the surface in the image
@@ -105,7 +105,7 @@ def test_a_cleared_map_is_empty_and_can_be_filled_again():
 
 
 def test_a_cart_is_rigid_and_gets_its_shape():
-    sequence = dudmap.synthetic.sequence(
+    sequence = dudmap.lab.synthetic.sequence(
         "box", ["creeper"], frames=30, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
     (obj,) = fused(sequence, range(4, 30)).values()
@@ -121,7 +121,7 @@ def test_a_cart_is_rigid_and_gets_its_shape():
 
 
 def test_a_walking_person_is_rejected_with_a_reason():
-    sequence = dudmap.synthetic.sequence(
+    sequence = dudmap.lab.synthetic.sequence(
         "box", ["person"], frames=36, speed=0.8, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
     (obj,) = fused(sequence, range(36)).values()
@@ -132,7 +132,7 @@ def test_a_walking_person_is_rejected_with_a_reason():
 
 
 def test_an_object_at_rest_is_not_moving():
-    sequence = dudmap.synthetic.sequence(
+    sequence = dudmap.lab.synthetic.sequence(
         "box", ["stopping_cart"], frames=90, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
     (obj,) = fused(sequence, range(70, 90)).values()
@@ -141,7 +141,7 @@ def test_an_object_at_rest_is_not_moving():
 
 
 def test_a_few_frames_do_not_prove_an_object_rigid():
-    sequence = dudmap.synthetic.sequence(
+    sequence = dudmap.lab.synthetic.sequence(
         "box", ["creeper"], frames=8, speed=0.5, start_dynamic=True, camera=SMALL, camera_path="still", seed=1
     )
     (obj,) = fused(sequence, range(4, 8)).values()
@@ -150,7 +150,7 @@ def test_a_few_frames_do_not_prove_an_object_rigid():
 
 
 def test_off_by_default_and_without_influence():
-    sequence = dudmap.synthetic.sequence("box", ["person"], frames=12, start_dynamic=True, camera=SMALL)
+    sequence = dudmap.lab.synthetic.sequence("box", ["person"], frames=12, start_dynamic=True, camera=SMALL)
     off, on = Slam(sequence.camera), Slam(sequence.camera, ON)
     for i in range(12):
         a, b = off.process(sequence[i]), on.process(sequence[i])
@@ -167,7 +167,7 @@ def test_off_by_default_and_without_influence():
 def test_run_writes_meshes_of_rigid_movers(tmp_path):
     """The whole system on a moving camera: a ball rolls, a cart creeps, each in its own recording."""
     for name, rms, seed in (("creeper", 0.01, 0), ("ball", 0.02, 0)):
-        sequence = dudmap.synthetic.sequence("room", [name], frames=100, seed=seed)
+        sequence = dudmap.lab.synthetic.sequence("room", [name], frames=100, seed=seed)
         out = tmp_path / name
         (out / "movers").mkdir(parents=True)
         (out / "movers" / "77.ply").write_text("of an earlier run")

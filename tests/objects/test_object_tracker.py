@@ -6,15 +6,15 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
+from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.config import Config, MoversConfig
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.objects.moving_objects import MOST_WAITING, MovingObjects
-from dudmap.objects.object_tracker import ObjectTracker
-from dudmap.pipeline.metrics import RunRecord
-from dudmap.slam import Slam
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.objects.moving_objects import MOST_WAITING, MovingObjects
+from dudmap.core.objects.object_tracker import ObjectTracker
+from dudmap.core.slam import Slam
 
 CAMERA = Camera(fx=131, fy=131, cx=79.5, cy=59.5, width=160, height=120)
 RNG = np.random.default_rng(3)
@@ -203,7 +203,7 @@ def test_a_live_run_adds_movers_when_there_is_time():
 
 
 def test_a_walking_person_in_the_whole_system():
-    sequence = dudmap.synthetic.sequence(frames=60, seed=0, camera_path="still", start_dynamic=True)
+    sequence = dudmap.lab.synthetic.sequence(frames=60, seed=0, camera_path="still", start_dynamic=True)
     slam, off = Slam(sequence.camera), Slam(sequence.camera, Config().override(["movers.enabled=false"]))
     R = sequence.ground_truth.Ts_world_camera[0][:3, :3]
     errors, numbers = [], set()

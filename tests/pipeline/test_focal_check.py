@@ -6,10 +6,10 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.pipeline.focal_check import focal_error
-from dudmap.pipeline.inspection import inspect
+from dudmap.app.pipeline.focal_check import focal_error
+from dudmap.app.pipeline.inspection import inspect
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
 
 CAMERA = Camera(300.0, 300.0, 159.5, 119.5, 320, 240)
 NORMALS = np.array([[0.75, 0.1, 0.65], [-0.65, 0.15, 0.75], [0.05, 0.8, 0.6]])

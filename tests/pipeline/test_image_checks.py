@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from dudmap.benchmark.wrong_input import LARGE, RIGHT, SPOILT, SpoiltSequence
+from dudmap.app.pipeline.image_checks import image_warnings
+from dudmap.app.pipeline.inspection import inspect
 from dudmap.cli import app
-from dudmap.frames.frame import Frame
-from dudmap.pipeline.image_checks import image_warnings
-from dudmap.pipeline.inspection import inspect
-from dudmap.sequences import open_sequence
+from dudmap.core.frames.frame import Frame
+from dudmap.io.sequences import open_sequence
+from dudmap.lab.benchmark.wrong_input import LARGE, RIGHT, SPOILT, SpoiltSequence
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 SAID = {

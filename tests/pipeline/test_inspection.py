@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.pipeline.inspection import inspect, repeats
 from dudmap.cli import app
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.inspection import inspect, repeats
-from dudmap.sequences import open_sequence
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.io.sequences import open_sequence
 from recordings import HEIGHT, WIDTH, color_image, cut, write_recording
 
 

@@ -7,12 +7,12 @@ import time
 import numpy as np
 import pytest
 
-from dudmap.cameras import CameraFrame, LiveCamera
-from dudmap.cameras.replay import ReplayCamera
+from dudmap.app.pipeline.live import run_live
 from dudmap.config import Config
 from dudmap.errors import CameraError, DudmapError, FrameError
-from dudmap.pipeline.live import run_live
-from dudmap.sequences import open_sequence
+from dudmap.io.cameras import CameraFrame, LiveCamera
+from dudmap.io.cameras.replay import ReplayCamera
+from dudmap.io.sequences import open_sequence
 from fake_slam import FakeSlam
 from recordings import color_image, write_recording
 
@@ -67,7 +67,7 @@ def test_the_recording_is_complete_though_the_run_folder_cannot_be_written(slam,
     def full(*_, **__):
         raise DudmapError("no space left")
 
-    monkeypatch.setattr("dudmap.pipeline.live.write_run_folder", full)
+    monkeypatch.setattr("dudmap.app.pipeline.live.write_run_folder", full)
     file = tmp_path / "walk.mcap"
     with pytest.raises(DudmapError, match="no space left"):
         run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)

@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline.replay import Arrival, WaitingRoom, live, replay
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import DatasetError
-from dudmap.pipeline.replay import Arrival, WaitingRoom, live, replay
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from fake_slam import FakeSlam
 from recordings import cut, write_recording
 

@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline.frame_source import read_ahead
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, DudmapError
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.frame_source import read_ahead
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from fake_slam import SECOND, FakeVolume
 from layouts import corbs, replica, write
 from recordings import HEIGHT, WIDTH, cut, write_recording

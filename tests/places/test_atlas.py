@@ -3,11 +3,11 @@
 import numpy as np
 
 from dudmap.config import Config
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.atlas import Atlas
-from dudmap.places.place_recognition import KeyframeDatabase
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.place_recognition import KeyframeDatabase
 
 TINY = Camera(fx=32.8, fy=32.8, cx=19.5, cy=14.5, width=40, height=30)
 TWIST = np.array([0.3, -0.1, 0.2, 0.5, 0.4, -0.6])

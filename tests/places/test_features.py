@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.places.features import SiftExtractor, match_descriptors, reduced_grey
+from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 
 
 def unit_vectors(count, seed=3):

@@ -3,14 +3,14 @@
 import numpy as np
 import pytest
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.glimpse import DEPTH_UNIT
 from dudmap.errors import MapError
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.frame_store import FrameStore
-from dudmap.places.glimpse import DEPTH_UNIT
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)
 
@@ -64,7 +64,7 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
     def full(*args, **kwargs):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("dudmap.places.frame_file.tempfile.TemporaryFile", full)
+    monkeypatch.setattr("dudmap.core.places.frame_file.tempfile.TemporaryFile", full)
     history, frame = FrameStore(CAMERA, gap=1), smooth_frame(np.random.default_rng(3), 0.0)
 
     def keep():
@@ -77,7 +77,7 @@ def test_a_full_disk_is_one_sentence(monkeypatch):
 
 @pytest.fixture(scope="module")
 def room():
-    return dudmap.synthetic.sequence(scene="room", movers=(), frames=24, fps=6, camera=CAMERA, seed=2)
+    return dudmap.lab.synthetic.sequence(scene="room", movers=(), frames=24, fps=6, camera=CAMERA, seed=2)
 
 
 def test_map_built_again_equals_the_map(room):

@@ -5,22 +5,22 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
 from dudmap.config import Config
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places import frame_thinning
-from dudmap.places.atlas import Atlas
-from dudmap.places.frame_file import FrameFile
-from dudmap.places.frame_store import FrameStore
-from dudmap.places.frame_thinning import FrameThinning, chained
-from dudmap.places.glimpse import DEPTH_UNIT, Glimpse, Visibility, pixels
-from dudmap.places.loop_correction import LoopCorrector
-from dudmap.places.loop_verification import LOCAL_FRAMES
-from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
-from dudmap.places.pose_graph import Edge
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places import frame_thinning
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_file import FrameFile
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.frame_thinning import FrameThinning, chained
+from dudmap.core.places.glimpse import DEPTH_UNIT, Glimpse, Visibility, pixels
+from dudmap.core.places.loop_correction import LoopCorrector
+from dudmap.core.places.loop_verification import LOCAL_FRAMES
+from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
+from dudmap.core.places.pose_graph import Edge
 
 CAMERA = Camera(60.0, 60.0, 31.5, 23.5, 64, 48)
 READINGS = 8
@@ -289,7 +289,7 @@ def test_a_loop_after_many_visits_gives_as_good_a_map():
     """A view is seen many times, then the camera turns round once, drifting, until it sees it again. After the loop the
     map rebuilt without the removed frames is as near to the room as that of all frames."""
     camera, turn = Camera(65.6, 65.6, 39.5, 31.5, 80, 64), 45
-    room = dudmap.synthetic.sequence("room", movers=(), frames=turn, camera=camera, camera_path="round", seed=3)
+    room = dudmap.lab.synthetic.sequence("room", movers=(), frames=turn, camera=camera, camera_path="round", seed=3)
     images, true = [room[n] for n in range(turn)], room.ground_truth.Ts_world_camera
     true = se3.inverse(true[0]) @ true
     config = Config().override([f"volume.max_readings={READINGS}", "volume.voxel_size=0.04"])

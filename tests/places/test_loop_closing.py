@@ -5,25 +5,25 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config, RelocalizationConfig, SensorConfig, TrackerConfig
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.loop_closing import LoopCloser
+from dudmap.core.places.loop_verification import LoopQuery, LoopVerifier
+from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.tracker import Tracker, TrackingResult
 from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import moved
-from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Level, Observation
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.pipeline.run import run
-from dudmap.places.atlas import Atlas
-from dudmap.places.frame_store import FrameStore
-from dudmap.places.loop_closing import LoopCloser
-from dudmap.places.loop_verification import LoopQuery, LoopVerifier
-from dudmap.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import SyntheticSequence
-from dudmap.tracking.tracker import Tracker, TrackingResult
+from dudmap.lab.synthetic.recording import SyntheticSequence
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 NARROW = replace(SMALL, fx=420.0, fy=420.0)
@@ -89,7 +89,7 @@ def test_a_loop_counts_only_if_its_correction_is_finite(monkeypatch, solvable):
     atlas = made_up_atlas([0, 0, 0, 0])
     loops = LoopCloser(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
     if not solvable:
-        monkeypatch.setattr("dudmap.places.loop_correction.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
+        monkeypatch.setattr("dudmap.core.places.loop_correction.optimize", lambda Ts, edges: np.full_like(Ts, np.nan))
     before = [pose.T_world_camera.copy() for pose in atlas.poses]
     T = before[-1]
     place = PlaceMatch(atlas.keyframes.keyframes[0], T, 20)
@@ -152,7 +152,7 @@ def test_join_brings_one_map_into_the_other():
 
 def turned(yaw, fps=15.0, camera=SMALL):
     """The room from one place, turned about the vertical by these angles (degrees), one per frame."""
-    base = dudmap.synthetic.sequence(
+    base = dudmap.lab.synthetic.sequence(
         movers=(), frames=len(yaw), seed=1, camera=camera, camera_path="slow", fps=fps, noise="realsense"
     )
     Ts = base.ground_truth.Ts_world_camera.copy()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config, SensorConfig
-from dudmap.frames.frame import Frame
-from dudmap.mapping.adaptive_volume import make_volume
-from dudmap.places.atlas import Atlas
-from dudmap.places.frame_store import FrameStore
-from dudmap.places.map_rebuilding import AT_ONCE, PER_FRAME, nearest_views
-from dudmap.places.place_recognition import KeyframeDatabase
+from dudmap.core.frames.frame import Frame
+from dudmap.core.map.adaptive_volume import make_volume
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, nearest_views
+from dudmap.core.places.place_recognition import KeyframeDatabase
 from wavy_wall import CAMERA, CONSTANT, wall
 
 CONFIG = CONSTANT.model_copy(update={"min_weight": 1, "voxel_size": 0.02, "carving": True})

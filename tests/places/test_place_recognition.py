@@ -5,18 +5,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-import dudmap.synthetic
+import dudmap.lab.synthetic
 from dudmap.config import Config, RelocalizationConfig
-from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.geometry import se3
-from dudmap.geometry.alignment import agree, kabsch, rigid_ransac
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.places.place_recognition import KeyframeDatabase
-from dudmap.slam import Slam
-from dudmap.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
-from dudmap.synthetic.ring_corridor import ring_corridor
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.alignment import agree, kabsch, rigid_ransac
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.slam import Slam
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.ring_corridor import ring_corridor
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 
@@ -69,7 +69,7 @@ def test_ransac_of_nothing():
 @pytest.fixture(scope="module")
 def room():
     """Views of a static room along a path, with their poses."""
-    sequence = dudmap.synthetic.sequence(movers=(), frames=60, camera_path="pan", seed=0, camera=SMALL)
+    sequence = dudmap.lab.synthetic.sequence(movers=(), frames=60, camera_path="pan", seed=0, camera=SMALL)
     prepare = Preprocessor(SMALL)
     return [(prepare(sequence[i]), sequence.ground_truth.Ts_world_camera[i]) for i in range(0, 60, 6)]
 
@@ -126,7 +126,7 @@ def test_a_known_place_is_recognised_exactly(room):
 
 def test_an_unknown_or_empty_view_is_not_recognised(room):
     known, _ = keyframes_of(room)
-    elsewhere = dudmap.synthetic.sequence("yard", movers=(), frames=1, camera=SMALL)
+    elsewhere = dudmap.lab.synthetic.sequence("yard", movers=(), frames=1, camera=SMALL)
     prepare = Preprocessor(SMALL)
     assert recognised(known, prepare(elsewhere[0])) == []
     nothing = np.zeros(SMALL.shape, np.float32)
@@ -173,7 +173,7 @@ def errors(slam, sequence, count):
 
 @pytest.mark.parametrize("yaw", [90.0, 150.0])
 def test_a_camera_that_is_suddenly_elsewhere_is_lost_and_found(yaw):
-    sequence = dudmap.synthetic.sequence(movers=(), frames=50, seed=1, camera=SMALL, camera_path="fast")
+    sequence = dudmap.lab.synthetic.sequence(movers=(), frames=50, seed=1, camera=SMALL, camera_path="fast")
     sequence = turned_away(sequence, 15, 40, yaw)
     slam = Slam(sequence.camera)
     rows = errors(slam, sequence, 50)
@@ -198,7 +198,7 @@ def test_a_camera_that_went_on_in_the_dark_is_not_tracked_elsewhere_in_a_corrido
 
 def test_a_map_of_six_frames_is_enough_to_be_found_in():
     """A quarter of the view lies beyond what six frames have seen: less of the readings than usual falls on the map."""
-    sequence = dudmap.synthetic.sequence(movers=(), frames=40, seed=1, camera=SMALL, camera_path="dolly")
+    sequence = dudmap.lab.synthetic.sequence(movers=(), frames=40, seed=1, camera=SMALL, camera_path="dolly")
     sequence = turned_away(sequence, 6, 12, 25.0)
     rows = errors(Slam(sequence.camera), sequence, 14)
     assert all(result.state == "tracked" for result, _ in rows)
@@ -208,7 +208,7 @@ def test_a_map_of_six_frames_is_enough_to_be_found_in():
 @pytest.mark.slow
 @pytest.mark.parametrize("situation", ["kidnapped", "blocked"])
 def test_the_situations(situation):
-    sequence = dudmap.synthetic.sequence(situation=situation, frames=120, seed=0, camera=SMALL)
+    sequence = dudmap.lab.synthetic.sequence(situation=situation, frames=120, seed=0, camera=SMALL)
     rows = errors(Slam(sequence.camera), sequence, 120)
     spans = sequence.parameters["covered_s"] + sequence.parameters["elsewhere_s"]
     back = int(np.searchsorted(sequence.timestamps, max(stop for _, stop in spans) + 0.15))

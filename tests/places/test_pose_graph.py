@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from dudmap.geometry import se3
-from dudmap.places.pose_graph import Edge, optimize
+from dudmap.core.geometry import se3
+from dudmap.core.places.pose_graph import Edge, optimize
 
 
 def random_pose(rng, reach=1.0):

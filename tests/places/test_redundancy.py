@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config, SimilarityConfig
-from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.redundancy import RedundantViews, SimilarityTest
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.redundancy import RedundantViews, SimilarityTest
 from wavy_wall import CAMERA, wall
 
 cv2 = pytest.importorskip("cv2")

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.frames.observation import Level, Observation
-from dudmap.geometry.camera import Camera
-from dudmap.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
-from dudmap.places.relocalizer import Relocalizer
-from dudmap.stage_timer import StageTimer
-from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.tracker import TrackingResult
+from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
+from dudmap.core.places.relocalizer import Relocalizer
+from dudmap.core.stage_timer import StageTimer
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.tracker import TrackingResult
 
 CAMERA = Camera(fx=20.0, fy=20.0, cx=15.5, cy=11.5, width=32, height=24)
 GOOD = TrackingResult(np.eye(4), (1.0, 0.0), True, "", 0.9, 0.001, 0.1, 5)
@@ -200,7 +200,7 @@ def motion_of(*, moving_share, share):
 @pytest.mark.parametrize("crowded", [False, True])
 def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, share, wanted, crowded):
     motion = motion_of(moving_share=moving_share, share=share)
-    monkeypatch.setattr("dudmap.places.relocalizer.dominant_motion", lambda *_: motion)
+    monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: motion)
     subject = relocalizer()
     subject.lost(0.0, crowded=crowded)
     assert not subject.wants_new_submap(lost_view(0.5))
@@ -211,7 +211,7 @@ def test_no_map_is_begun_where_two_motions_compete(monkeypatch, moving_share, sh
 def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeypatch, slow):
     few, most = motion_of(moving_share=0.1, share=0.9), motion_of(moving_share=0.7, share=0.9)
     monkeypatch.setattr(
-        "dudmap.places.relocalizer.dominant_motion",
+        "dudmap.core.places.relocalizer.dominant_motion",
         lambda before, after, _: most if slow and after - before > 0.2 else few,
     )
     subject = relocalizer()
@@ -226,7 +226,7 @@ def test_no_map_is_begun_on_people_whose_motion_shows_after_a_while_only(monkeyp
 
 @pytest.mark.parametrize("crowded", [False, True])
 def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monkeypatch, crowded):
-    monkeypatch.setattr("dudmap.places.relocalizer.dominant_motion", lambda *_: None)
+    monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *_: None)
     subject = relocalizer()
     subject.lost(0.0, crowded=crowded)
     assert subject.wants_new_submap(lost_view(10.0)) != crowded

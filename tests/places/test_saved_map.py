@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.quality_monitor import RegistrationHistory
 from dudmap.errors import ConfigError, MapError
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.place_recognition import Keyframe, PlacedFeatures
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
-from dudmap.tracking.quality_monitor import RegistrationHistory
+from dudmap.lab.synthetic import sequence
 
 SMALL = Camera(fx=140.0, fy=140.0, cx=79.5, cy=59.5, width=160, height=120)
 CAMERA = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)

@@ -10,11 +10,11 @@ import pytest
 from rosbags.typesys import Stores, get_typestore
 
 from dudmap.config import Config
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.saved_map import SavedMap
 from dudmap.errors import ConfigError, DatasetError, MapError
-from dudmap.exporting import ros_messages as ros
-from dudmap.geometry.camera import Camera
-from dudmap.places.saved_map import SavedMap
-from dudmap.synthetic import sequence
+from dudmap.io.exporting import ros_messages as ros
+from dudmap.lab.synthetic import sequence
 from off_course import LIMIT, off_course
 
 PACKAGE = Path(__file__).parents[2] / "ros"

@@ -13,11 +13,11 @@ import zlib
 import numpy as np
 import pytest
 
+from dudmap.app.pipeline.resume import resume
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.fleet.two_runs import save_trajectories
 from dudmap.input_files import DEEPEST, LARGEST_COUNT, inflated, parse_json, parse_toml
-from dudmap.pipeline.resume import resume
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 
 
 @pytest.fixture

@@ -13,10 +13,10 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from dudmap.app.state import database, schema
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import restore, take_snapshot
 from dudmap.errors import StateError
-from dudmap.state import database, schema
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import restore, take_snapshot
 
 ENDLESS = "WITH RECURSIVE n(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM n) SELECT x AS key, 'a' AS value FROM n"
 
@@ -114,7 +114,7 @@ def store(path, tree, arrays=()):
         connection.execute("UPDATE state SET crc = ?, tree = ?", (zlib.crc32(packed), packed))
 
 
-CALLED = {"tuple": [10**9], "class": "dudmap.mapping.voxel_blocks:VoxelBlocks", "id": 1}
+CALLED = {"tuple": [10**9], "class": "dudmap.core.map.voxel_blocks:VoxelBlocks", "id": 1}
 LIST = {"list": [1, 2], "id": 1}
 
 
@@ -122,7 +122,7 @@ def camera(**changes):
     values = {"fx": 30.0, "fy": 30.0, "cx": 20.0, "cy": 15.0, "width": 40, "height": 30, "depth_scale": 1000.0,
               "distortion": {"tuple": [], "id": 2}} | changes  # fmt: skip
     attributes = {key: value for key, value in values.items() if value != "left out"}
-    return {"object": "dudmap.geometry.camera:Camera", "id": 1, "attributes": attributes}
+    return {"object": "dudmap.core.geometry.camera:Camera", "id": 1, "attributes": attributes}
 
 
 @pytest.mark.parametrize(("node", "match"), [
@@ -131,16 +131,16 @@ def camera(**changes):
     (camera(fx={"dict": [], "values": [], "id": 3}), r"at state\[0\]\.fx: found dict; expected float"),
     (camera(width="left out"), r"at state\[0\]: found the attributes .* of Camera; expected"),
     (camera(__class__=1), r"found the attributes \['__class__', "),
-    ({"object": "dudmap.mapping.volume:TsdfVolume", "id": 1, "attributes": {}}, "of other types|TsdfVolume"),
+    ({"object": "dudmap.core.map.volume:TsdfVolume", "id": 1, "attributes": {}}, "of other types|TsdfVolume"),
     ({"object": "os:system", "id": 1, "attributes": {}}, "which this version does not know"),
     ({"scalar": "<U999999999", "value": "a"}, "not understood|expected a number"),
     ({"deque": [], "limit": "x", "id": 1}, "TypeError"),
     ({"same": 77}, "KeyError 77"),
     (camera(width=10**9), "camera image is 1000000000x30"),
-    ({"model": "dudmap.slam:Slam", "json": "{}", "id": 1}, "Slam is no configuration"),
+    ({"model": "dudmap.core.slam:Slam", "json": "{}", "id": 1}, "Slam is no configuration"),
 ])  # fmt: skip
 def test_a_tree_of_another_type_is_refused_with_its_place(node, match, path):
-    from dudmap.geometry.camera import Camera
+    from dudmap.core.geometry.camera import Camera
 
     like = {"camera": Camera(30.0, 30.0, 20.0, 15.0, 40, 30, 1000.0)}
     store(path, {"dict": ["camera"], "values": [camera()], "id": 0})
@@ -177,7 +177,7 @@ def test_what_is_missing_in_the_state_of_a_run(tmp_path):
     """A tree that is one, but not that of a run."""
     from types import SimpleNamespace
 
-    from dudmap.pipeline.storing import restored
+    from dudmap.app.pipeline.storing import restored
 
     made = StateDatabase(tmp_path / "state.db")
     made.write(take_snapshot({"numbers": np.arange(10.0)}, made), {"next": 1})

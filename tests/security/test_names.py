@@ -8,9 +8,9 @@ import sys
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.terminal import plain_console, say
 from dudmap.cli import app
 from dudmap.errors import printable
-from dudmap.terminal import plain_console, say
 from recordings import write_recording
 from viewing.test_report import Page
 

@@ -6,17 +6,17 @@ from pathlib import Path
 
 import pytest
 
+from dudmap.app.pipeline.resume import resume
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.run_folder import WRITTEN
+from dudmap.app.state.database import StateDatabase
+from dudmap.app.state.run_lock import NAME, RunLock
+from dudmap.app.viewing.thumbnails import Thumbnails
 from dudmap.atomic_file import atomic_file, atomic_path, write_bytes, write_text
 from dudmap.config import Config
 from dudmap.errors import DudmapError
+from dudmap.io.sequences import open_sequence
 from dudmap.own_folder import OwnFolder
-from dudmap.pipeline.resume import resume
-from dudmap.pipeline.run import run
-from dudmap.pipeline.run_folder import WRITTEN
-from dudmap.sequences import open_sequence
-from dudmap.state.database import StateDatabase
-from dudmap.state.run_lock import NAME, RunLock
-from dudmap.viewing.thumbnails import Thumbnails
 from recordings import write_recording
 
 posix = pytest.mark.skipif(os.name != "posix", reason="links and pipes as POSIX has them")

@@ -12,7 +12,7 @@ def test_too_little_memory(text, monkeypatch, tmp_path):
         raise MemoryError(text)
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dudmap.sequences.open_sequence", fail)
+    monkeypatch.setattr("dudmap.io.sequences.open_sequence", fail)
     for command in (["info", "a"], ["run", "a"]):
         found = CliRunner().invoke(app, command)
         assert found.exit_code == 1
@@ -27,6 +27,6 @@ def test_a_library_that_finds_no_room(monkeypatch, tmp_path):
         raise ImportError("libgfortran.so.5: failed to map segment from shared object")
 
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("dudmap.sequences.open_sequence", fail)
+    monkeypatch.setattr("dudmap.io.sequences.open_sequence", fail)
     found = CliRunner().invoke(app, ["info", "a"])
     assert "there is not enough memory (libgfortran.so.5: failed to map" in found.stderr

@@ -8,7 +8,7 @@ import zipfile
 import pytest
 
 from dudmap.errors import DatasetError
-from dudmap.sequences import archive, open_sequence
+from dudmap.io.sequences import archive, open_sequence
 from layouts import tum, write
 
 

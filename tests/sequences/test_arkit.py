@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError, FrameError
-from dudmap.sequences import open_sequence
-from dudmap.sequences.video import Video
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.video import Video
 from layouts import arkit_scenes, color, polycam, stray_scanner, write
 
 

@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError, FrameError
-from dudmap.geometry import se3
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 
 pytest.importorskip("av")
 FRAMES, WIDTH, HEIGHT = 9, 320, 288

@@ -11,10 +11,10 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode
 
 from bags import START, BagWriter, millimetres, write_bag, write_frames
+from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError, FrameError, MissingExtraError
-from dudmap.geometry import se3
-from dudmap.sequences import open_sequence
-from dudmap.sequences.bag import RosBag
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.bag import RosBag
 from recordings import HEIGHT, WIDTH, color_image, cut
 
 KINDS = {"ros1": "a.bag", "sqlite": "folder", "mcap": "folder"}
@@ -67,8 +67,8 @@ def test_a_bag_compressed_by_files(tmp_path, kind, monkeypatch):
     compression = (CompressionMode.FILE, CompressionFormat.ZSTD)
     path = write_bag(tmp_path / "folder", kind, set_compression=compression)
     check_frames(open_sequence(path))
-    monkeypatch.setattr("dudmap.sequences.bag_file.RATIO_FREE_BYTES", 10_000)
-    monkeypatch.setattr("dudmap.sequences.bag_file.LARGEST_RATIO", 1)
+    monkeypatch.setattr("dudmap.io.sequences.bag_file.RATIO_FREE_BYTES", 10_000)
+    monkeypatch.setattr("dudmap.io.sequences.bag_file.LARGEST_RATIO", 1)
     with pytest.raises(DatasetError, match="one of its files unpacks to more than 1 times its size"):
         open_sequence(path)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from layouts import bop, scannet, seven_scenes, tsdf_fusion, tum, with_matrices, write, write_color, write_depth
 
 MATRIX = np.array([[60.0, 0, 31.0], [0, 61.0, 23.0], [0, 0, 1]])
@@ -256,7 +256,7 @@ def test_patterns_of_a_layout_that_is_not_known(tmp_path):
 
 
 def test_counts_that_differ_are_said_with_the_pairing(tmp_path):
-    from dudmap.pipeline.inspection import inspect
+    from dudmap.app.pipeline.inspection import inspect
 
     folder, _ = write(with_matrices, tmp_path)
     (folder / "poses.txt").unlink()
@@ -270,7 +270,7 @@ def test_counts_that_differ_are_said_with_the_pairing(tmp_path):
 
 
 def test_implausible_depth_is_warned_of_with_the_unit_that_fits(tmp_path):
-    from dudmap.pipeline.inspection import inspect
+    from dudmap.app.pipeline.inspection import inspect
 
     folder, _ = write(tum, tmp_path)
     for file in (folder / "depth").iterdir():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from bags import write_bag
-from dudmap.sequences import is_recording, open_sequence
+from dudmap.io.sequences import is_recording, open_sequence
 from recordings import HEIGHT, WIDTH
 from sequences.test_klg import NUMBERS, write_klg
 from sequences.test_record3d import write_r3d

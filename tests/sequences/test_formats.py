@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import Recording, open_sequence, readers
+from dudmap.io.sequences import Recording, open_sequence, readers
 from layouts import (
     LAYOUTS,
     color,

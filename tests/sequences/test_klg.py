@@ -7,9 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from recordings import HEIGHT, WIDTH, color_image, cut, depth_image
 
 NUMBERS = f"60,60,31.5,23.5,{WIDTH},{HEIGHT}"

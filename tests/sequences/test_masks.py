@@ -10,12 +10,12 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
 from dudmap.errors import DatasetError, FrameError
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import open_sequence
-from dudmap.sequences.masks import MaskFolder
-from dudmap.slam import Slam
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.masks import MaskFolder
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"
 CAMERA = Camera(fx=80, fy=80, cx=31.5, cy=23.5, width=64, height=48)

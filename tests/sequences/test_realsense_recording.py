@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from bags import START, BagWriter, K, millimetres
-from dudmap.geometry import se3
-from dudmap.sequences import open_sequence
-from dudmap.sequences.realsense import RealSenseRecording
+from dudmap.core.geometry import se3
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.realsense import RealSenseRecording
 from recordings import HEIGHT, WIDTH, color_image
 from software_device import T_COLOR_DEPTH, record
 

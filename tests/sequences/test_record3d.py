@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError, FrameError, MissingExtraError
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 
 COLOR_SIZE, DEPTH_SIZE = (96, 128), (24, 32)
 """Width and height of a portrait recording."""

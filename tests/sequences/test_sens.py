@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from dudmap.errors import DatasetError, FrameError
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from recordings import HEIGHT, WIDTH, cut, depth_image
 
 COLOR_SIZE = (80, 60)

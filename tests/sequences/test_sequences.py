@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
+from dudmap.core.geometry.association import associate
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
-from dudmap.geometry.association import associate
-from dudmap.geometry.camera import Camera
-from dudmap.sequences import Sequence, open_sequence
-from dudmap.sequences.tum import TumSequence
+from dudmap.io.sequences import Sequence, open_sequence
+from dudmap.io.sequences.tum import TumSequence
 from recordings import HEIGHT, WIDTH, color_image, cut, depth_image, write_recording
 
 EXCERPT = Path(__file__).parents[1] / "fixtures" / "freiburg1_xyz"

@@ -14,19 +14,19 @@ import cv2
 import numpy as np
 
 from delayed_color import FAULTS
-from dudmap import synthetic
+from dudmap.app.pipeline.resume import resume
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
+from dudmap.app.state.database import StateDatabase
 from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import StateError
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.pipeline.resume import resume
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.places.atlas import Atlas
-from dudmap.places.frame_store import FrameStore
-from dudmap.state.database import StateDatabase
-from dudmap.synthetic.recording import SyntheticSequence
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.recording import SyntheticSequence
 
 SMALL = Camera(fx=262.5, fy=262.5, cx=159.5, cy=119.5, width=320, height=240)
 CONFIG = Config().override(

@@ -2,8 +2,8 @@
 
 import time
 
-from dudmap.state import checkpoints
-from dudmap.state.checkpoints import Checkpoints
+from dudmap.app.state import checkpoints
+from dudmap.app.state.checkpoints import Checkpoints
 
 
 class NoDatabase:

@@ -7,16 +7,16 @@ import numpy as np
 import pytest
 from killing import results
 
-from dudmap import synthetic
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.pipeline.resume import resume
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
+from dudmap.app.viewing.thumbnails import Thumbnails
 from dudmap.config import Config
-from dudmap.geometry.camera import Camera
-from dudmap.pipeline.observer import RunObserver
-from dudmap.pipeline.resume import resume
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.places.saved_map import SavedMap
-from dudmap.synthetic.folder import write_folder
-from dudmap.viewing.thumbnails import Thumbnails
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.folder import write_folder
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 FRAMES = 18
@@ -44,7 +44,7 @@ def recording(tmp_path_factory):
 
 def both(recording, tmp_path, passes=1, **options):
     """Results of a whole run, and of one that was interrupted in its last pass and continued."""
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
 
     settings = Config().override(["sensor.self_calibration=false", "movers.meshes=true", "volume.voxel_size=0.02"])
     for name in ("whole", "parts"):
@@ -64,7 +64,7 @@ def both(recording, tmp_path, passes=1, **options):
 
 
 def next_frame(out):
-    from dudmap.state.database import StateReader
+    from dudmap.app.state.database import StateReader
 
     return StateReader(out / "state.db").meta()["next"]
 
@@ -90,7 +90,7 @@ def test_two_passes(recording, tmp_path):
 
 @pytest.mark.parametrize("localize", [False, True])
 def test_a_run_that_goes_on_in_a_saved_map(recording, tmp_path, localize):
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
 
     run(open_sequence(recording), Config().override(["volume.voxel_size=0.02"]), tmp_path / "first", progress=False)
     whole, parts = both(recording, tmp_path, saved_map=None, localize=localize)

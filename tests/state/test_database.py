@@ -6,15 +6,15 @@ from contextlib import closing
 import numpy as np
 import pytest
 
+from dudmap.app.state.block_keys import MAP_SHIFT, MAX_MAPS, block_coords, block_keys
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import differences, restore, take_snapshot
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map import morton
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.voxel_blocks import COORDINATE_BITS, MAX_COORDINATE
 from dudmap.errors import DudmapError, StateError
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.mapping import morton
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.mapping.voxel_blocks import COORDINATE_BITS, MAX_COORDINATE
-from dudmap.state.block_keys import MAP_SHIFT, MAX_MAPS, block_coords, block_keys
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import differences, restore, take_snapshot
 
 TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=31.5, width=80, height=64)
 
@@ -280,9 +280,15 @@ def test_an_attribute_that_is_not_restored_is_noticed(tmp_path):
 
 
 def test_no_class_from_elsewhere_is_made():
-    from dudmap.state.tree import TreeReader
+    from dudmap.app.state.tree import TreeReader
 
-    for name in ("subprocess:Popen", "builtins:object", "dudmap.pipeline.run:Job", "dudmap.slam:np", "os:system"):
+    for name in (
+        "subprocess:Popen",
+        "builtins:object",
+        "dudmap.app.pipeline.run:Job",
+        "dudmap.core.slam:np",
+        "os:system",
+    ):
         tree = {"object": name, "id": 0, "attributes": {}}
         with pytest.raises(StateError, match="does not know"):
             TreeReader([], [], None, None).restore(tree, None)

@@ -4,10 +4,10 @@ import errno
 import os
 
 import dudmap.atomic_file
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
+from dudmap.io.sequences import open_sequence
 from recordings import write_recording
 
 

@@ -11,9 +11,9 @@ import pytest
 from killing import begin, in_child, killed, lost_and_found, proceed, results
 
 from delayed_color import DELAY, find_early
+from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.state.database import StateDatabase
 from dudmap.errors import DudmapError
-from dudmap.pipeline.progress import RunProgress
-from dudmap.state.database import StateDatabase
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="processes are forked")
 
@@ -87,7 +87,7 @@ def on_a_full_disk(sequence, out, report):
     """A run whose files cannot grow beyond ``LIMIT``; what it says is written to ``report``."""
     import resource  # POSIX only
 
-    from dudmap.pipeline.progress import RunProgress
+    from dudmap.app.pipeline.progress import RunProgress
 
     said = []
     RunProgress.note = lambda self, sentence: said.append(sentence)

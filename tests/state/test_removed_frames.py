@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from dudmap import synthetic
+from dudmap import resume_system, save_system
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.system import differences, take_snapshot
 from dudmap.config import Config
-from dudmap.geometry.camera import Camera
-from dudmap.places import frame_thinning
-from dudmap.slam import Slam
-from dudmap.state.database import StateDatabase, StateReader
-from dudmap.state.system import differences, take_snapshot
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places import frame_thinning
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 SETTINGS = ["loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0.5", "similarity.max_translation=1e-9"]
@@ -37,8 +38,8 @@ def test_a_system_with_removed_frames_goes_on_the_same(slam, frames, tmp_path):
         slam.process(frame)
     store = slam.atlas.history
     assert 3 <= len(store.removed.serials) == store.serials[-1] + 1 - len(store)
-    slam.save(tmp_path / "state.db")
-    again = Slam.resume(tmp_path / "state.db")
+    save_system(slam, tmp_path / "state.db")
+    again = resume_system(tmp_path / "state.db")
     other = again.atlas.history
     assert content(other) == content(store)
     for number in range(len(store)):

@@ -10,22 +10,22 @@ from dataclasses import replace
 
 import pytest
 
+from dudmap.app.pipeline.resume import resume
+from dudmap.app.pipeline.run import run
+from dudmap.app.pipeline.storing import Storing
+from dudmap.app.state.database import StateDatabase
+from dudmap.app.state.identity import code_fingerprint, recording_fingerprint
+from dudmap.app.state.run_lock import NAME, RunLock
 from dudmap.config import Config
+from dudmap.core.geometry.calibration import Calibration
 from dudmap.errors import DudmapError, StateError
-from dudmap.geometry.calibration import Calibration
-from dudmap.pipeline.resume import resume
-from dudmap.pipeline.run import run
-from dudmap.pipeline.storing import Storing
-from dudmap.sequences import open_sequence
-from dudmap.state.database import StateDatabase
-from dudmap.state.identity import code_fingerprint, recording_fingerprint
-from dudmap.state.run_lock import NAME, RunLock
+from dudmap.io.sequences import open_sequence
 from recordings import write_recording
 
 HOLD = """
 import sys, time
 from pathlib import Path
-from dudmap.state.run_lock import RunLock
+from dudmap.app.state.run_lock import RunLock
 with RunLock(Path(sys.argv[1])):
     print("held", flush=True)
     time.sleep(60)
@@ -73,14 +73,14 @@ def test_the_folder_is_taken_before_the_calibration_which_a_resumed_run_repeats(
             run(sequence, Config(), out, progress=False)
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("dudmap.pipeline.calibration.calibrate_start", killed)
+    monkeypatch.setattr("dudmap.app.pipeline.calibration.calibrate_start", killed)
     ordered = {"progress": False, "calibrate": True, "storing": Storing({"path": str(recording)})}
     (tmp_path / "file").touch()
     with pytest.raises(DudmapError, match="cannot write into the run folder"):
         run(sequence, Config(), tmp_path / "file", **ordered)
     with pytest.raises(KeyboardInterrupt):
         run(sequence, Config(), out, max_frames=3, save_masks=True, **ordered)
-    monkeypatch.setattr("dudmap.pipeline.calibration.calibrate_start", lambda *_: found)
+    monkeypatch.setattr("dudmap.app.pipeline.calibration.calibrate_start", lambda *_: found)
     assert resume(out, progress=False).metrics["frames"] == 3
     assert Calibration.load(out / "calibration.toml").delay == 0.02
     assert len(list((out / "masks").iterdir())) == 3

@@ -6,15 +6,16 @@ import numpy as np
 import pytest
 
 from delayed_color import DELAY, FAULTS, find_early
-from dudmap import synthetic
+from dudmap import resume_system, save_system
+from dudmap.app.state.database import StateDatabase
+from dudmap.app.state.system import differences, take_snapshot
 from dudmap.config import Config
-from dudmap.frames.frame import Frame
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.places.pose_graph import Edge
-from dudmap.slam import Slam
-from dudmap.state.database import StateDatabase
-from dudmap.state.system import differences, take_snapshot
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.pose_graph import Edge
+from dudmap.core.slam import Slam
+from dudmap.lab import synthetic
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 
@@ -69,8 +70,8 @@ def test_a_stored_system_is_the_same_and_goes_on_the_same(tmp_path, case):
         slam.process(frame)
     if "voxel sizes" in case:
         assert slam.volume.levels[0].blocks.num_voxel_blocks > 100
-    slam.save(tmp_path / "state.db")
-    again = Slam.resume(tmp_path / "state.db")
+    save_system(slam, tmp_path / "state.db")
+    again = resume_system(tmp_path / "state.db")
     assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
     for frame in frames[stop:]:
         assert_same_results(slam.process(frame), again.process(frame))
@@ -97,8 +98,8 @@ def test_a_system_that_calibrates_itself_is_stored_after_every_frame(tmp_path, m
         if again is not slam:
             assert_same_results(result, again.process(frame))
         assert (result.state == "lost", result.calibrated) == (index in (9, 10), index == 6)
-        slam.save(tmp_path / "state.db")
-        again = Slam.resume(tmp_path / "state.db")
+        save_system(slam, tmp_path / "state.db")
+        again = resume_system(tmp_path / "state.db")
         assert differences(whole(slam, tmp_path, f"a{index}"), whole(again, tmp_path, f"b{index}")) == []
     assert slam.calibration.delay == DELAY
 
@@ -106,8 +107,10 @@ def test_a_system_that_calibrates_itself_is_stored_after_every_frame(tmp_path, m
 def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch):
     """A loop says that the camera is 3 mm farther; the map of the 24 frames stored is rebuilt over the next 20."""
     for module in ("atlas", "loop_correction"):
-        monkeypatch.setattr(f"dudmap.places.{module}.AT_ONCE", 4)
-    monkeypatch.setattr("dudmap.places.loop_correction._is_worse", lambda after, before: False)  # there was no loop
+        monkeypatch.setattr(f"dudmap.core.places.{module}.AT_ONCE", 4)
+    monkeypatch.setattr(
+        "dudmap.core.places.loop_correction._is_worse", lambda after, before: False
+    )  # there was no loop
     sequence, frames = scene(movers=(), frames=48)
     settings = ["loops.keep_gap=1", "loops.min_age=100", "volume.voxel_size=0.02"]
     slam = Slam(sequence.camera, Config().override(settings))
@@ -123,8 +126,8 @@ def test_a_map_that_is_being_rebuilt_goes_on_being_rebuilt(tmp_path, monkeypatch
     for frame in frames[24:28]:
         slam.process(frame)
     assert len(slam.atlas.rebuildings[0].missing) > 10
-    slam.save(tmp_path / "state.db")
-    again = Slam.resume(tmp_path / "state.db")
+    save_system(slam, tmp_path / "state.db")
+    again = resume_system(tmp_path / "state.db")
     assert differences(whole(slam, tmp_path, "a"), whole(again, tmp_path, "b")) == []
     for frame in frames[28:]:
         assert_same_results(slam.process(frame), again.process(frame))

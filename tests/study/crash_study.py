@@ -4,9 +4,9 @@ import sys
 import time
 from pathlib import Path
 
-from dudmap.study.conduct import conduct
-from dudmap.study.executor import LocalExecutor
-from dudmap.study.plan import make_plan
+from dudmap.lab.study.conduct import conduct
+from dudmap.lab.study.executor import LocalExecutor
+from dudmap.lab.study.plan import make_plan
 
 
 def sleep_row(run, out):

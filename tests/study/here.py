@@ -3,7 +3,7 @@
 from concurrent.futures import Future
 from dataclasses import replace
 
-from dudmap.study.worker import perform
+from dudmap.lab.study.worker import perform
 
 
 class Here:

@@ -11,8 +11,8 @@ import pytest
 ray = pytest.importorskip("ray")
 
 from dudmap.errors import ConfigError
-from dudmap.study.conduct import conduct
-from dudmap.study.store import StudyFolder
+from dudmap.lab.study.conduct import conduct
+from dudmap.lab.study.store import StudyFolder
 from study.crash_study import sleep_row, tiny_plan
 
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]
@@ -24,7 +24,7 @@ def slower_row(run, out):
 
 
 def test_no_cluster_is_one_sentence():
-    from dudmap.study.cluster import RayExecutor
+    from dudmap.lab.study.cluster import RayExecutor
 
     with pytest.raises(ConfigError, match="no Ray cluster at auto"):
         RayExecutor("auto")
@@ -33,7 +33,7 @@ def test_no_cluster_is_one_sentence():
 def test_a_lost_node_loses_no_run(tmp_path, monkeypatch):
     from ray.cluster_utils import Cluster
 
-    from dudmap.study.cluster import RayExecutor
+    from dudmap.lab.study.cluster import RayExecutor
 
     where = os.pathsep.join([*sys.path, str(Path(__file__).parents[1])])
     monkeypatch.setenv("PYTHONPATH", where)

@@ -3,9 +3,9 @@
 import pytest
 
 from dudmap.errors import ConfigError
-from dudmap.study.conduct import Progress
-from dudmap.study.plan import make_plan
-from dudmap.study.study import run_study
+from dudmap.lab.study.conduct import Progress
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.study import run_study
 from study.here import Here
 
 ROOM = {"scene": "room", "movers": [], "frames": 6, "camera": [160, 120]}

@@ -5,9 +5,9 @@ from typer.testing import CliRunner
 
 from dudmap.cli import app
 from dudmap.errors import DudmapError
-from dudmap.study.plan import make_plan
-from dudmap.study.thesis import thesis_plan
-from dudmap.study.tune import check_tune, tune_options
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.thesis import thesis_plan
+from dudmap.lab.study.tune import check_tune, tune_options
 from recordings import write_recording
 
 ROOM = {"scene": "room", "movers": [], "frames": 6, "camera": [160, 120]}

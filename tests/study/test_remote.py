@@ -10,8 +10,8 @@ import pytest
 fsspec = pytest.importorskip("fsspec")
 
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.study.plan import make_plan
-from dudmap.study.remote import RemoteEntry, fetched
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.remote import RemoteEntry, fetched
 from recordings import write_recording
 
 FACTORS = {"tracker.huber": [0.005, 0.01]}

@@ -6,11 +6,11 @@ import pytest
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.study.designs import DesignOptions, points_of
-from dudmap.study.factors import configured, make_factors, value_of
-from dudmap.study.plan import make_plan
-from dudmap.study.report import Report
-from dudmap.study.screening import bounds_of, describe_screening, screen, summary, which_matter
+from dudmap.lab.study.designs import DesignOptions, points_of
+from dudmap.lab.study.factors import configured, make_factors, value_of
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.report import Report
+from dudmap.lab.study.screening import bounds_of, describe_screening, screen, summary, which_matter
 
 
 def factors_of(**changed):

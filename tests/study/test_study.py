@@ -4,11 +4,11 @@ import csv
 
 import pytest
 
-from dudmap.benchmark.entries import Entry
-from dudmap.benchmark.measure import measure_sequence
 from dudmap.config import Config
-from dudmap.study.plan import make_plan
-from dudmap.study.study import run_study
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.measure import measure_sequence
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.study import run_study
 from study.here import Here
 
 ROOM = {"scene": "room", "movers": ["person"], "start_dynamic": True, "frames": 6, "camera": [160, 120]}

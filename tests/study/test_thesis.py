@@ -5,11 +5,11 @@ import csv
 import numpy as np
 import pytest
 
-from dudmap.study.analysis import predict_optimum
-from dudmap.study.effects import anova, interactions, main_effects
-from dudmap.study.judgement import influence
-from dudmap.study.response_surface import canonical_analysis, lack_of_fit
-from dudmap.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
+from dudmap.lab.study.analysis import predict_optimum
+from dudmap.lab.study.effects import anova, interactions, main_effects
+from dudmap.lab.study.judgement import influence
+from dudmap.lab.study.response_surface import canonical_analysis, lack_of_fit
+from dudmap.lab.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
 
 # Table 6.1 as printed: Huber constant, regularisation, one row per voxel size 0.01, 0.02, 0.05 m, one column per weight
 # 0.025, 0.1, 0.175.

@@ -3,8 +3,8 @@
 import pytest
 
 from dudmap.config import Config
-from dudmap.study.plan import make_plan
-from dudmap.study.tune import run_tune
+from dudmap.lab.study.plan import make_plan
+from dudmap.lab.study.tune import run_tune
 from study.here import Here
 
 SMALL = {"scene": "room", "movers": [], "frames": 30, "camera": [160, 120]}

@@ -5,17 +5,17 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from dudmap import synthetic
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
-from dudmap.geometry.camera import Camera
-from dudmap.synthetic import SensorFaults
-from dudmap.synthetic.cameras import CAMERAS
-from dudmap.synthetic.color_camera import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
-from dudmap.synthetic.depth_faults import WAVE_NUMBER, with_flying_pixels, with_multipath
-from dudmap.synthetic.faults import LIMITS, parse_faults
-from dudmap.synthetic.folder import write_folder
-from dudmap.synthetic.render import Rendering
-from dudmap.synthetic.sensors import SENSORS, Sensor
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic import SensorFaults
+from dudmap.lab.synthetic.cameras import CAMERAS
+from dudmap.lab.synthetic.color_camera import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
+from dudmap.lab.synthetic.depth_faults import WAVE_NUMBER, with_flying_pixels, with_multipath
+from dudmap.lab.synthetic.faults import LIMITS, parse_faults
+from dudmap.lab.synthetic.folder import write_folder
+from dudmap.lab.synthetic.render import Rendering
+from dudmap.lab.synthetic.sensors import SENSORS, Sensor
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 UNREGISTERED = SensorFaults(

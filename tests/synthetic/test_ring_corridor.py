@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.places.place_recognition import KeyframeDatabase
-from dudmap.synthetic.recording import DEFAULT_CAMERA
-from dudmap.synthetic.ring_corridor import ring_corridor
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+from dudmap.lab.synthetic.ring_corridor import ring_corridor
 
 LENGTH, BETWEEN = 60, 1.0
 """Of the walk until it is where it began, and between two keyframes, metres."""

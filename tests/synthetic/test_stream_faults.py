@@ -6,16 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import synthetic
-from dudmap.benchmark.stream_faults import fault_row, measure_stream_faults, table_head
+from dudmap.app.pipeline.run import run
 from dudmap.config import Config
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.frames.observation import Observation
+from dudmap.core.frames.stream_check import AGREEING, StreamCheck, sudden_factor
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
-from dudmap.frames.observation import Observation
-from dudmap.frames.stream_check import AGREEING, StreamCheck, sudden_factor
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.pipeline.run import run
-from dudmap.synthetic.stream_faults import FAULTS, FaultyStream
+from dudmap.lab import synthetic
+from dudmap.lab.benchmark.stream_faults import fault_row, measure_stream_faults, table_head
+from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 FRAMES = 25

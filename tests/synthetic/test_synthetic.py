@@ -4,17 +4,18 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from dudmap import open_sequence, synthetic
+from dudmap import open_sequence
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError, FrameError
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.synthetic import scene as parts
-from dudmap.synthetic.folder import write_folder
-from dudmap.synthetic.render import Renderer
-from dudmap.synthetic.rooms import SCENES, build_scene
-from dudmap.synthetic.sensors import SENSORS
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic import scene as parts
+from dudmap.lab.synthetic.folder import write_folder
+from dudmap.lab.synthetic.render import Renderer
+from dudmap.lab.synthetic.rooms import SCENES, build_scene
+from dudmap.lab.synthetic.sensors import SENSORS
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 TINY = Camera(52.5, 52.5, 31.5, 23.5, 64, 48)

@@ -5,12 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import Config, Slam, synthetic
-from dudmap.geometry.camera import Camera
-from dudmap.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
-from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.image_consistency import ImageComparison
-from dudmap.tracking.quality_monitor import MIN_HISTORY
+from dudmap import Config, Slam
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.checks import CHECKS, MAX_IMAGE_SHIFT, RELATIVE, Limits, first_failure
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.image_consistency import ImageComparison
+from dudmap.core.tracking.quality_monitor import MIN_HISTORY
+from dudmap.lab import synthetic
 
 CONFIG = Config()
 LIMITS = Limits(CONFIG.tracker, CONFIG.sensor, 0.9, "recovering", True, 2.0, 0.9, 0.02)

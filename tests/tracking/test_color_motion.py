@@ -7,14 +7,14 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config, TrackerConfig
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.slam import Slam
-from dudmap.synthetic import sequence
-from dudmap.synthetic.faults import SensorFaults
-from dudmap.tracking.color_motion import ColorMotion
-from dudmap.tracking.motion_model import MotionModel
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.color_motion import ColorMotion
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.lab.synthetic import sequence
+from dudmap.lab.synthetic.faults import SensorFaults
 
 SMALL = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
 FRAMES = 12

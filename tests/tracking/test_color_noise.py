@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.tracking.color_noise import motion_discount
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.color_noise import motion_discount
 
 CAMERA = Camera(fx=250.0, fy=250.0, cx=159.5, cy=119.5, width=320, height=240)
 

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 
 from dudmap.config import SensorConfig, VolumeConfig
-from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Observation
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.cpu import CpuBackend
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.depth_noise import LARGEST, STEPS, DepthNoise, _medians
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Observation
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.depth_noise import LARGEST, STEPS, DepthNoise, _medians
 
 CAMERA = Camera(80.0, 80.0, 39.5, 29.5, 80, 60)
 SENSOR = SensorConfig()

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from test_observability import CONFIG, grey, registered, tunnel, wall
 
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.tracking import tracker as tracker_module
-from dudmap.tracking.gradient_agreement import GradientAgreement
-from dudmap.tracking.tracker import Tracker
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking import tracker as tracker_module
+from dudmap.core.tracking.gradient_agreement import GradientAgreement
+from dudmap.core.tracking.tracker import Tracker
 from textured_corner import SENSOR, corner, corner_map, level_of, ones
 
 TILTED = np.array([0.3, -0.2, -0.933])

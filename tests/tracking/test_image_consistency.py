@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap import Config, Slam, synthetic
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.tracking.checks import MAX_IMAGE_SHIFT
-from dudmap.tracking.estimate import PoseEstimate
-from dudmap.tracking.image_consistency import ImageComparison, ImageConsistency
-from dudmap.tracking.motion_model import MotionModel
+from dudmap import Config, Slam
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.checks import MAX_IMAGE_SHIFT
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.image_consistency import ImageComparison, ImageConsistency
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.lab import synthetic
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 

@@ -4,18 +4,18 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.frames.frame import Frame
-from dudmap.frames.preprocess import Preprocessor
-from dudmap.frames.pyramid import Pyramid
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.kernels.descent import restricted_step
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.slam import Slam
-from dudmap.tracking.checks import MAX_DRIFT
-from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
-from dudmap.tracking.tracker import Tracker
+from dudmap.core.backends.descent import restricted_step
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.slam import Slam
+from dudmap.core.tracking.checks import MAX_DRIFT
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.observability import INTENSITY_SIGMA, GradientNoise, gradient_noise, sentence
+from dudmap.core.tracking.tracker import Tracker
 
 CAMERA = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 V, U = np.mgrid[: CAMERA.height, : CAMERA.width]

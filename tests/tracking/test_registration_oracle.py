@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config, TrackerConfig, VolumeConfig
-from dudmap.frames.exposure import chained, exposed, fit_exposure
-from dudmap.frames.frame import Frame
-from dudmap.frames.observation import Level
-from dudmap.geometry import se3
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.se3 import retract
-from dudmap.kernels.parameters import NormalEquations
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.tracking.checks import RELATIVE, first_failure
-from dudmap.tracking.motion_model import MotionModel
-from dudmap.tracking.quality_monitor import QualityMonitor
-from dudmap.tracking.tracker import Tracker, TrackingResult
+from dudmap.core.backends.parameters import NormalEquations
+from dudmap.core.frames.exposure import chained, exposed, fit_exposure
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import retract
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.checks import RELATIVE, first_failure
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import Tracker, TrackingResult
 from textured_corner import CAMERA, SENSOR, corner, corner_map, level_of, ones
 
 

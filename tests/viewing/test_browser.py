@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from browsers import SOFTWARE, find_chromium
-from dudmap.viewing.report import write_report
-from dudmap.viewing.run_files import RunFiles
+from dudmap.app.viewing.report import write_report
+from dudmap.app.viewing.run_files import RunFiles
 from run_folders import write_run
 from security.hostile_runs import MARKUP, write_hostile_run
 
@@ -149,8 +149,8 @@ def test_a_browser_without_webgl_is_told_so_and_sees_the_rest(driver, folder):
 @pytest.fixture(scope="module")
 def window(folder):
     pytest.importorskip("viser", reason="the extra view is not installed")
-    from dudmap.viewing.stored_view import show_run
-    from dudmap.viewing.window import Window
+    from dudmap.app.viewing.stored_view import show_run
+    from dudmap.app.viewing.window import Window
 
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
@@ -212,7 +212,7 @@ def test_clicks_in_the_window_measure(live, window):
 
 def test_a_live_window_grows(browser, window):
     """New frames appear on an open page without a reload."""
-    from dudmap.viewing.snapshot import FrameFigures
+    from dudmap.app.viewing.snapshot import FrameFigures
 
     window._follow.value = True
     T = np.eye(4)

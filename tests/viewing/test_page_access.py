@@ -3,9 +3,9 @@
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.viewing.page_access import PageAccess, is_loopback
 from dudmap.cli import app
 from dudmap.errors import ConfigError
-from dudmap.viewing.page_access import PageAccess, is_loopback
 from run_folders import write_run
 
 TOKEN = "a-token-of-a-test"
@@ -72,7 +72,7 @@ def window(request, tmp_path):
     pytest.importorskip("viser")
     import socket
 
-    from dudmap.viewing.stored_view import open_run
+    from dudmap.app.viewing.stored_view import open_run
 
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

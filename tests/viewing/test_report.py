@@ -11,13 +11,13 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.pipeline.run import run
+from dudmap.app.viewing.report import ReportObserver, write_report
+from dudmap.app.viewing.thumbnails import NUMBER, Thumbnails
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.pipeline.run import run
-from dudmap.sequences import open_sequence
-from dudmap.viewing.report import ReportObserver, write_report
-from dudmap.viewing.thumbnails import NUMBER, Thumbnails
+from dudmap.io.sequences import open_sequence
 from fake_slam import FakeResult
 from recordings import write_recording
 from run_folders import FRAMES, stamp, wall, write_run

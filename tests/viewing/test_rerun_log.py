@@ -12,7 +12,7 @@ pytest.importorskip("rerun", reason="the extra rerun is not installed")
 
 
 def test_the_log_holds_camera_images_map_and_plots(tmp_path):
-    from dudmap.viewing.rerun_log import RerunLog
+    from dudmap.app.viewing.rerun_log import RerunLog
 
     log, slam = RerunLog(tmp_path / "run.rrd"), GrowingMap()
     log.start(slam, tmp_path, 5)
@@ -33,7 +33,7 @@ def test_the_log_holds_camera_images_map_and_plots(tmp_path):
 
 @pytest.mark.parametrize(("name", "sentence"), [("run.log", "ends in .rrd"), ("no/run.rrd", "cannot write the log")])
 def test_files_that_cannot_be_written(tmp_path, name, sentence):
-    from dudmap.viewing.rerun_log import RerunLog
+    from dudmap.app.viewing.rerun_log import RerunLog
 
     with pytest.raises(DudmapError, match=sentence):
         RerunLog(tmp_path / name)

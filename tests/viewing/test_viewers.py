@@ -11,15 +11,15 @@ import pytest
 import trimesh
 from typer.testing import CliRunner
 
+from dudmap.app.viewing.glb import glb
+from dudmap.app.viewing.live_view import LiveView
+from dudmap.app.viewing.mesh_feed import MeshFeed
+from dudmap.app.viewing.picking import first_hit
+from dudmap.app.viewing.snapshot import RESIDUAL_RANGE, FrameImages, depth_colors, mask_overlay, residual_colors
+from dudmap.app.viewing.window import Window
 from dudmap.cli import app
+from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
-from dudmap.frames.frame import Frame
-from dudmap.viewing.glb import glb
-from dudmap.viewing.live_view import LiveView
-from dudmap.viewing.mesh_feed import MeshFeed
-from dudmap.viewing.picking import first_hit
-from dudmap.viewing.snapshot import RESIDUAL_RANGE, FrameImages, depth_colors, mask_overlay, residual_colors
-from dudmap.viewing.window import Window
 from fake_slam import FakeResult
 from growing_map import GrowingMap, read
 from recordings import write_recording

@@ -7,24 +7,24 @@ import cv2
 import numpy as np
 import pytest
 
-from dudmap import synthetic
+from dudmap.app.pipeline.run_folder import save_mask
+from dudmap.app.views.cleaning import clean_recording, grown
 from dudmap.config import VolumeConfig
-from dudmap.exporting.exporters import export_run
-from dudmap.exporting.options import ExportOptions
-from dudmap.exporting.run_content import RunContent
-from dudmap.geometry import se3
-from dudmap.geometry.calibration import Calibration
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.lens import Lens
-from dudmap.geometry.other_view import OtherView
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.pipeline.run_folder import save_mask
-from dudmap.sequences import open_sequence
-from dudmap.sequences.images import read_mask
-from dudmap.synthetic.faults import SensorFaults
-from dudmap.synthetic.folder import write_folder
-from dudmap.views.cleaning import clean_recording, grown
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.lens import Lens
+from dudmap.core.geometry.other_view import OtherView
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.io.exporting.exporters import export_run
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.images import read_mask
+from dudmap.lab import synthetic
+from dudmap.lab.synthetic.faults import SensorFaults
+from dudmap.lab.synthetic.folder import write_folder
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120, depth_scale=5000.0)
 FRAMES = 24

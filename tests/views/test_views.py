@@ -7,19 +7,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from dudmap.app.views.background import BackgroundRenderer, continued, exposure_gain
+from dudmap.app.views.cleaning import clean_recording, unlike, with_shadow
+from dudmap.app.views.rendering import looking_at, orbit, render_run
+from dudmap.app.views.video import VideoWriter
 from dudmap.cli import app
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.lens import Lens
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.exporting.run_content import RunContent
-from dudmap.frames.frame import Frame
-from dudmap.geometry.camera import Camera
-from dudmap.geometry.lens import Lens
-from dudmap.geometry.trajectory import Trajectory
-from dudmap.sequences import open_sequence
-from dudmap.sequences.images import read_mask
-from dudmap.views.background import BackgroundRenderer, continued, exposure_gain
-from dudmap.views.cleaning import clean_recording, unlike, with_shadow
-from dudmap.views.rendering import looking_at, orbit, render_run
-from dudmap.views.video import VideoWriter
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.sequences import open_sequence
+from dudmap.io.sequences.images import read_mask
 from exported_runs import CAMERA, make_run
 
 

@@ -8,11 +8,11 @@ from typing import Annotated, Any
 
 import typer
 
-from dudmap.benchmark.suites import SUITES
+from dudmap.app.terminal import say
 from dudmap.cli.benchmark_gpu import gpu
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.progress import counted
-from dudmap.terminal import say
+from dudmap.lab.benchmark.suites import SUITES
 
 app = typer.Typer(
     add_completion=False,
@@ -52,9 +52,9 @@ def suite_command(
     as_json: JsonOption = False,
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
-    from dudmap.benchmark.report import named_folders, run_suite
-    from dudmap.benchmark.suites import find_suite
-    from dudmap.benchmark.systems import systems as find_systems
+    from dudmap.lab.benchmark.report import named_folders, run_suite
+    from dudmap.lab.benchmark.suites import find_suite
+    from dudmap.lab.benchmark.systems import systems as find_systems
 
     name = str(context.info_name)
     wanted, others = find_systems(systems), named_folders(score or [])
@@ -96,11 +96,11 @@ def sensors(
 
     The default must be within 5 % of the better of the other two columns.
     """
-    from dudmap.benchmark.color_columns import color_table, measure_columns
-    from dudmap.benchmark.suites import sensor_entries
-    from dudmap.benchmark.table import save
+    from dudmap.app.pipeline.environment import machine, versions
     from dudmap.config import Config
-    from dudmap.pipeline.environment import machine, versions
+    from dudmap.lab.benchmark.color_columns import color_table, measure_columns
+    from dudmap.lab.benchmark.suites import sensor_entries
+    from dudmap.lab.benchmark.table import save
 
     entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
     rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
@@ -127,9 +127,9 @@ def random(
 
     Every world is written to the folder as soon as it is measured; an interrupted run of the same code continues.
     """
-    from dudmap.benchmark.random_worlds import measure_worlds, report
     from dudmap.config import Config
     from dudmap.errors import ConfigError
+    from dudmap.lab.benchmark.random_worlds import measure_worlds, report
 
     try:
         numbers = [int(number) for number in only.split(",") if number] or list(range(count))
@@ -160,10 +160,10 @@ def bias(
     as_json: JsonOption = False,
 ) -> None:
     """Measure how far each term of the registration pulls a frame from its true pose."""
-    from dudmap import synthetic
-    from dudmap.benchmark.bias import bias_table, measure_pulls
     from dudmap.config import Config
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab import synthetic
+    from dudmap.lab.benchmark.bias import bias_table, measure_pulls
 
     config = Config().override(assignments or [])
     if recording is not None:
@@ -195,9 +195,9 @@ def first_second(
     as_json: JsonOption = False,
 ) -> None:
     """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
-    from dudmap import synthetic
-    from dudmap.benchmark.first_second import FRAMES, first_second_table, measure_first_second
     from dudmap.config import Config
+    from dudmap.lab import synthetic
+    from dudmap.lab.benchmark.first_second import FRAMES, first_second_table, measure_first_second
 
     config = Config().override(assignments or [])
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
@@ -228,9 +228,9 @@ def faults(
     as_json: JsonOption = False,
 ) -> None:
     """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
-    from dudmap.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
     from dudmap.config import Config
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
 
     config = Config().override(assignments or [])
     source = default_room(frames, width, seed) if recording is None else open_sequence(recording)
@@ -262,10 +262,10 @@ def wrong_input(
     as_json: JsonOption = False,
 ) -> None:
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
-    from dudmap.benchmark.stream_faults import default_room
-    from dudmap.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
     from dudmap.config import Config
-    from dudmap.sequences import open_sequence
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.stream_faults import default_room
+    from dudmap.lab.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
 
     config, runs = Config(), []
     if recording is not None:
@@ -296,8 +296,8 @@ def gate(
     as_json: JsonOption = False,
 ) -> None:
     """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
-    from dudmap.benchmark import gate as gates
     from dudmap.config import Config
+    from dudmap.lab.benchmark import gate as gates
 
     old = gates.load_figures(figures) if figures.is_file() or not record else None
     rows = gates.measure_gate(gates.gate_entries(fixtures), Config().override(assignments or []))
@@ -331,12 +331,12 @@ def limits(
     Writes heat maps (PNG) of ATE, mask IoU, ghost area and share of lost frames, and limits.md, .csv and .json.
     Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
-    from dudmap.benchmark.conditions import FRAMES
-    from dudmap.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
-    from dudmap.benchmark.limits import QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
-    from dudmap.benchmark.systems import systems as find_systems
-    from dudmap.benchmark.table import save
-    from dudmap.pipeline.environment import machine, versions
+    from dudmap.app.pipeline.environment import machine, versions
+    from dudmap.lab.benchmark.conditions import FRAMES
+    from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
+    from dudmap.lab.benchmark.limits import QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
+    from dudmap.lab.benchmark.systems import systems as find_systems
+    from dudmap.lab.benchmark.table import save
 
     wanted = find_systems(systems)
     sweeps = QUICK_SWEEPS if quick else SWEEPS
@@ -381,9 +381,9 @@ def speed(
     as_json: JsonOption = False,
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
-    from dudmap.benchmark.interleaved import find_open3d
-    from dudmap.benchmark.speed import markdown, speed_figures
-    from dudmap.pipeline.environment import machine, versions
+    from dudmap.app.pipeline.environment import machine, versions
+    from dudmap.lab.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.speed import markdown, speed_figures
 
     frames, long_frames = (20, 60) if quick else (300, 2000)
     figures = speed_figures(

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
+from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text
 from dudmap.cli.output import JsonOption, answer
-from dudmap.terminal import say
 
 
 def gpu(
@@ -40,9 +40,9 @@ def gpu(
 
     Without a GPU, only the CPU is measured, and the table says why.
     """
-    from dudmap.benchmark import gpu as measurements
-    from dudmap.benchmark.interleaved import find_open3d
-    from dudmap.pipeline.environment import machine, versions
+    from dudmap.app.pipeline.environment import machine, versions
+    from dudmap.lab.benchmark import gpu as measurements
+    from dudmap.lab.benchmark.interleaved import find_open3d
 
     rows, python = [], find_open3d(open3d)
     steps, shapes = measurements.numbers(voxels, sizes)

@@ -22,8 +22,8 @@ from dudmap.cli.run import (
 if TYPE_CHECKING:
     from rich.table import Table
 
-    from dudmap.calibration.estimator import Estimate
-    from dudmap.geometry.calibration import Calibration
+    from dudmap.core.calibration.estimator import Estimate
+    from dudmap.core.geometry.calibration import Calibration
 
 app = typer.Typer(add_completion=False)
 
@@ -52,10 +52,10 @@ def calibrate(
     Tracks the recording, compares pairs of its images, and prints every parameter with its standard deviation. What
     the images do not prove stays as the files give it.
     """
-    from dudmap.geometry.calibration import Calibration
-    from dudmap.pipeline.calibration import calibrate_sequence
-    from dudmap.sequences import open_sequence
-    from dudmap.terminal import plain_console
+    from dudmap.app.pipeline.calibration import calibrate_sequence
+    from dudmap.app.terminal import plain_console
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.io.sequences import open_sequence
 
     recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
@@ -80,7 +80,7 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     import numpy as np
     from rich.table import Table
 
-    from dudmap.geometry.calibration import PARAMETERS
+    from dudmap.core.geometry.calibration import PARAMETERS
 
     out = Table("parameter", "change", "sigma", "unit", "")
     change = given.step_to(estimate.calibration)
@@ -112,7 +112,7 @@ UNITS = {
 
 def remarks(estimate: "Estimate") -> list[str]:
     """Sentences on what was decided and why."""
-    from dudmap.calibration.estimator import EVIDENCE, GROUPS, MIN_PAIRS
+    from dudmap.core.calibration.estimator import EVIDENCE, GROUPS, MIN_PAIRS
 
     out = []
     for name, members in GROUPS.items():

@@ -49,11 +49,11 @@ def clean(
     """Replace what moves in every frame of a recording by the map and by what other frames show there."""
     from dataclasses import asdict
 
+    from dudmap.app.pipeline.run import run as run_sequence
+    from dudmap.app.views.cleaning import clean_recording
     from dudmap.cli.progress import counted
-    from dudmap.exporting.run_content import RunContent
-    from dudmap.pipeline.run import run as run_sequence
-    from dudmap.sequences import open_sequence
-    from dudmap.views.cleaning import clean_recording
+    from dudmap.io.exporting.run_content import RunContent
+    from dudmap.io.sequences import open_sequence
 
     recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):

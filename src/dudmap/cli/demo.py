@@ -25,10 +25,10 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from dudmap.frames.frame import Frame
-    from dudmap.geometry.camera import Camera
-    from dudmap.pipeline.frame_source import FrameRead
-    from dudmap.result import FrameResult
+    from dudmap.app.pipeline.frame_source import FrameRead
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.result import FrameResult
 
 app = typer.Typer(add_completion=False)
 
@@ -52,8 +52,8 @@ def demo(
     The depth has the noise of a Kinect; poses and masks are known exactly. The run folder also receives demo.png:
     colour, depth, mask, residuals and the map without the person, rendered from the same pose.
     """
-    from dudmap.pipeline.run import run
-    from dudmap.synthetic import sequence
+    from dudmap.app.pipeline.run import run
+    from dudmap.lab.synthetic import sequence
 
     config = read_config(None, None, assignments or [])
     recording = sequence(scene="room", movers=("person",), frames=frames, noise="kinect", seed=0)
@@ -85,8 +85,8 @@ class MostDynamicFrame:
 
     def save_picture(self, out: Path, camera: "Camera") -> None:
         """Write demo.png into the run folder ``out``, from the map it holds."""
-        from dudmap.mapping.volume import TsdfVolume
-        from dudmap.pipeline.contact_sheet import save_sheet
+        from dudmap.app.pipeline.contact_sheet import save_sheet
+        from dudmap.core.map.volume import TsdfVolume
 
         if self._kept is None:
             return

@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from dudmap.terminal import plain_console, say
+from dudmap.app.terminal import plain_console, say
 
 app = typer.Typer(add_completion=False)
 
@@ -28,7 +28,7 @@ def doctor(
         return
     from rich.text import Text
 
-    from dudmap.doctor import checks
+    from dudmap.app.doctor import checks
 
     found = list(checks())
     works = all(check.state != "bad" for check in found)
@@ -46,7 +46,7 @@ def doctor(
 
 
 def _print_licences(as_json: bool) -> None:
-    from dudmap.doctor import licences
+    from dudmap.app.doctor import licences
 
     rows = licences()
     if as_json:

@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Annotated, Any, cast
 import typer
 from typer.core import TyperGroup
 
+from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text
 from dudmap.cli.output import JsonOption
 from dudmap.errors import ConfigError, DatasetError, DudmapError
-from dudmap.terminal import say
 
 if TYPE_CHECKING:
+    from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.evaluation.trajectory import Align
-    from dudmap.geometry.trajectory import Trajectory
 
 Figures = dict[str, Any]
 """Figures by name and unit; None for a figure that could not be computed."""
@@ -71,9 +71,9 @@ def trajectory(
 
     The default reference is groundtruth.txt in the run folder. Without one, only path length and duration are given.
     """
+    from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
     from dudmap.evaluation.trajectory import trajectory_figures
-    from dudmap.geometry.trajectory import Trajectory
 
     file, folder = find_trajectory(estimate)
     found = Trajectory.load(file)
@@ -272,7 +272,7 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
         return
     from rich.table import Table
 
-    from dudmap.terminal import plain_console
+    from dudmap.app.terminal import plain_console
 
     table = Table(title=title, show_header=False)
     for key, value in figures.items():

@@ -8,7 +8,7 @@ import typer
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, QuietOption
 from dudmap.errors import ConfigError
-from dudmap.exporting.exporters import EXPORTERS
+from dudmap.io.exporting.exporters import EXPORTERS
 
 app = typer.Typer(add_completion=False)
 _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS.items())
@@ -54,8 +54,8 @@ def export(
     as_json: JsonOption = False,
 ) -> None:
     """Write trajectory, surface, space or images of a run for another program."""
-    from dudmap.exporting.exporters import export_run
-    from dudmap.exporting.options import ExportOptions
+    from dudmap.io.exporting.exporters import export_run
+    from dudmap.io.exporting.options import ExportOptions
 
     low, high = numbers(heights, 2, "--heights")
     options = ExportOptions(

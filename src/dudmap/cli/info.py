@@ -9,7 +9,7 @@ from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import CameraOption, ColorOption, DepthOption, DepthUnitOption, FpsOption, TopicsOption
 
 if TYPE_CHECKING:
-    from dudmap.pipeline.inspection import Inspection
+    from dudmap.app.pipeline.inspection import Inspection
 
 app = typer.Typer(add_completion=False)
 
@@ -36,10 +36,10 @@ def info(
     """
     from rich.table import Table
 
-    from dudmap.pipeline.contact_sheet import save_overview
-    from dudmap.pipeline.inspection import inspect, repeats, sample
-    from dudmap.sequences import open_sequence
-    from dudmap.terminal import plain_console
+    from dudmap.app.pipeline.contact_sheet import save_overview
+    from dudmap.app.pipeline.inspection import inspect, repeats, sample
+    from dudmap.app.terminal import plain_console
+    from dudmap.io.sequences import open_sequence
 
     recording = open_sequence(path, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     frames, unreadable = sample(recording)

@@ -65,9 +65,9 @@ def live(
 
     Frames wait for at most 0.1 s; those for which there is no time are counted as dropped, but recorded with --record.
     """
-    from dudmap.cameras import open_camera
-    from dudmap.geometry.calibration import Calibration
-    from dudmap.pipeline.live import run_live
+    from dudmap.app.pipeline.live import run_live
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.io.cameras import open_camera
 
     parameters = read_config(config, preset, assignments or [])
     given = None if calibration is None else Calibration.load(calibration)

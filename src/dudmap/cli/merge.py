@@ -5,9 +5,9 @@ from typing import Annotated
 
 import typer
 
+from dudmap.app.terminal import say
 from dudmap.cli.output import JsonOption, answer
 from dudmap.cli.run import QuietOption, free_folder
-from dudmap.terminal import say
 
 app = typer.Typer(add_completion=False)
 

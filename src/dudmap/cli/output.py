@@ -7,7 +7,7 @@ from typing import Annotated, Any
 
 import typer
 
-from dudmap.terminal import say
+from dudmap.app.terminal import say
 
 JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
 
@@ -51,6 +51,6 @@ def parameter_names(incomplete: str) -> list[str]:
 
 def camera_names(incomplete: str) -> list[str]:
     """Kinds of cameras that begin so, for the shell."""
-    from dudmap.cameras import CAMERAS
+    from dudmap.io.cameras import CAMERAS
 
     return [name for name in CAMERAS if name.startswith(incomplete)]

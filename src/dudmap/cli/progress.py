@@ -9,7 +9,7 @@ def counted(name: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
     """Bar on stderr, if that is a terminal; gives a function that takes the number of finished frames and of all."""
     from rich.progress import Progress
 
-    from dudmap.terminal import plain_console
+    from dudmap.app.terminal import plain_console
 
     console = plain_console(stderr=True)
     with Progress(console=console, disable=quiet or not console.is_terminal) as bar:

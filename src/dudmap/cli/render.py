@@ -33,10 +33,10 @@ def render(
     as_json: JsonOption = False,
 ) -> None:
     """Render the map as a camera would see it: a video, or a recording without anything that moves."""
+    from dudmap.app.views import rendering
     from dudmap.cli.progress import counted
-    from dudmap.exporting.run_content import RunContent
-    from dudmap.geometry.trajectory import Trajectory
-    from dudmap.views import rendering
+    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.io.exporting.run_content import RunContent
 
     if (trajectory is None) == (not orbit):
         raise ConfigError("name either a --trajectory or --orbit")

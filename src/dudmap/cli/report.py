@@ -22,7 +22,7 @@ def report(
 
     The page is one file and loads nothing, so that it can be sent by mail and opened offline.
     """
-    from dudmap.viewing.report import write_report
+    from dudmap.app.viewing.report import write_report
 
     path = write_report(run, out)
     size = path.stat().st_size

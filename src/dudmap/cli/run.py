@@ -5,14 +5,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.app.terminal import say
 from dudmap.cli.output import JsonOption, answer, parameter_names, preset_names
 from dudmap.cli.view import TokenOption, observers
 from dudmap.errors import ConfigError
-from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from dudmap.config import Config
-    from dudmap.places.saved_map import SavedMap
+    from dudmap.core.places.saved_map import SavedMap
 
 app = typer.Typer(add_completion=False)
 
@@ -168,12 +168,12 @@ def run(
     into the run folder; with --set movers.meshes=true also movers/<id>.ply and <id>.txt, mesh and poses of every rigid
     moving object.
     """
-    from dudmap.geometry.calibration import Calibration
-    from dudmap.gpu.device import resolve
-    from dudmap.pipeline.inspection import inspect
-    from dudmap.pipeline.run import run as run_sequence
-    from dudmap.pipeline.storing import Storing
-    from dudmap.sequences import open_sequence
+    from dudmap.app.pipeline.inspection import inspect
+    from dudmap.app.pipeline.run import run as run_sequence
+    from dudmap.app.pipeline.storing import Storing
+    from dudmap.core.backends.device import resolve
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.io.sequences import open_sequence
 
     if resume is not None:
         if sequence is not None or out is not None:
@@ -234,7 +234,7 @@ def _resume(
     as_json: bool,
 ) -> None:
     """Go on with an interrupted run."""
-    from dudmap.pipeline.resume import resume, wants_report
+    from dudmap.app.pipeline.resume import resume, wants_report
 
     with observers(report=wants_report(folder), page=page, rerun=rerun, log=log) as watching:
         done = resume(folder, device=device, progress=not quiet, observers=watching)
@@ -259,7 +259,7 @@ def read_config(file: Path | None, preset: str | None, assignments: list[str]) -
 
 def read_saved_map(folder: Path, config: "Config", out: Path | None) -> "SavedMap":
     """Map of a run folder for a run with this configuration."""
-    from dudmap.places.saved_map import SavedMap
+    from dudmap.core.places.saved_map import SavedMap
 
     if out is not None and out.resolve() == folder.resolve():
         raise ConfigError(
@@ -284,8 +284,8 @@ def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json:
     if as_json:
         answer(metrics, "", as_json=True)
     elif not quiet:
-        from dudmap.pipeline.progress import summary
-        from dudmap.terminal import plain_console
+        from dudmap.app.pipeline.progress import summary
+        from dudmap.app.terminal import plain_console
 
         console = plain_console()
         console.print(summary(metrics))

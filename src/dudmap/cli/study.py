@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from dudmap.app.terminal import say
 from dudmap.cli.output import JsonOption, answer
 from dudmap.extras import STUDY, need
-from dudmap.terminal import say
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dudmap.study.conduct import Progress
-    from dudmap.study.executor import Executor
+    from dudmap.lab.study.conduct import Progress
+    from dudmap.lab.study.executor import Executor
 
 
 class StudyGroup(TyperGroup):
@@ -61,8 +61,8 @@ def run(
     as_json: JsonOption = False,
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
-    from dudmap.study.plan import load_plan
-    from dudmap.study.study import run_study
+    from dudmap.lab.study.plan import load_plan
+    from dudmap.lab.study.study import run_study
 
     need("study", "dudmap study", STUDY)
     plan = load_plan(design)
@@ -91,8 +91,8 @@ def thesis(
     as_json: JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
-    from dudmap.study.study import run_study
-    from dudmap.study.thesis import published_report, thesis_plan
+    from dudmap.lab.study.study import run_study
+    from dudmap.lab.study.thesis import published_report, thesis_plan
 
     need("study", "dudmap study", STUDY)
     if published:
@@ -117,8 +117,8 @@ def tune(
     as_json: JsonOption = False,
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
-    from dudmap.study.plan import load_plan
-    from dudmap.study.tune import run_tune
+    from dudmap.lab.study.plan import load_plan
+    from dudmap.lab.study.tune import run_tune
 
     need("study", "dudmap study", STUDY)
     plan = load_plan(design)
@@ -134,10 +134,10 @@ def _answer(outcome: str, out: Path, *, as_json: bool) -> None:
 
 def _executor(jobs: int, cluster: str) -> "Executor":
     if cluster:
-        from dudmap.study.cluster import RayExecutor
+        from dudmap.lab.study.cluster import RayExecutor
 
         return RayExecutor(cluster, jobs or None)
-    from dudmap.study.executor import LocalExecutor, usable_cores
+    from dudmap.lab.study.executor import LocalExecutor, usable_cores
 
     return LocalExecutor(jobs or usable_cores())
 

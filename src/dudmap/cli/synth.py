@@ -96,11 +96,11 @@ def synth(
     Writes rgb/, depth/, masks/ and their lists, groundtruth.txt, intrinsics.txt, movers.jsonl, surface.ply,
     surface_observed.ply, scene.json and sensor_truth.json.
     """
-    from dudmap import synthetic
-    from dudmap.synthetic.cameras import find_camera
-    from dudmap.synthetic.faults import parse_faults
-    from dudmap.synthetic.folder import write_folder
-    from dudmap.synthetic.recording import DEFAULT_CAMERA
+    from dudmap.lab import synthetic
+    from dudmap.lab.synthetic.cameras import find_camera
+    from dudmap.lab.synthetic.faults import parse_faults
+    from dudmap.lab.synthetic.folder import write_folder
+    from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
     model = find_camera(sensor) if sensor is not None else None
     width, height = _size(size)

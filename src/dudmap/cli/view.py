@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.app.terminal import say
 from dudmap.errors import DudmapError
-from dudmap.terminal import say
 
 if TYPE_CHECKING:
-    from dudmap.pipeline.observer import RunObserver
+    from dudmap.app.pipeline.observer import RunObserver
 
 app = typer.Typer(add_completion=False)
 
@@ -37,7 +37,7 @@ def view(
     token: TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
-    from dudmap.viewing.stored_view import open_run
+    from dudmap.app.viewing.stored_view import open_run
 
     window = open_run(run, host, port, token)
     say(f"{window.url} shows {run} {window.access.notice}; ctrl-C ends it", err=True)
@@ -55,24 +55,24 @@ def observers(
     An error that nobody foresaw becomes one sentence and a report in the run folder. A page stays open after the run
     until ctrl-C, unless nobody sits at the terminal.
     """
-    from dudmap.pipeline.crash_report import report_crash
-    from dudmap.pipeline.event_log import EventLog
+    from dudmap.app.pipeline.crash_report import report_crash
+    from dudmap.app.pipeline.event_log import EventLog
 
     events = EventLog(log)
     with ExitStack() as stack:
         stack.callback(events.close)
         watching: list[RunObserver] = [events]
         if report:
-            from dudmap.viewing.report import ReportObserver
+            from dudmap.app.viewing.report import ReportObserver
 
             watching.append(ReportObserver())
         if rerun is not None:
-            from dudmap.viewing.rerun_log import RerunLog
+            from dudmap.app.viewing.rerun_log import RerunLog
 
             watching.append(RerunLog(rerun))
         if page is not None:
-            from dudmap.viewing.live_view import LiveView
-            from dudmap.viewing.window import Window
+            from dudmap.app.viewing.live_view import LiveView
+            from dudmap.app.viewing.window import Window
 
             host, port, token = page
             window = Window(host, port, "dudmap", token)

@@ -1,7 +1,6 @@
 """``dudmap warmup``: compile all kernels into the cache."""
 
 import time
-from collections.abc import Callable
 from typing import Annotated
 
 import typer
@@ -22,7 +21,8 @@ def warmup(
     """
     from contextlib import nullcontext
 
-    from dudmap.terminal import plain_console
+    from dudmap.app.terminal import plain_console
+    from dudmap.lab.warmup import steps
 
     console = plain_console(stderr=True, quiet=quiet or as_json)
     taken: dict[str, float] = {}
@@ -34,53 +34,3 @@ def warmup(
         console.print(f"{name}: {taken[name]:.1f} s")
     total = sum(taken.values())
     answer({"seconds": total, "steps": taken}, f"ready after {total:.1f} s", as_json=as_json, quiet=quiet)
-
-
-def steps() -> list[tuple[str, Callable[[], object]]]:
-    """Name and action of every part with kernels, in the order in which they must run."""
-    import tempfile
-    from pathlib import Path
-
-    from dudmap.config import Config
-    from dudmap.mapping.volume import TsdfVolume
-    from dudmap.slam import Slam
-    from dudmap.synthetic import sequence
-    from dudmap.synthetic.recording import DEFAULT_CAMERA
-
-    camera = DEFAULT_CAMERA.resized(160, 120)
-    recording = sequence(frames=4, camera=camera, start_dynamic=True)
-    frames = []
-    small = ["volume.voxel_size=0.04", "preprocess.depth_max=4", "similarity.max_translation=0"]
-    slam = Slam(camera, Config().override(small))
-
-    def render() -> None:
-        frames.extend(recording[index] for index in range(len(recording)))
-
-    def process(system: Slam) -> None:
-        for frame in frames:
-            system.process(frame)
-
-    def process_variants() -> None:
-        for variant in ("preset=thesis", "dynamics.method=threshold", "tracker.robust=tukey"):
-            process(Slam(camera, Config().override([variant, *small])))
-
-    def several_voxel_sizes() -> None:
-        adaptive = Slam(camera, Config().override(["volume.adaptive=true", "volume.adaptive_bend=0.05", *small]))
-        process(adaptive)
-        adaptive.volume.extract_mesh()
-        adaptive.volume.raycast(adaptive.trajectory.Ts_world_camera[-1], camera)
-
-    def save_and_load() -> None:
-        with tempfile.TemporaryDirectory() as folder:
-            slam.volume.save(Path(folder) / "map.npz")
-            TsdfVolume.load(Path(folder) / "map.npz")
-
-    return [
-        ("synthetic frames", render),
-        ("tracking, labels and map", lambda: process(slam)),
-        ("variants of the method", process_variants),
-        ("mesh", lambda: slam.volume.extract_mesh()),
-        ("view", lambda: slam.volume.raycast(slam.trajectory.Ts_world_camera[-1], camera)),
-        ("several voxel sizes", several_voxel_sizes),
-        ("map file", save_and_load),
-    ]

@@ -6,14 +6,14 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.association import read_list, read_pairs
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, MapError
 from dudmap.evaluation.trajectory import ate
-from dudmap.geometry.association import read_list, read_pairs
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import DAMAGE, read_json
-from dudmap.sequences import is_recording, open_sequence, reader_of
-from dudmap.sequences.tum import TumSequence
+from dudmap.io.sequences import is_recording, open_sequence, reader_of
+from dudmap.io.sequences.tum import TumSequence
 
 
 class TrajectoryFile(NamedTuple):

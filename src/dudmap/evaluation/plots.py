@@ -7,11 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_path
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
 from dudmap.evaluation.trajectory import AteResult, RpeResult
-from dudmap.geometry.trajectory import Trajectory
 from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:

@@ -10,9 +10,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError
 from dudmap.evaluation.surface import Surface
-from dudmap.geometry.mesh import Mesh
 
 Distances = NDArray[np.float32]
 

@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.association import associate, read_list, read_pairs
 from dudmap.errors import DatasetError
-from dudmap.geometry.association import associate, read_list, read_pairs
-from dudmap.sequences.images import read_mask
-from dudmap.sequences.masks import stamped_masks
+from dudmap.io.sequences.images import read_mask
+from dudmap.io.sequences.masks import stamped_masks
 
 Numbers = NDArray[np.float64]
 Mask = NDArray[np.bool_]

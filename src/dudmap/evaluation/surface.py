@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import MapError
-from dudmap.geometry import se3
-from dudmap.geometry.mesh import Mesh
 
 if TYPE_CHECKING:
     from scipy.spatial import KDTree

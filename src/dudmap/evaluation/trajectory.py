@@ -6,11 +6,11 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.alignment import umeyama
+from dudmap.core.geometry.association import LARGEST_GAP, associate
+from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.geometry import se3
-from dudmap.geometry.alignment import umeyama
-from dudmap.geometry.association import LARGEST_GAP, associate
-from dudmap.geometry.trajectory import Trajectory
 
 Numbers = NDArray[np.float64]
 Align = Literal["se3", "origin", "none"]

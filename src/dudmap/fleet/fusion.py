@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.map import morton
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.fleet.inputs import MapHeader
+from dudmap.fleet.map_fusion import FusedRange, RangeFusion, ReachedBlocks
 from dudmap.fleet.open_maps import open_map, reached_blocks
 from dudmap.fleet.tiles import Tile, write_tile
 from dudmap.fleet.workers import Workers
-from dudmap.mapping import morton
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_fusion import FusedRange, RangeFusion, ReachedBlocks
 
 CELL_BITS = 12
 """Bits of the code of a block within its cell: cells are 16 blocks wide, 2.56 m with voxels of 2 cm."""

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.map_file import FORMAT
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
-from dudmap.geometry.camera import Camera
 from dudmap.input_files import DAMAGE, open_arrays
-from dudmap.mapping.map_file import FORMAT
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE
 
 TRAJECTORY_FILE = "trajectory.txt"
 MAX_RUNS = 8000

@@ -13,22 +13,22 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
+from dudmap.core.map import morton
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.errors import DudmapError, MapError
 from dudmap.extras import need
+from dudmap.fleet.block_sums import MAX_COUNT, VOXELS
 from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, RangeJob, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
+from dudmap.fleet.map_fusion import FusedRange, joined
+from dudmap.fleet.map_samples import sample_map
 from dudmap.fleet.registration import RegisteredPair
 from dudmap.fleet.rounds import registered_runs
+from dudmap.fleet.run_graph import RunGraph
 from dudmap.fleet.tiles import TILE_FOLDER, TILESET_FILE, write_tileset, write_tree
 from dudmap.fleet.two_runs import save_trajectories
 from dudmap.fleet.workers import Workers
 from dudmap.input_files import DAMAGE, describe, read_json
-from dudmap.mapping import morton
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.block_sums import MAX_COUNT, VOXELS
-from dudmap.merging.map_fusion import FusedRange, joined
-from dudmap.merging.map_samples import sample_map
-from dudmap.merging.run_graph import RunGraph
 from dudmap.own_folder import remove_files
 
 WORLD_FILE, FORMAT = "world.json", "dudmap world 1"

@@ -5,13 +5,13 @@ from pathlib import Path
 
 import numpy as np
 
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.place_recognition import Keyframe
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap, load_keyframes
 from dudmap.fleet.inputs import MapHeader
-from dudmap.mapping.volume import TsdfVolume
-from dudmap.merging.map_fusion import ReachedBlocks
-from dudmap.merging.map_merging import MapSurface
-from dudmap.merging.map_samples import SurfacePoints
-from dudmap.places.place_recognition import Keyframe
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap, load_keyframes
+from dudmap.fleet.map_fusion import ReachedBlocks
+from dudmap.fleet.map_merging import MapSurface
+from dudmap.fleet.map_samples import SurfacePoints
 
 OPEN_MAPS = 2
 """Whole maps in memory: the two of a pair."""

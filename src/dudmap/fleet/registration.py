@@ -7,14 +7,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.places.saved_map import MAP_FILE
 from dudmap.fleet.inputs import MapHeader
+from dudmap.fleet.map_merging import NOT_RECOGNISED, MapPair, decided
 from dudmap.fleet.open_maps import keyframes_of, surface_of
+from dudmap.fleet.place_index import PARTNERS, TRAINING, described, learnt_words, similarity
+from dudmap.fleet.relative_pose import Hypothesis, relative_poses
+from dudmap.fleet.run_graph import Join, drift_covariance
 from dudmap.fleet.workers import Workers
-from dudmap.merging.map_merging import NOT_RECOGNISED, MapPair, decided
-from dudmap.merging.place_index import PARTNERS, TRAINING, described, learnt_words, similarity
-from dudmap.merging.relative_pose import Hypothesis, relative_poses
-from dudmap.merging.run_graph import Join, drift_covariance
-from dudmap.places.saved_map import MAP_FILE
 
 ALL_PAIRS = PARTNERS
 """Number of runs up to which all pairs are compared: the index would leave out next to none."""

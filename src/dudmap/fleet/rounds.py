@@ -7,16 +7,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.map import morton
+from dudmap.core.places.saved_map import MAP_FILE
 from dudmap.fleet.inputs import MapHeader
+from dudmap.fleet.map_samples import transformed
+from dudmap.fleet.place_index import PARTNERS, most_similar
 from dudmap.fleet.registration import RegisteredPair, register_pairs, similar_runs
+from dudmap.fleet.run_graph import RunGraph, solve
 from dudmap.fleet.workers import Workers
-from dudmap.geometry import se3
-from dudmap.geometry.alignment import agree
-from dudmap.mapping import morton
-from dudmap.merging.map_samples import transformed
-from dudmap.merging.place_index import PARTNERS, most_similar
-from dudmap.merging.run_graph import RunGraph, solve
-from dudmap.places.saved_map import MAP_FILE
 
 Pairs = dict[tuple[int, int], RegisteredPair]
 Guesses = dict[tuple[int, int], NDArray[np.float64]]

@@ -15,10 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
-from dudmap.exporting.gltf import encoded
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh_simplification import clustered
 from dudmap.fleet.workers import Workers
-from dudmap.geometry.mesh import Mesh
-from dudmap.geometry.mesh_simplification import clustered
+from dudmap.io.exporting.gltf import encoded
 
 TILE_FOLDER, TILESET_FILE = "tiles", "tileset.json"
 T_GLTF_MAP = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])

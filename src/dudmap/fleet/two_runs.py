@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.app.pipeline.run_folder import prepare_run_folder
 from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DatasetError, MapError
 from dudmap.fleet.inputs import check_runs
-from dudmap.geometry.trajectory import Trajectory
+from dudmap.fleet.map_merging import MapPair, compare_maps, merged_map
 from dudmap.input_files import damaged, read_bytes, read_json
-from dudmap.merging.map_merging import MapPair, compare_maps, merged_map
-from dudmap.pipeline.run_folder import prepare_run_folder
-from dudmap.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 
 MERGE_FILE = "merge.json"
 

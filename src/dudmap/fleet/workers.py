@@ -9,8 +9,8 @@ from concurrent.futures.process import BrokenProcessPool
 from types import TracebackType
 from typing import TypeVar
 
+from dudmap.app.pipeline.environment import peak_rss_mb
 from dudmap.errors import DudmapError
-from dudmap.pipeline.environment import peak_rss_mb
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")

@@ -1,0 +1,1 @@
+"""A run: frames in, a run folder out, its state, and what a person sees of it."""

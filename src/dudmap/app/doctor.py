@@ -1,0 +1,253 @@
+"""Checks of an installation, each with what was found and what to do about it."""
+
+import os
+import platform
+import re
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from pathlib import Path
+from typing import Any, Literal
+
+from dudmap import __version__
+
+PYTHON = ((3, 11), (3, 14))
+"""First version of Python that is supported, and the first that is not."""
+PORT = 8080
+"""Port of the page of --view."""
+FEATURES = ("avx2", "fma")
+"""What processors of Intel and AMD have had since 2013, and the kernels profit from."""
+FREE_BYTES = 2**31
+"""Space below which a folder counts as nearly full: a map and the results of a long run."""
+State = Literal["good", "note", "bad"]
+
+
+@dataclass(frozen=True)
+class Check:
+    """One checked thing.
+
+    Attributes:
+        name: What was checked.
+        state: "good"; "note" for what limits a part of the program; "bad" for what stops it.
+        found: What was found.
+        mend: What to do, empty if nothing.
+    """
+
+    name: str
+    state: State
+    found: str
+    mend: str = ""
+
+    def tree(self) -> dict[str, Any]:
+        """Dictionary of text."""
+        return asdict(self)
+
+
+def checks() -> Iterator[Check]:
+    """All checks, quick ones only: nothing is compiled, and nothing outside of this machine is asked."""
+    yield _python()
+    yield from _packages()
+    yield _processor()
+    yield _threads()
+    yield _gpu()
+    yield _kernel_cache()
+    yield _archive_cache()
+    yield from _extras()
+    yield _port()
+
+
+def _python() -> Check:
+    found = f"Python {platform.python_version()}, dudmap {__version__}, {platform.platform()}"
+    if PYTHON[0] <= sys.version_info[:2] < PYTHON[1]:
+        return Check("versions", "good", found)
+    return Check("versions", "bad", found, "install Python 3.11, 3.12 or 3.13 and dudmap in it")
+
+
+def _packages() -> Iterator[Check]:
+    for name, lowest, extra in requirements():
+        if extra:
+            continue
+        found = installed(name)
+        if found is None:
+            yield Check(name, "bad", "not installed", f"pip install '{name}>={lowest}'")
+        elif numbers(found) < numbers(lowest):
+            yield Check(
+                name, "bad", f"{found}; {lowest} or newer is needed", f"pip install --upgrade '{name}>={lowest}'"
+            )
+        else:
+            yield Check(name, "good", found)
+
+
+def _processor() -> Check:
+    from dudmap.app.pipeline.environment import machine
+
+    name = f"{machine()['cpu']} ({platform.machine()})"
+    if platform.machine().lower() not in ("x86_64", "amd64"):
+        return Check("processor", "good", name)
+    try:
+        from llvmlite.binding import get_host_cpu_features
+
+        features = get_host_cpu_features()
+    except (ImportError, RuntimeError) as error:
+        return Check("processor", "note", f"{name}; its features are not known: {error}", "see the packages above")
+    missing = [feature for feature in FEATURES if not features.get(feature)]
+    if missing:
+        mend = "expect several times the time per frame; if it is a virtual machine, pass on the host's processor"
+        return Check("processor", "note", f"{name} without {' and '.join(missing)}", mend)
+    return Check("processor", "good", f"{name} with {', '.join(FEATURES)}")
+
+
+def _threads() -> Check:
+    try:
+        from dudmap.core.backends.threads import num_threads
+    except ImportError as error:
+        return Check("threads", "bad", f"Numba cannot be loaded: {error}", "pip install --force-reinstall numba")
+    count, given = num_threads(), os.environ.get("DUDMAP_THREADS")
+    found = f"{count} of {os.cpu_count()} cores" + (f", as DUDMAP_THREADS={given} says" if given else "")
+    if given and not (given.isdigit() and int(given) > 0):
+        return Check("threads", "note", found, "DUDMAP_THREADS is no positive whole number and has no effect: unset it")
+    return Check("threads", "good" if count > 1 else "note", found, "" if count > 1 else "more cores make it faster")
+
+
+def _gpu() -> Check:
+    from dudmap.core.backends.device import driver_version, obstacle
+
+    found = obstacle()
+    if not found:
+        return Check("GPU", "good", "works, and is used unless --device cpu is given")
+    if driver_version() is None:
+        return Check("GPU", "good", "none of NVIDIA found; none is needed")
+    return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, mend this")
+
+
+def kernel_cache() -> Path:
+    """Folder in which Numba keeps the compiled kernels, as far as it can be known without compiling."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(given) if given else Path(__file__).parents[1] / "core" / "backends" / "cpu" / "__pycache__"
+
+
+def _kernel_cache() -> Check:
+    folder = kernel_cache()
+    problem = not_writable(folder)
+    if problem:
+        mend = "set NUMBA_CACHE_DIR to a folder that you can write, or every start compiles for a minute"
+        return Check("kernel cache", "note", f"{folder}: {problem}", mend)
+    count = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
+    if not count:
+        return Check("kernel cache", "note", f"{folder} is empty", "dudmap warmup compiles all kernels in advance")
+    return Check("kernel cache", "good", f"{folder}, {count} kernels")
+
+
+def _archive_cache() -> Check:
+    from dudmap.io.sequences.archive import cache_folder
+
+    folder = cache_folder()
+    problem = not_writable(folder)
+    if problem:
+        return Check("archive cache", "note", f"{folder}: {problem}", "set DUDMAP_CACHE to a folder that you can write")
+    return Check("archive cache", "good", str(folder))
+
+
+def _extras() -> Iterator[Check]:
+    by_extra: dict[str, list[tuple[str, str]]] = {}
+    for name, lowest, extra in requirements():
+        if extra and extra != "dev":
+            by_extra.setdefault(extra, []).append((name, lowest))
+    for extra, packages in sorted(by_extra.items()):
+        missing = [
+            name for name, lowest in packages
+            if (found := installed(name)) is None or numbers(found) < numbers(lowest)
+        ]  # fmt: skip
+        if missing:
+            mend = f"only if you need it: pip install 'dudmap[{extra}]'"
+            yield Check(f"extra {extra}", "note", f"without {', '.join(missing)}", mend)
+        else:
+            yield Check(f"extra {extra}", "good", ", ".join(f"{name} {installed(name)}" for name, _ in packages))
+
+
+def _port() -> Check:
+    import socket
+
+    with socket.socket() as probe:
+        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind(("127.0.0.1", PORT))
+        except OSError as error:
+            return Check("viewer port", "note", f"{PORT}: {error.strerror}", "name another one with --port")
+    return Check("viewer port", "good", f"{PORT} is free on this machine")
+
+
+def not_writable(folder: Path) -> str:
+    """Why nothing can be written into a folder or where it would be made; empty if all is well."""
+    place = next((parent for parent in (folder, *folder.parents) if parent.exists()), Path("/"))
+    try:
+        with tempfile.TemporaryFile(dir=place):
+            pass
+    except OSError as error:
+        return f"it cannot be written ({error.strerror})"
+    free = shutil.disk_usage(place).free
+    return f"only {free / 1e9:.1f} GB are free" if free < FREE_BYTES else ""
+
+
+def requirements() -> list[tuple[str, str, str]]:
+    """Name, lowest version and extra (empty: required) of the packages that dudmap says it uses."""
+    found = []
+    for line in requires("dudmap") or []:
+        name = re.match(r"[A-Za-z0-9._-]+", line)
+        lowest, extra = re.search(r">=\s*([\d.]+)", line), re.search(r"extra == ['\"]([\w-]+)['\"]", line)
+        if name is not None:
+            found.append((name[0], lowest[1] if lowest else "0", extra[1] if extra else ""))
+    return found
+
+
+def installed(name: str) -> str | None:
+    """Version of an installed package; None if it is not there."""
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return None
+
+
+def numbers(text: str) -> tuple[int, ...]:
+    """Leading numbers of a version, for comparison."""
+    release = re.match(r"\d+(?:\.\d+)*", text)
+    return tuple(int(part) for part in release[0].split(".")) if release else ()
+
+
+@dataclass(frozen=True)
+class Licence:
+    """Licence of a package, as its own metadata states it."""
+
+    package: str
+    version: str
+    licence: str
+
+
+def licences() -> list[Licence]:
+    """Licences of all packages that dudmap needs, also of those that these need; extras are left out."""
+    queue, seen = [name for name, _, extra in requirements() if not extra], {}
+    while queue:
+        name = queue.pop()
+        key = re.sub(r"[-_.]+", "-", name).lower()
+        if key in seen or installed(name) is None:  # the latter: only for another system or version of Python
+            continue
+        seen[key] = Licence(key, version(name), licence_of(name))
+        for line in requires(name) or []:
+            match = re.match(r"[A-Za-z0-9._-]+", line)
+            if match is not None and "extra ==" not in line:
+                queue.append(match[0])
+    return [seen[key] for key in sorted(seen)]
+
+
+def licence_of(name: str) -> str:
+    """Licence of an installed package: its SPDX expression, else its classifiers, else the first line of its text."""
+    about: Any = metadata(name)
+    expression = about.get("License-Expression")
+    if expression:
+        return expression
+    marks = [line.rpartition(" :: ")[2] for line in about.get_all("Classifier", []) if line.startswith("License")]
+    text = (about.get("License") or "").strip().splitlines()
+    return ", ".join(marks) or (text[0][:60] if text else "not stated")

@@ -1,0 +1,173 @@
+"""Calibration of a whole recording."""
+
+from contextlib import closing
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import cv2
+import numpy as np
+
+from dudmap.app.pipeline.frame_source import read_ahead
+from dudmap.config import Config
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.threads import num_threads
+from dudmap.core.calibration.collector import KeyframeCollector
+from dudmap.core.calibration.estimator import CalibrationEstimator, Estimate, mask_of
+from dudmap.core.calibration.keyframes import halvings_to
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.pyramid import HALVING_BAND
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError, FrameError
+from dudmap.io.sequences import is_timed
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dudmap.io.sequences import Sequence
+
+
+START_FRAMES, MIN_FRAMES = 300, 90
+"""Frames at the start of a recording from which a run calibrates itself, and the fewest that can show a fault: the
+estimator compares pairs of keyframes from both halves of the time."""
+
+WIDTH, INTERVAL = 320, 1 / 30
+"""Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
+at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
+noise of the poses and more of the camera's shaking enter, the longer they are."""
+VOXEL_SIZE = 0.02
+"""Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
+
+
+def calibrate_start(
+    sequence: "Sequence",
+    config: Config,
+    max_frames: int | None = None,
+    notice: "Callable[[str], None] | None" = None,
+) -> Calibration | None:
+    """Calibration estimated from the start of a recording; None where none was made.
+
+    Preset ``thesis``, which takes the images as they are, and short recordings are not calibrated.
+
+    Args:
+        sequence: The recording.
+        config: All parameters.
+        max_frames: Number of frames that will be processed; None for all.
+        notice: Receives sentences on what is being done and what was found.
+    """
+    notice = notice or (lambda text: None)
+    count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
+    if config.preset == "thesis" or count < MIN_FRAMES:
+        return None
+    notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
+    given = sequence.calibration or Calibration.registered(sequence.camera)
+    try:
+        found = calibrate_sequence(sequence, config, given, count, notice).calibration
+    except DatasetError as error:
+        notice(f"the colour camera is taken as given: {error}")
+        return None
+    names = ", ".join(found.estimated)
+    notice(f"colour camera: estimated {names}" if names else "colour camera: as given, the images show no fault")
+    return found
+
+
+def calibrate_sequence(
+    sequence: "Sequence",
+    config: Config,
+    given: Calibration,
+    max_frames: int | None = None,
+    notice: "Callable[[str], None]" = lambda text: None,
+) -> Estimate:
+    """Track a recording quickly with the calibration as given, and estimate a better one.
+
+    The poses are unknowns of the estimation too, so that images at an ``INTERVAL``, about ``WIDTH`` wide, will do.
+
+    Args:
+        sequence: The recording.
+        config: All parameters.
+        given: The calibration to start from.
+        max_frames: Use only so many frames.
+        notice: Receives a sentence on what is being done.
+
+    Raises:
+        DatasetError: Hardly any frame could be read and tracked.
+    """
+    from dudmap.core.slam import Slam
+
+    halvings = halvings_to(WIDTH, sequence.camera)
+    small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
+    slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence))
+    notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
+    collector, submap = KeyframeCollector(small.calibration.camera), 0
+    with closing(read_ahead(small, len(small), slam=slam)) as frames:
+        for read in frames:
+            if isinstance(read.frame, FrameError) or read.prepared is None:
+                continue
+            result = slam.process(read.prepared)
+            if result.submap != submap:
+                submap = result.submap
+                collector.clear()
+            if result.state == "repeated":
+                continue
+            if result.T_world_camera is None or result.blind:
+                collector.interrupt()
+            else:
+                mask = slam.preprocess.mask(result.dynamic_mask)
+                collector.add(read.prepared.observation, result.T_world_camera, mask)
+    if len(collector.keyframes) < 2:
+        raise DatasetError(f"{sequence.name} has no two tracked frames to compare")
+    notice(f"calibration: comparing {len(collector.keyframes)} of them with each other")
+    estimate = CalibrationEstimator(small.calibration, config.sensor, num_threads()).estimate(collector.keyframes)
+    return replace(estimate, calibration=_enlarged(estimate.calibration, given.camera, halvings))
+
+
+def _quick(config: Config, halvings: int) -> Config:
+    """Parameters for the excerpt: voxels as large as its pixels ask for, and nothing that is only reported."""
+    preprocess = config.preprocess
+    return config.override([
+        "sensor.self_calibration=false", "movers.enabled=false", "loops.enabled=false",
+        f"volume.voxel_size={max(config.volume.voxel_size, VOXEL_SIZE)}",
+        f"preprocess.filter_sigma_px={preprocess.filter_sigma_px / (1 << halvings)}",
+        f"preprocess.filter_radius={max(1, preprocess.filter_radius >> halvings)}",
+    ])  # fmt: skip
+
+
+class _Excerpt:
+    """Frames of a recording at an ``INTERVAL``, with images halved some times by 2x2 blocks.
+
+    Attributes:
+        camera: Of its depth images.
+        calibration: Of its colour images.
+    """
+
+    def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
+        usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
+        self._sequence, self._halvings = sequence, halvings
+        self.name, self.ground_truth = sequence.name, None
+        self._step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
+        self.timestamps = sequence.timestamps[: count : self._step]
+        self.camera = sequence.camera.scaled(halvings)
+        self.calibration = replace(given, camera=given.camera.scaled(halvings))
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Frame:
+        frame, backend = self._sequence[self._step * index], CpuBackend()
+        depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.color
+        for _ in range(self._halvings):
+            depth, _ = backend.halve(depth, np.zeros_like(depth), HALVING_BAND)
+            height, width = (size // 2 for size in color.shape[:2])
+            color = cv2.resize(color[: 2 * height, : 2 * width], (width, height), interpolation=cv2.INTER_AREA)
+        return replace(frame, depth=depth, color=np.asarray(color, np.uint8))
+
+    def mask(self, index: int) -> None:
+        """No true mask: none is scored here."""
+
+
+def _enlarged(found: Calibration, camera: Camera, halvings: int) -> Calibration:
+    """A calibration of halved colour images, for images of a camera's size."""
+    factor, sigma = 1 << halvings, found.sigma.copy()
+    sigma[mask_of(("center_x", "center_y"))] *= factor
+    whole = found.camera.resized(found.camera.width * factor, found.camera.height * factor)
+    return replace(found, camera=replace(whole, width=camera.width, height=camera.height), sigma=sigma)

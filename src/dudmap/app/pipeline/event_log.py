@@ -1,0 +1,90 @@
+"""What happens in a run, one event after the other: for programs that read along, and for the report of a crash."""
+
+import json
+import time
+from collections import deque
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
+
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.errors import DudmapError
+
+if TYPE_CHECKING:
+    from dudmap.app.pipeline.frame_source import FrameRead
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
+
+RECENT = 50
+"""Last events that are kept in memory: of a second or two, most of them frames."""
+
+
+class EventLog(RunObserver):
+    """Writes one JSON object per line and event; each is on its way to the file before the next frame begins.
+
+    Every object has ``time`` (seconds since 1970) and ``event``; docs/reliability.md lists the events and their keys.
+
+    Args:
+        path: The file, which is replaced; None only keeps the last events.
+
+    Attributes:
+        recent: The last ``RECENT`` events.
+        out: The run folder, None before a run has begun.
+
+    Raises:
+        DudmapError: The file cannot be written.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.recent: deque[dict[str, Any]] = deque(maxlen=RECENT)
+        self.out: Path | None = None
+        self._file: TextIO | None = None
+        if path is not None:
+            try:
+                self._file = path.open("w", encoding="utf-8", buffering=1)
+            except OSError as error:
+                raise DudmapError(f"cannot write the log {path}: {error.strerror}; name another file") from error
+        self._slam: Slam | None = None
+        self._state = "tracked"
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """A pass begins."""
+        self._slam, self.out, self._state = slam, out, "tracked"
+        self.event("start", folder=str(out), frames=count)
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """One event for the frame, and one for what else happened with it."""
+        assert self._slam is not None
+        place: dict[str, Any] = {"frame": index, "timestamp": result.timestamp}
+        figures = {"ms": round(ms, 2), "dynamic_share": round(float(result.dynamic_share), 4), "submap": result.submap}
+        if result.state == "lost":
+            self.event("lost", **place, **figures, reason=result.lost_reason, first=self._state != "lost")
+        else:
+            assert result.T_world_camera is not None
+            position = [round(float(x), 4) for x in result.T_world_camera[:3, 3]]
+            self.event(result.state, **place, **figures, fused=result.fused, position=position)
+        if result.relocalized:
+            self.event("relocalized", **place, submap=result.submap)
+        if result.corrected:
+            self.event("loop", **place, submap=result.submap)
+        if result.calibrated:
+            self.event("calibration", **place, estimated=list(self._slam.calibration.estimated))
+        for kind, sentence in (("uncertain", result.uncertain), ("blind", "no contrast" if result.blind else "")):
+            if sentence:
+                self.event("warning", **place, kind=kind, reason=sentence)
+        self._state = result.state
+
+    def event(self, name: str, **values: Any) -> None:  # noqa: ANN401 - any JSON value
+        """Write an event."""
+        row = {"time": round(time.time(), 3), "event": name} | values
+        self.recent.append(row)
+        if self._file is not None:
+            self._file.write(json.dumps(row) + "\n")
+
+    def finish(self, out: Path) -> None:
+        """The run folder is written."""
+        self.event("finish", folder=str(out))
+
+    def close(self) -> None:
+        """End the file."""
+        if self._file is not None:
+            self._file.close()

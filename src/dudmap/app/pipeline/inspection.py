@@ -1,0 +1,291 @@
+"""What a recording holds, and what looks wrong in it, from its lists and a few of its frames."""
+
+from dataclasses import asdict, dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.pipeline.focal_check import WRONG, focal_error
+from dudmap.app.pipeline.image_checks import image_warnings
+from dudmap.errors import FrameError
+from dudmap.io.sequences.intrinsics import BY_NAME
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.io.sequences import Sequence
+
+SAMPLES = 12
+"""Number of evenly spread frames that are read."""
+NEAR, FAR = 0.1, 8.0
+"""Plausible medians of the depth readings, metres: no depth camera measures nearer or farther most of the time."""
+NEAREST, FARTHEST = 0.2, 10.0
+"""Where the median lies beyond ``SEEN``: least plausible 5th and largest plausible 95th percentile of the readings,
+metres: few depth cameras measure nearer than 0.2 m, and those for rooms hardly beyond 10 m."""
+SEEN = (0.4, 4.0)
+"""Medians, metres, within which the scale is not doubted."""
+FEW_READINGS = 0.2
+"""Share of pixels with a reading below which the depth is called sparse."""
+FIELD_OF_VIEW = (20.0, 130.0)
+"""Plausible horizontal and vertical fields of view, degrees: from tele lenses to the widest depth mode in use."""
+OFF_CENTER = 0.25
+"""Largest plausible distance of the principal point from the middle of the image, share of its size."""
+UNEQUAL_FOCAL = 0.1
+"""Largest plausible difference of fx and fy, as a share: pixels are square but for calibration error."""
+GAP = 3.0
+"""Time between frames that counts as a gap, as a multiple of the median."""
+LEFT_OVER = 0.02
+"""Share of the images without a partner that is worth a warning."""
+SLOW, FAST = 1.0, 0.001
+"""Median time between frames, seconds, beyond which the times are in another unit, or not of one camera."""
+LATE = 0.015
+"""Median time between the colour and the depth image of a frame, seconds, that is worth a warning: half a frame."""
+RUN = 6
+"""Number of frames in a row that are compared with each other at every sampled place."""
+SCALES = (1000.0, 5000.0, 1.0, 4000.0, 6553.5, 10000.0)
+"""Depth scales in use, units per metre, of which the first that fits is proposed where the given one is implausible."""
+USUAL = (0.4, 8.0)
+"""Median depth, metres, that a proposed scale must give."""
+
+
+@dataclass
+class Inspection:
+    """What a recording holds.
+
+    Attributes:
+        name, format: Of the recording.
+        frames: Number of frames.
+        duration: From the first to the last depth image, seconds.
+        rate: Depth images per second (of the median time between two).
+        color_rate: The same for the colour images; None where their times are not known.
+        gaps: (time of the last frame before it, length) of every gap, seconds.
+        camera, color_camera: Intrinsics of the depth and of the colour camera; the same where they are registered.
+        T_color_depth: 4x4 motion between them, row by row; None where they are registered.
+        sources: Where intrinsics, depth unit and times come from: a file, a name, an option, or that they are assumed.
+        depth_scale: Units of a 16-bit depth image per metre.
+        median_depth: Of all readings of the sampled frames, metres; None without any.
+        valid_depth: Share of pixels with a reading.
+        unreadable: Reasons of the sampled frames that cannot be read.
+        ground_truth: Number of true poses, 0 without.
+        repeats: Shares of the frames that repeat the one before: both images (``frame``), or ``depth`` or ``color``
+            alone; empty where they were not compared.
+        warnings: Sentences on what looks wrong.
+    """
+
+    name: str
+    format: str
+    frames: int
+    duration: float
+    rate: float | None
+    color_rate: float | None
+    gaps: list[tuple[float, float]]
+    camera: dict[str, Any]
+    color_camera: dict[str, Any]
+    T_color_depth: list[list[float]] | None
+    sources: dict[str, str]
+    depth_scale: float
+    median_depth: float | None
+    valid_depth: float
+    ground_truth: int
+    unreadable: list[str] = field(default_factory=list)
+    repeats: dict[str, float] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+
+    def distinct_rate(self, stream: str) -> float | None:
+        """Images per second of the ``depth`` or ``color`` stream without those that repeat the one before; None where
+        that is not known."""
+        if self.rate is None or not self.repeats:
+            return None
+        return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
+
+    def tree(self) -> dict[str, Any]:
+        """Nested dictionary of numbers, lists and words, for JSON."""
+        return asdict(self)
+
+
+def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int, Frame]], list[str]]":
+    """Numbers and frames of an evenly spread selection, and the reasons of those that cannot be read."""
+    frames, unreadable = [], []
+    for index in np.unique(np.linspace(0, len(sequence) - 1, count).astype(int)):
+        try:
+            frames.append((int(index), sequence[int(index)]))
+        except FrameError as error:
+            unreadable.append(str(error))
+    return frames, unreadable
+
+
+def repeats(sequence: "Sequence") -> dict[str, float]:
+    """Shares of the frames whose images are bit for bit those of the frame before, by what repeats: ``frame``,
+    ``depth`` or ``color``; from RUN frames in a row at SAMPLES places. Empty where no two can be read."""
+    from dudmap.core.frames.stream_check import repeated
+
+    counts, pairs = {"frame": 0, "depth": 0, "color": 0}, 0
+    last = max(0, len(sequence) - RUN)
+    for start in np.unique(np.linspace(0, last, SAMPLES).astype(int)):
+        before = None
+        for index in range(start, min(start + RUN, len(sequence))):
+            try:
+                frame = sequence[index]
+            except FrameError:
+                before = None
+                continue
+            if before is not None:
+                pairs += 1
+                kind = repeated((before.depth, before.color), (frame.depth, frame.color))
+                if kind:
+                    counts[kind] += 1
+            before = frame
+    return {kind: count / pairs for kind, count in counts.items()} if pairs else {}
+
+
+def inspect(
+    sequence: "Sequence", frames: "list[tuple[int, Frame]] | None" = None, unreadable: list[str] | None = None
+) -> Inspection:
+    """Describe a recording and name what looks wrong.
+
+    Args:
+        sequence: The recording.
+        frames: Numbers and frames as ``sample`` returns them; None samples.
+        unreadable: Reasons of the sampled frames that cannot be read.
+    """
+    if frames is None:
+        frames, unreadable = sample(sequence)
+    depths = [frame.depth[frame.depth > 0] for _, frame in frames]
+    readings = np.concatenate(depths) if depths else np.zeros(0, np.float32)
+    pixels = sum(frame.depth.size for _, frame in frames)
+    camera, calibration = sequence.camera, sequence.calibration
+    colors = getattr(sequence, "color_timestamps", None)
+    truth = sequence.ground_truth
+    found = Inspection(
+        name=sequence.name,
+        format=getattr(sequence, "format", type(sequence).__name__),
+        frames=len(sequence),
+        duration=float(sequence.timestamps[-1] - sequence.timestamps[0]),
+        rate=_rate(sequence.timestamps),
+        color_rate=None if colors is None else _rate(np.unique(colors)),
+        gaps=_gaps(sequence.timestamps),
+        camera=_numbers(camera),
+        color_camera=_numbers(camera if calibration is None else calibration.camera),
+        T_color_depth=None if calibration is None else calibration.T_color_depth.tolist(),
+        sources=dict(getattr(sequence, "sources", {})),
+        depth_scale=camera.depth_scale,
+        median_depth=float(np.median(readings)) if len(readings) else None,
+        valid_depth=len(readings) / pixels if pixels else 0.0,
+        ground_truth=0 if truth is None else len(truth),
+        unreadable=list(unreadable or []),
+    )
+    named = found.sources.get("intrinsics", "").endswith(BY_NAME) and calibration is None
+    found.warnings = [
+        *(_focal_warnings(sequence) if named else []),
+        *_depth_warnings(found, readings),
+        *image_warnings([frame for _, frame in frames]),
+        *_camera_warnings("depth camera", camera),
+        *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
+        *_time_warnings(sequence.timestamps, colors),
+        *_truth_warnings(sequence.timestamps, truth),
+        *_pairing_warnings(sequence),
+    ]
+    return found
+
+
+def _numbers(camera: "Camera") -> dict[str, Any]:
+    out = asdict(camera) | {"distortion": list(camera.distortion)}
+    del out["depth_scale"]
+    return out
+
+
+def _rate(times: NDArray[np.float64]) -> float | None:
+    return float(1.0 / np.median(np.diff(times))) if len(times) > 1 else None
+
+
+def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
+    steps = np.diff(times)
+    if not len(steps):
+        return []
+    return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
+
+
+def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[str]:
+    out = []
+    if found.unreadable:
+        out.append(
+            f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
+        )
+    if found.median_depth is None:
+        return [*out, "the sampled frames hold no depth reading"]
+    median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
+    implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
+    if implausible or not NEAR <= median <= FAR:
+        units = median * found.depth_scale
+        fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
+        proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
+        unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
+        out.append(
+            f"the depth scale looks wrong: with {found.depth_scale:g} units per metre nine tenths of the readings lie "
+            f"from {near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: "
+            f"give --depth-unit {unit}"
+        )
+    if found.valid_depth < FEW_READINGS:
+        out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")
+    return out
+
+
+def _camera_warnings(name: str, camera: "Camera") -> list[str]:
+    out = []
+    angles = [
+        np.degrees(2 * np.arctan(size / 2 / f)) for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
+    ]
+    if not all(FIELD_OF_VIEW[0] <= angle <= FIELD_OF_VIEW[1] for angle in angles):
+        out.append(f"a field of view of {angles[0]:.0f} x {angles[1]:.0f} degrees")
+    for axis, center, size in (("x", camera.cx, camera.width), ("y", camera.cy, camera.height)):
+        if abs(center + 0.5 - size / 2) > OFF_CENTER * size:
+            out.append(f"a principal point c{axis} of {center:g} in an image of {size} pixels")
+    if abs(camera.fx - camera.fy) > UNEQUAL_FOCAL * max(camera.fx, camera.fy):
+        out.append(f"focal lengths of {camera.fx:g} and {camera.fy:g}")
+    return [f"the intrinsics of the {name} look wrong: {what}; give the right ones with --camera" for what in out]
+
+
+def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | None) -> list[str]:
+    out = []
+    if len(times) > 1:
+        step = float(np.median(np.diff(times)))
+        if not FAST <= step <= SLOW:
+            out.append(f"the times look wrong: {step:.3g} s from frame to frame; expected seconds, of one camera")
+    if colors is None:
+        return out
+    late = float(np.median(np.abs(colors - times)))
+    if late > LATE:
+        out.append(f"colour and depth are {1000 * late:.0f} ms apart in most frames: the lists may be paired wrongly")
+    if np.any(np.diff(colors) < 0):
+        out.append("the colour images are not in the order of the depth images: the times of the lists are mixed up")
+    return out
+
+
+def _focal_warnings(sequence: "Sequence") -> list[str]:
+    error = focal_error(sequence)
+    if error is None or abs(error - 1) < WRONG:
+        return []
+    fx = sequence.camera.fx
+    return [
+        f"the focal length {fx:g} is that of {getattr(sequence, 'sources', {})['intrinsics']}, but pairs of frames are "
+        f"consistent with about {fx / error:.0f}; give the right intrinsics with --camera"
+    ]
+
+
+def _pairing_warnings(sequence: "Sequence") -> list[str]:
+    counts = getattr(sequence, "image_counts", None)
+    if counts is None or len(sequence) >= (1 - LEFT_OVER) * max(counts):
+        return []
+    how = getattr(sequence, "sources", {})["frames"]
+    return [f"only {len(sequence)} frames come of {how}; the other images are not used"]
+
+
+def _truth_warnings(times: NDArray[np.float64], truth: "Trajectory | None") -> list[str]:
+    if truth is None or (truth.timestamps[0] <= times[-1] and times[0] <= truth.timestamps[-1]):
+        return []
+    return [
+        f"the ground truth ({truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s) is of another time than the "
+        f"images ({times[0]:.3f} to {times[-1]:.3f} s)"
+    ]

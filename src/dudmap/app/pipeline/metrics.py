@@ -1,0 +1,258 @@
+"""Metrics of a run, collected frame by frame."""
+
+import csv
+import io
+import json
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.pipeline.environment import peak_rss_mb
+from dudmap.atomic_file import atomic_file, write_text
+from dudmap.core.objects.moving_objects import MOST_WAITING
+from dudmap.evaluation.segmentation import SCORED_COVERAGE, mask_iou
+
+if TYPE_CHECKING:
+    from dudmap.core.objects.object_tracker import Mover
+    from dudmap.core.result import FrameResult
+    from dudmap.errors import FrameError
+
+
+@dataclass
+class RunRecord:
+    """Metrics of the frames processed so far.
+
+    Attributes:
+        rows: Per processed frame: timestamp, state, total and reading time, and the time of every stage, ms.
+        lost: Timestamp and reason of every lost frame.
+        unreadable: One sentence per frame that could not be read or had another size.
+        checks: Per registered frame, its figures (``core/tracking/checks.py``).
+        repeated: Number of frames that repeat the frame before, its depth or its colour, by what repeats.
+        rejected: Number of frames that were not used for a fault of the stream, by kind; those with a readable image
+            of the right size are lost as well.
+        mask_ious: Intersection over union of the dynamic mask, per frame with sufficient true coverage.
+        movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
+        residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
+        postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
+        fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
+        degenerate: Number of tracked frames with unobservable directions of motion.
+        warnings: Sentences on what looked wrong in the recording before the run.
+        masked: Number of frames with an external mask, None without external masks.
+        dropped: Number of frames dropped by a live run, None otherwise.
+    """
+
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    lost: list[dict[str, Any]] = field(default_factory=list)
+    unreadable: list[str] = field(default_factory=list)
+    checks: list[dict[str, Any]] = field(default_factory=list)
+    repeated: dict[str, int] = field(default_factory=dict)
+    rejected: dict[str, int] = field(default_factory=dict)
+    mask_ious: list[float] = field(default_factory=list)
+    movers: list[str] = field(default_factory=list)
+    residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
+    postponed: "list[tuple[dict[str, Any], FrameResult]]" = field(default_factory=list)
+    fused: int = 0
+    skipped_similar: int = 0
+    relocalized: int = 0
+    corrected: int = 0
+    blind: int = 0
+    uncertain: int = 0
+    degenerate: int = 0
+    warnings: list[str] = field(default_factory=list)
+    masked: int | None = None
+    dropped: int | None = None
+    _wall_start: float = field(default_factory=time.perf_counter)
+    _cpu_start: float = field(default_factory=time.process_time)
+
+    def elapsed(self) -> tuple[float, float]:
+        """Seconds, and seconds of processor time, since the run began."""
+        return time.perf_counter() - self._wall_start, time.process_time() - self._cpu_start
+
+    def continue_from(self, wall_s: float, cpu_s: float) -> None:
+        """Count the time on from that of a process that ended."""
+        self._wall_start, self._cpu_start = time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+    def add(
+        self,
+        result: "FrameResult",
+        total_ms: float,
+        reading_ms: float,
+        mask: NDArray[np.bool_] | None,
+        **delays: float,
+    ) -> None:
+        """Add one processed frame.
+
+        Args:
+            result: Result of the frame.
+            total_ms: Processing time.
+            reading_ms: Reading time.
+            mask: True dynamic mask (H, W), if known.
+            delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
+                arrival to the result, ms.
+        """
+        row: dict[str, Any] = (
+            {
+                "timestamp": f"{result.timestamp:.6f}",
+                "state": result.state,
+                "fused": int(result.fused),
+                "dynamic_share": round(result.dynamic_share, 4),
+                "reading": round(reading_ms, 3),
+                "total": round(total_ms, 3),
+            }
+            | {key: round(value, 3) for key, value in delays.items()}
+            | {stage: round(ms, 3) for stage, ms in result.timings.items()}
+        )
+        self.rows.append(row)
+        self.fused += result.fused
+        self.skipped_similar += result.skipped_similar
+        self.relocalized += result.relocalized
+        self.corrected += result.corrected
+        self.blind += result.blind
+        self.uncertain += bool(result.uncertain)
+        self.degenerate += len(result.unobservable) > 0
+        if result.rejected:
+            self._reject(result.rejected)
+        if result.repeats:
+            self.repeated[result.repeats] = self.repeated.get(result.repeats, 0) + 1
+        if result.checks:
+            known = {name: float(f"{figure:.4g}") for name, figure in result.checks.items() if np.isfinite(figure)}
+            self.checks.append({"timestamp": f"{result.timestamp:.6f}", "state": result.state} | known)
+        if result.state == "lost":
+            self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
+        self.postponed.append((row, result))
+        if self.dropped is None or len(self.postponed) > MOST_WAITING:
+            self.catch_up()
+        if result.labels is not None:
+            self.residuals = self.residuals + result.labels.histogram
+        if mask is not None and mask.mean() > SCORED_COVERAGE:
+            self.mask_ious.append(mask_iou(result.dynamic_mask, mask))
+
+    def catch_up(self) -> bool:
+        """Add the moving objects of the first frame that lacks them; returns whether one did."""
+        if not self.postponed:
+            return False
+        (row, result), start = self.postponed.pop(0), time.perf_counter()
+        if result.movers:
+            line = {"timestamp": result.timestamp, "movers": [_row(mover) for mover in result.movers]}
+            self.movers.append(json.dumps(line))
+        row["movers"] = round(1000 * (time.perf_counter() - start), 3)
+        return True
+
+    def _complete(self) -> None:
+        while self.catch_up():
+            pass
+
+    def skip(self, error: "FrameError") -> None:
+        """Count a frame that cannot be read or used."""
+        self.unreadable.append(str(error))
+        self._reject(error.kind)
+
+    def _reject(self, kind: str) -> None:
+        self.rejected[kind] = self.rejected.get(kind, 0) + 1
+
+    def save_timings(self, path: Path) -> None:
+        """Write a CSV file with one row per processed frame and one column per stage, milliseconds."""
+        self._complete()
+        _write_table(path, self.rows, "0")
+
+    def save_checks(self, path: Path) -> None:
+        """Write a CSV file with one row per registered frame and one column per figure; empty where it is not known."""
+        _write_table(path, self.checks, "")
+
+    def save_movers(self, path: Path) -> None:
+        """Write JSON lines, one per frame with moving objects."""
+        self._complete()
+        write_text(path, "".join(f"{line}\n" for line in self.movers))
+
+    def save_residuals(self, path: Path) -> None:
+        """Write an NPZ file with the histogram of all residuals and the mixture fitted to it, if there are any.
+
+        ``edges`` (BINS + 1,) in standard deviations of the reading, ``counts`` (BINS,), ``prior`` (2,) and ``sigma``
+        (2,) of the static and the dynamic half-normal density (thesis eq. 4.56).
+        """
+        from dudmap.core.backends.cpu.evidence import EDGES
+        from dudmap.core.dynamics.mixture import fit_mixture
+
+        if not self.residuals.any():
+            return
+        mixture = fit_mixture(self.residuals, EDGES)
+        with atomic_file(path) as file:
+            np.savez(file, edges=EDGES, counts=self.residuals, prior=mixture.prior, sigma=mixture.sigma)
+
+    def metrics(self) -> dict[str, Any]:
+        """Counts and times of all frames, under the keys of metrics.json."""
+        totals = np.array([row["total"] for row in self.rows] or [np.nan])
+        readings = np.array([row["reading"] for row in self.rows] or [np.nan])
+        return {
+            "frames": len(self.rows) + len(self.unreadable),
+            "tracked": sum(row["state"] == "tracked" for row in self.rows),
+            "repeated": sum(row["state"] == "repeated" for row in self.rows),
+            "fused": self.fused,
+            "skipped_similar": self.skipped_similar,
+            "lost": len(self.lost),
+            "relocalized": self.relocalized,
+            "corrected": self.corrected,
+            "blind": self.blind,
+            "uncertain": self.uncertain,
+            "degenerate": self.degenerate,
+            "unreadable": len(self.unreadable),
+            "frames_rejected": dict(sorted(self.rejected.items())),
+            "images_repeated": dict(sorted(self.repeated.items())),
+            "ms_per_frame_median": _number(np.median(totals)),
+            "ms_per_frame_p95": _number(np.percentile(totals, 95)),
+            "ms_reading_median": _number(np.median(readings)),
+            "wall_s": round(time.perf_counter() - self._wall_start, 3),
+            "cpu_s": round(time.process_time() - self._cpu_start, 3),
+            "peak_rss_mb": peak_rss_mb(),
+            "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
+            "warnings": self.warnings,
+            "lost_frames": self.lost,
+            "unreadable_frames": self.unreadable,
+        } | self._occasional()
+
+    def _occasional(self) -> dict[str, Any]:
+        """Metrics of runs with masks and of live runs."""
+        out: dict[str, Any] = {}
+        if self.masked is not None:
+            out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
+        if self.mask_ious:
+            out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
+        if self.dropped is not None:
+            latencies = np.array([row["latency"] for row in self.rows] or [np.nan])
+            out |= {
+                "dropped": self.dropped,
+                "latency_ms_median": _number(np.median(latencies)),
+                "latency_ms_p95": _number(np.percentile(latencies, 95)),
+            }
+        return out
+
+
+def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:
+    """Write a CSV file of rows with different columns."""
+    text = io.StringIO(newline="")
+    writer = csv.DictWriter(text, list(dict.fromkeys(key for row in rows for key in row)), restval=missing)
+    writer.writeheader()
+    writer.writerows(rows)
+    write_text(path, text.getvalue())
+
+
+def _row(mover: "Mover") -> dict[str, Any]:
+    """JSON object of a moving object: metres, m/s, world frame."""
+    return {
+        "id": mover.id,
+        "centroid": mover.centroid.round(4).tolist(),
+        "box": mover.box.round(4).tolist(),
+        "velocity": mover.velocity.round(4).tolist(),
+        "speed": round(mover.speed, 4),
+        "age": round(mover.age, 4),
+        "pixels": int(np.count_nonzero(mover.mask)),
+    }
+
+
+def _number(value: float | np.floating, digits: int = 3) -> float | None:
+    """Rounded number for JSON; None for NaN."""
+    return round(float(value), digits) if np.isfinite(value) else None

@@ -1,0 +1,125 @@
+"""Terminal output of a run: a progress bar and a summary table."""
+
+import time
+from collections import deque
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+from rich.text import Text
+
+from dudmap.app.terminal import plain_console
+
+if TYPE_CHECKING:
+    from dudmap.core.result import FrameResult
+
+
+class RunProgress:
+    """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
+
+    Losses of tracking and unreadable frames are reported, once per gap, even without the bar.
+
+    Args:
+        total: Number of frames, None if it is not known.
+        bar: Show the bar if stderr is a terminal.
+    """
+
+    def __init__(self, total: int | None, *, bar: bool = True) -> None:
+        self.console = plain_console(stderr=True)
+        self._bar = Progress(
+            TextColumn("frame"),
+            MofNCompleteColumn(),
+            BarColumn(),
+            TextColumn("{task.fields[fps]:5.1f} fps"),
+            TextColumn("{task.fields[dynamic]:4.0%} dynamic"),
+            TextColumn("{task.fields[state]}"),
+            TimeRemainingColumn(),
+            console=self.console,
+            disable=not (bar and self.console.is_terminal),
+        )
+        self._task = self._bar.add_task("run", total=total, fps=0.0, dynamic=0.0, state="starting")
+        self._times: deque[float] = deque(maxlen=30)
+        self._lost = 0
+        self._said: set[str] = set()
+
+    def __enter__(self) -> "RunProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._bar.stop()
+
+    def frame(self, index: int, result: "FrameResult", dropped: int | None = None) -> None:
+        """Show a processed frame and the number of frames that a live run has dropped so far."""
+        if result.state == "lost":
+            if self._lost == 0:
+                self.note(f"frame {index}: lost, {result.lost_reason}")
+            self._lost += 1
+        elif self._lost:
+            self.note(f"frame {index}: tracked again, {self._lost} lost")
+            self._lost = 0
+        self._times.append(time.perf_counter())
+        seconds = self._times[-1] - self._times[0]
+        state = f"[{'red' if result.state == 'lost' else 'green'}]{result.state}[/]"
+        if dropped:
+            state += f", {dropped} dropped"
+        self._bar.update(
+            self._task,
+            completed=index + 1,
+            fps=(len(self._times) - 1) / seconds if seconds > 0 else 0.0,
+            dynamic=result.dynamic_share,
+            state=state,
+        )
+
+    def note(self, sentence: str) -> None:
+        """Print a sentence above the bar."""
+        self.console.print(sentence, style="yellow", soft_wrap=True)
+
+    def once(self, sentence: str) -> None:
+        """Print a sentence above the bar unless it was printed before."""
+        if sentence not in self._said:
+            self._said.add(sentence)
+            self.note(sentence)
+
+    def working(self, what: str) -> None:
+        """Show an activity other than the processing of a frame."""
+        self._bar.update(self._task, state=what)
+
+
+def summary(metrics: dict[str, Any]) -> Table:
+    """Table of the metrics of a run."""
+    table = Table(title=str(metrics["sequence"]), show_header=False, title_justify="left")
+    table.add_column(style="bold")
+    table.add_column(justify="right")
+    counts = "tracked", "repeated", "fused", "skipped_similar", "lost", "unreadable"
+    table.add_row("frames", str(metrics["frames"]))
+    for key in counts:
+        value = metrics[key]
+        bad = key in ("lost", "unreadable") and value
+        table.add_row(f"  {key.replace('_', ' ')}", Text(str(value), "red" if bad else ""))
+    if "dropped" in metrics:
+        table.add_row("  dropped", str(metrics["dropped"]))
+        table.add_row("latency, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))
+        table.add_row("latency, 95th percentile", _text(metrics["latency_ms_p95"], "{:.1f} ms"))
+    table.add_row("time per frame, median", _text(metrics["ms_per_frame_median"], "{:.1f} ms"))
+    table.add_row("time per frame, 95th percentile", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
+    table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))
+    table.add_row("map", _text(metrics["map_bytes"], "{:.1f} MB", 1e-6))
+    table.add_row("mesh", f"{metrics['mesh_triangles']} triangles")
+    if "bodies" in metrics:
+        rigid = sum(body["rigid"] for body in metrics["bodies"])
+        table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
+    if "ate_rmse_m" in metrics:
+        table.add_row("ATE RMSE", _text(metrics["ate_rmse_m"], "{:.2f} cm", 100))
+        table.add_row("RPE RMSE, translation", _text(metrics["rpe_trans_rmse_m_per_s"], "{:.2f} cm/s", 100))
+        table.add_row("RPE RMSE, rotation", _text(metrics["rpe_rot_rmse_deg_per_s"], "{:.2f} deg/s"))
+    if "mask_iou_mean" in metrics:
+        table.add_row("mask IoU", _text(metrics["mask_iou_mean"], "{:.3f}"))
+    return table
+
+
+def _text(value: float | None, form: str, factor: float = 1.0) -> str:
+    return "unknown" if value is None else form.format(value * factor)

@@ -1,0 +1,390 @@
+"""Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
+
+import time
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import ExitStack, closing, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from dudmap.app.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
+from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
+from dudmap.app.pipeline.storing import RunState, RunStore, Storing, restored
+from dudmap.app.state.database import StateReader
+from dudmap.config import Config
+from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.io.sequences import is_timed
+
+if TYPE_CHECKING:
+    from dudmap.app.pipeline.observer import RunObserver
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.places.saved_map import SavedMap
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
+    from dudmap.io.sequences import Sequence
+    from dudmap.io.sequences.masks import MaskFolder
+
+
+def run(
+    sequence: "Sequence",
+    config: Config,
+    out: str | Path,
+    *,
+    max_frames: int | None = None,
+    save_masks: bool = False,
+    save_map: bool = True,
+    masks: str | Path | None = None,
+    progress: bool = True,
+    ahead: int = AHEAD,
+    live: bool = False,
+    passes: int = 1,
+    depth_model: str | Path | None = None,
+    calibration: "Calibration | None" = None,
+    calibrate: bool = False,
+    saved_map: "SavedMap | None" = None,
+    localize: bool = False,
+    max_memory: int | None = None,
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
+    observers: "tuple[RunObserver, ...]" = (),
+    storing: Storing | None = None,
+    warnings: Iterable[str] = (),
+) -> RunReport:
+    """Run the system over a recording and write a run folder.
+
+    The folder receives trajectory.txt (TUM format, one line per tracked frame), mesh.ply, map.npz and keyframes.npz
+    (what a later run needs to go on in the map), config.toml,
+    metrics.json, timings.csv, residuals.npz (histogram of the residuals and the mixture fitted to it), movers.jsonl
+    (one JSON object per frame with moving objects: timestamp, and per object id, centroid, box, velocity, speed and
+    pixels; metres, m/s, world frame), groundtruth.txt if the true trajectory is known, masks/<timestamp>.png (255 =
+    dynamic) with ``save_masks``, and movers/<id>.ply and .txt, mesh and poses of every rigid moving object, with
+    ``movers.meshes``. Submaps that could not be merged with the largest one are written as trajectory-2.txt and
+    mesh-2.ply and so on, each in its own world frame. Results of an earlier run in the same folder are removed first.
+    If the run is interrupted or fails, the results up to there are written. With ``storing`` the folder also holds
+    state.db until the run is finished, from which ``dudmap.app.pipeline.resume.resume`` continues it.
+
+    Args:
+        sequence: The recording; its ground truth and masks are used for evaluation only.
+        config: All parameters.
+        out: The run folder; created if needed.
+        max_frames: Process only this many frames.
+        save_masks: Write the dynamic mask of every frame.
+        save_map: Write map.npz and keyframes.npz.
+        masks: Folder of external dynamic masks, <timestamp>.png with 255 = dynamic, which are added to the estimated
+            ones. Frames with and without a mask are counted.
+        progress: Show a progress bar on a terminal.
+        ahead: Number of frames read ahead of the processed one; 0 for rendered frames, whose reading uses all cores and
+            would distort the times. The result does not depend on it.
+        live: Replay the recording in real time once the kernels are loaded; frames for which there is no time are
+            dropped and counted.
+        passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
+            first, so that objects that were in view from the start also leave the map. The last complete pass is
+            written.
+        depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
+        calibration: Of the colour camera; None takes that of the recording.
+        calibrate: Estimate the calibration from the start of the recording first.
+        saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
+        localize: Only find the camera in ``saved_map``; no map and no mesh is written.
+        max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
+            wait on disk. None keeps the whole map in memory. It changes no result.
+        observe: Called after each processed frame with its number, what was read, and the result.
+        observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
+        storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
+        warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
+
+    Raises:
+        ConfigError: ``passes`` is not 1 or 2, or 2 with ``live`` or ``saved_map``; ``localize`` without a
+            ``saved_map``; ``storing`` with ``live``.
+        DudmapError: Another process writes into the folder, it cannot be written, the recording cannot be used, or no
+            frame could be tracked.
+        KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
+    """
+    from dudmap.app.pipeline.calibration import calibrate_start
+    from dudmap.core.calibration.depth_model import DepthModel
+    from dudmap.core.map.memory_limit import MemoryLimit
+    from dudmap.core.slam import Slam
+
+    out = Path(out)
+    count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
+    if count < 1:
+        raise DatasetError(
+            f"{sequence.name} has {len(sequence)} frames and {max_frames} are wanted; expected one or more"
+        )
+    if passes not in (1, 2) or (live and passes == 2):
+        raise ConfigError(
+            f"found passes = {passes}{' of a live run' if live else ''}; expected 1, or 2 without live replay"
+        )
+    if saved_map is None and localize:
+        raise ConfigError("there is nothing to localize in; name the run folder of a saved map (--map)")
+    if max_memory is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a memory limit, but two passes need two maps; expected 1 pass")
+    if saved_map is not None and passes == 2:
+        raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
+    if storing is not None and live:
+        raise ConfigError("a live replay cannot be stored: it does not stop for what is missed; drop live or storing")
+    with locked(out):
+        given_masks = None if masks is None else _open_masks(masks, sequence)
+        model = None if depth_model is None else DepthModel.load(Path(depth_model))
+        prepare_run_folder(out, masks, save_masks=save_masks)
+        display = RunProgress(count * passes, bar=progress)
+        store = None
+        if storing is not None:
+            store = RunStore(out, storing.every, display.note)
+            options = {
+                "recording": storing.recording, "report": storing.report, "every": storing.every, "count": count,
+                "masks": None if masks is None else str(Path(masks).resolve()), "save_masks": save_masks,
+                "save_map": save_map, "ahead": ahead, "passes": passes, "config": config.model_dump_json(),
+                "max_memory": max_memory, "localize": localize,
+                "saved_map": None if saved_map is None else str(saved_map.folder.resolve()),
+                "depth_model": None if depth_model is None else str(Path(depth_model).resolve()),
+            }  # fmt: skip
+            store.order(sequence, options)
+        if calibrate:
+            calibration = calibrate_start(sequence, config, count, display.note if progress else None)
+        calibration = calibration or sequence.calibration
+        slam = Slam(
+            sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
+            localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
+            timed=is_timed(sequence),
+        )  # fmt: skip
+        record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
+        state = RunState(slam, record, calibration, model)
+        if store is not None:
+            store.begin(state)
+        job = Job(
+            sequence, config, out, count, display, given_masks, save_masks, save_map, ahead, live, passes, observe,
+            observers,
+        )  # fmt: skip
+        return job.carry_out(state, store)
+
+
+@dataclass(frozen=True, eq=False)
+class Job:
+    """A run as it was ordered; for the attributes see ``run``."""
+
+    sequence: "Sequence"
+    config: Config
+    out: Path
+    count: int
+    display: RunProgress
+    masks: "MaskFolder | None" = None
+    save_masks: bool = False
+    save_map: bool = True
+    ahead: int = AHEAD
+    live: bool = False
+    passes: int = 1
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None
+    observers: "tuple[RunObserver, ...]" = ()
+
+    def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
+        """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
+        out, display, stopped, defect = self.out, self.display, "", False
+        with ExitStack() as files, display:
+            try:
+                if self.live:
+                    display.working("loading kernels")
+                    load_kernels(self._system(state, None), self.sequence, self.count)
+                try:
+                    self._process(state, store)
+                except DeviceError as error:
+                    if store is None:
+                        raise
+                    display.note(f"{error}; the run goes on on the CPU")
+                    state, store = files.enter_context(self._from_checkpoint(state, store))
+                    self._process(state, store)
+                if len(state.slam.maps) > 1:
+                    display.note(_unmerged_submaps(state.slam))
+                if state.record.repeated:
+                    display.note(_repeats(state.record))
+                if state.record.degenerate:
+                    display.note(f"{state.record.degenerate} frames do not show all directions of motion: not fused")
+                if state.record.dropped:
+                    display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
+            except KeyboardInterrupt:
+                stopped = f"interrupted after {len(state.record.rows)} frames{_of_second(state.finished)}"
+                raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+            except DudmapError as error:
+                stopped = str(error)
+                raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
+            except BaseException as error:
+                stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
+                raise
+            finally:
+                report = self._finish(state, store, stopped, defect=defect)
+        record = state.record
+        if record.rows and not len(report.trajectory):
+            raise DudmapError(
+                f"none of the {self.count} frames could be tracked; the first: {record.lost[0]['reason']}"
+            )
+        if not record.rows:
+            raise DatasetError(f"none of the {self.count} frames could be read; the first: {record.unreadable[0]}")
+        return report
+
+    def _process(self, state: RunState, store: RunStore | None) -> None:
+        """Process the frames of all passes that are left."""
+        for number in range(state.number, self.passes):
+            if number > state.number:
+                state.finished = state.slam, state.record
+                masked = state.record.masked and 0
+                state.slam = self._system(state, state.slam)
+                state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
+                state.number, state.next = number, 0
+            last = number == self.passes - 1
+            for observer in self.observers:
+                if state.next:
+                    observer.resume(state.slam, self.out, self.count, state.next)
+                else:
+                    observer.start(state.slam, self.out, self.count)
+            with closing(
+                in_real_time(self.sequence, self.count, self.masks, state.slam, state.record.catch_up)
+                if self.live
+                else in_order(self.sequence, self.count, self.ahead, self.masks, state.slam, state.next)
+            ) as frames:
+                for frame in frames:
+                    process_source(
+                        frame,
+                        state.slam,
+                        state.record,
+                        self.display,
+                        self.out if self.save_masks and last else None,
+                        self.observe if last else None,
+                        self.observers,
+                    )
+                    state.next = frame.number + 1
+                    if store is not None:
+                        store.frame(state, frame.read.frame)
+        if store is not None:
+            store.end(state)
+
+    @contextmanager
+    def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
+        """Where the run stood at its last checkpoint, from which it goes on on the CPU."""
+        from dudmap.core.slam import Slam
+
+        store.close(finished=False)
+        with closing(StateReader(store.database.path)) as reader:
+            store = store.reopened()
+            limit, timed = state.slam.max_blocks, state.slam.motion.timed
+            systems = (Slam(self.sequence.camera, self.config, max_blocks=limit, timed=timed) for _ in range(2))
+            old, state = state, restored(reader, store, *systems)
+            self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")
+            yield state, store
+
+    def _system(self, state: RunState, first_pass: "Slam | None") -> "Slam":
+        """A new system for this recording."""
+        from dudmap.core.slam import Slam
+
+        return Slam(
+            self.sequence.camera, self.config, first_pass=first_pass, depth_model=state.model,
+            calibration=state.calibration, timed=is_timed(self.sequence),
+        )  # fmt: skip
+
+    def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
+        """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
+        self.display.working("writing")
+        slam, record = state.slam, state.record
+        if stopped and state.finished is not None:  # the first pass is complete, the second is not
+            slam, record = state.finished
+        complete = False
+        try:
+            report = write_run_folder(
+                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map, defect=defect
+            )
+            for observer in self.observers:
+                observer.finish(self.out)
+            complete = not stopped
+        finally:
+            if store is not None:
+                store.close(finished=complete)
+        return report
+
+
+def _unmerged_submaps(slam: "Slam") -> str:
+    """Sentence on the submaps that could not be merged."""
+    main, *others = (len(trajectory) for trajectory, _ in slam.maps)
+    names = " and ".join(f"mesh-{number}.ply ({count} frames)" for number, count in enumerate(others, start=2))
+    return f"{len(others)} submap(s) could not be merged: the main map has {main} frames; the others are {names}"
+
+
+def _repeats(record: RunRecord) -> str:
+    """Sentence on the frames that repeat images of the frame before."""
+    what = {
+        "frame": "{} both images (they have the pose of the frame before)",
+        "depth": "{} the depth image (their poses are interpolated)",
+        "color": "{} the colour image (tracked by distances alone, not fused)",
+    }
+    counts = ", ".join(text.format(record.repeated[kind]) for kind, text in what.items() if kind in record.repeated)
+    return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
+
+
+def _of_second(finished: object) -> str:
+    return " of the second pass" if finished else ""
+
+
+def _saved(finished: object) -> str:
+    whole = "the trajectory and the map of the first pass are"
+    return whole if finished else "the trajectory and the map up to there are"
+
+
+def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
+    from dudmap.io.sequences.masks import MaskFolder
+
+    return MaskFolder(folder, sequence.timestamps, sequence.camera)
+
+
+def process_source(
+    source: SourceFrame,
+    slam: "Slam",
+    record: RunRecord,
+    display: RunProgress,
+    mask_folder: Path | None,
+    observe: "Callable[[int, FrameRead, FrameResult], None] | None",
+    observers: "tuple[RunObserver, ...]" = (),
+) -> None:
+    """Process one frame, count it, save its mask, and report it."""
+    index, read = source.number, source.read
+    if record.dropped is not None:
+        record.dropped += source.dropped
+    if isinstance(read.frame, FrameError):
+        record.skip(read.frame)
+        display.note(f"skipped: {read.frame}")
+        for observer in observers:
+            observer.event("unreadable", frame=index, reason=str(read.frame))
+        return
+    true_mask = read.true_mask
+    if isinstance(true_mask, FrameError):
+        display.note(f"frame {index}: the true mask is not scored, {true_mask}")
+        true_mask = None
+    given_mask = read.given_mask
+    if isinstance(given_mask, FrameError):
+        display.note(f"frame {index}: the given mask is ignored, {given_mask}")
+        given_mask = None
+    start = time.perf_counter()
+    frame = read.prepared or read.frame
+    try:
+        result = slam.process(frame) if given_mask is None else slam.process(frame, given_mask)
+    except FrameError as error:
+        record.skip(error)
+        display.note(f"skipped: {error}")
+        return
+    end = time.perf_counter()
+    if record.masked is not None:
+        record.masked += given_mask is not None
+    delays = {} if source.arrival is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
+    record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
+    if mask_folder is not None and not result.rejected:
+        try:
+            save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
+        except OSError as error:
+            display.once(f"masks cannot be written: {error}; make room on the disk of the run folder")
+    if observe is not None:
+        observe(index, read, result)
+    for observer in observers:
+        try:
+            observer.frame(index, read, result, 1000 * (end - start))
+        except OSError as error:
+            display.once(f"images for the report cannot be written: {error}; make room on the disk of the run folder")
+    if result.calibrated:
+        display.note(f"frame {index}: the colour camera is calibrated ({', '.join(slam.calibration.estimated)})")
+    display.frame(index, result, record.dropped)

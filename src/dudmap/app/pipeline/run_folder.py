@@ -1,0 +1,235 @@
+"""The run folder: creation, cleaning and writing of all result files."""
+
+import json
+import os
+import re
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.pipeline.environment import machine, versions
+from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.pipeline.storing import FILES as STATE_FILES
+from dudmap.app.state.run_lock import RunLock
+from dudmap.atomic_file import UNFINISHED, write_bytes, write_text
+from dudmap.config import Config
+from dudmap.core.geometry.mesh_pieces import save_pieces
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DudmapError, MapError
+from dudmap.evaluation.trajectory import accuracy
+from dudmap.io.sequences import is_recording
+from dudmap.own_folder import OwnFolder, make_folder, remove_files
+
+if TYPE_CHECKING:
+    from dudmap.core.objects.object_map import RigidObject
+    from dudmap.core.slam import Slam
+    from dudmap.io.cameras import LiveCamera
+    from dudmap.io.sequences import Sequence
+
+FILES = (
+    "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
+    "checks.csv", "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz",
+    "merge.json", "report.html",
+)  # fmt: skip
+PROBE = ".dudmap-probe"
+"""File that is made and removed to see whether the folder can be written."""
+SCORES = (
+    "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
+    "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
+)  # fmt: skip
+"""Files of `dudmap evaluate` in a run folder."""
+WRITTEN = {
+    "": "|".join((
+        *map(re.escape, FILES + SCORES + STATE_FILES), r"trajectory-\d+\.txt", r"mesh-\d+\.ply", r"crash-[\d-]+\.txt",
+    )),
+    "masks": r"-?\d+\.\d{6}\.png", "movers": r"\d+\.(ply|txt)", "thumbnails": r"-?\d+\.\d{6}\.[a-z]+\.jpg",
+}  # fmt: skip
+"""Names of all files of a run by sub-folder, as regular expressions; a run removes them, and no others, first."""
+
+
+@dataclass(frozen=True, eq=False)
+class RunReport:
+    """Result of a run.
+
+    Attributes:
+        out: The run folder.
+        metrics: Content of metrics.json.
+        trajectory: Poses of all tracked frames.
+    """
+
+    out: Path
+    metrics: dict[str, Any]
+    trajectory: Trajectory
+
+
+def save_mask(path: Path, mask: NDArray[np.bool_]) -> None:
+    """Write a mask (H, W) as an image, 255 = dynamic. A checkpoint waits until it is on the disk, not every frame."""
+    import cv2
+
+    write_bytes(path, cv2.imencode(".png", mask.astype(np.uint8) * 255)[1].tobytes(), sync=False, own=True)
+
+
+@contextmanager
+def locked(out: Path) -> Iterator[None]:
+    """Keep other processes from writing into the run folder, which is created if needed.
+
+    What a process that was killed has left half written is removed.
+
+    Raises:
+        DudmapError: Another process writes into the folder, or it cannot be created or written.
+    """
+    with _writing_into(out):
+        out.mkdir(parents=True, exist_ok=True)
+        lock = RunLock(out)
+    with lock:
+        with _writing_into(out):
+            remove_files(out, dict.fromkeys(WRITTEN, UNFINISHED))
+        yield
+
+
+@contextmanager
+def _writing_into(out: Path) -> Iterator[None]:
+    """Say that it is the run folder that cannot be written.
+
+    Raises:
+        DudmapError: Instead of any error of the operating system.
+    """
+    try:
+        yield
+    except OSError as error:
+        raise DudmapError(f"cannot write into the run folder {out}: {error.strerror or error}") from error
+
+
+def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
+    """Create the run folder, check that it is writable, and remove the results of an earlier run.
+
+    Raises:
+        DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
+    """
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or (out.is_dir() and is_recording(out)):
+        raise DudmapError(
+            f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
+        )
+    if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
+        raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
+    with _writing_into(out):
+        out.mkdir(parents=True, exist_ok=True)
+        with OwnFolder(out, linked=True) as folder:
+            os.close(folder.create(PROBE))
+            folder.remove(PROBE)
+        remove_files(out, WRITTEN)
+        if save_masks:
+            make_folder(out / "masks")
+
+
+def write_run_folder(
+    out: Path,
+    slam: "Slam",
+    record: RunRecord,
+    sequence: "Sequence | LiveCamera",
+    config: Config,
+    stopped: str,
+    *,
+    save_map: bool,
+    defect: bool = False,
+) -> RunReport:
+    """Write all files of the run folder; a file that fails does not prevent the others.
+
+    After a defect of dudmap itself, what cannot be made of the state that it left is listed under ``not_written`` in
+    metrics.json, so that the error is not replaced by another one.
+
+    Raises:
+        DudmapError: A file could not be written, other than after a defect.
+    """
+    foreseen = Exception if defect else (OSError, MapError)
+    (trajectory, volume), *others = slam.maps
+    metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
+    metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
+    metrics |= record.metrics()
+    sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
+    metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
+    metrics["maps"] = len(others) + 1
+    noise = slam.depth_noise.fitted()
+    metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
+    calibration = slam.calibration
+    metrics["calibration"] = calibration.tree()
+
+    def save_mesh() -> None:
+        if volume.pager is not None:  # the mesh may not fit into the memory either
+            vertices, triangles = save_pieces(volume.extract_pieces(), out / "mesh.ply")
+        else:
+            mesh = volume.extract_mesh()
+            vertices, triangles = len(mesh.vertices), len(mesh.faces)
+            mesh.save(out / "mesh.ply")
+        metrics.update(mesh_vertices=vertices, mesh_triangles=triangles)
+
+    def save_metrics() -> None:
+        if sequence.ground_truth is not None:
+            metrics.update(accuracy(trajectory, sequence.ground_truth))
+        metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
+        metrics["device"] = slam.device
+        metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
+        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+
+    steps: list[Callable[[], None]] = [
+        lambda: trajectory.save(out / "trajectory.txt"),
+        lambda: config.save(out / "config.toml"),
+        lambda: calibration.save(out / "calibration.toml"),
+        lambda: record.save_timings(out / "timings.csv"),
+        lambda: record.save_checks(out / "checks.csv"),
+        lambda: record.save_residuals(out / "residuals.npz"),
+        lambda: record.save_movers(out / "movers.jsonl"),
+    ]
+    if sequence.ground_truth is not None:
+        truth = sequence.ground_truth
+        steps.append(lambda: truth.save(out / "groundtruth.txt"))
+    if not (volume.is_empty or slam.localize):
+        steps.append(save_mesh)
+        if save_map:
+            steps.append(lambda: volume.save(out / "map.npz"))
+            steps.append(lambda: slam.saved_map.save_keyframes(out / "keyframes.npz"))
+    for number, (path, part) in enumerate(others, start=2):
+        steps += [
+            partial(path.save, out / f"trajectory-{number}.txt"),
+            lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
+        ]
+    if config.sensor.distortion:
+        model = slam.learnt_depth_model()
+        metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
+        steps.append(lambda: model.save(out / "depth_model.npz"))
+    if config.movers.meshes:
+        steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
+    problems = []
+    try:
+        for step in steps:
+            try:
+                step()
+            except foreseen as error:
+                problems.append(str(error) or repr(error))
+    finally:
+        if problems:
+            metrics["not_written"] = problems
+        save_metrics()
+    if problems and not defect:
+        raise DudmapError(f"the run folder {out} is incomplete: {problems[0]}")
+    return RunReport(out, metrics, trajectory)
+
+
+def _save_objects(folder: Path, objects: "list[RigidObject]") -> list[dict[str, Any]]:
+    """Write mesh and trajectory of every rigid object; returns the entries of all objects in metrics.json."""
+    out = []
+    for obj in objects:
+        row = {"id": obj.id, "rigid": obj.rigid, "why_not": obj.reason or None, "frames": obj.frames}
+        if obj.mesh is not None and obj.trajectory is not None:
+            make_folder(folder)
+            obj.mesh.save(folder / f"{obj.id}.ply")
+            obj.trajectory.save(folder / f"{obj.id}.txt")
+            row["mesh_triangles"] = len(obj.mesh.faces)
+        out.append(row)
+    return out

@@ -1,0 +1,231 @@
+"""The state of a run in its folder: what is stored, when, and what a continued run finds there."""
+
+import re
+import sqlite3
+from dataclasses import dataclass
+from datetime import datetime
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dudmap.app.pipeline.environment import versions
+from dudmap.app.pipeline.metrics import RunRecord
+from dudmap.app.state import schema
+from dudmap.app.state.checkpoints import Checkpoints
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
+from dudmap.app.state.system import check_code, restore
+from dudmap.errors import DudmapError, StateError
+from dudmap.input_files import DAMAGE, damaged, read_json
+from dudmap.own_folder import remove_files
+
+if TYPE_CHECKING:
+    from collections.abc import Callable
+
+    from dudmap.core.calibration.depth_model import DepthModel
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.slam import Slam
+    from dudmap.io.sequences import Sequence
+
+DATABASE = "state.db"
+OPTIONS = {
+    "recording": dict[str, Any], "report": bool, "every": float | None, "count": int, "masks": str | None,
+    "save_masks": bool, "save_map": bool, "ahead": int, "passes": int, "config": str, "max_memory": int | None,
+    "localize": bool, "saved_map": str | None, "depth_model": str | None,
+}  # fmt: skip
+"""What describes a run, and the types of its values."""
+PLACE = {"pass": int, "next": int, "frame": str}
+"""What says where a run stands, once it has begun."""
+FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
+
+
+@dataclass(frozen=True)
+class Storing:
+    """How a run is stored while it goes on.
+
+    Attributes:
+        recording: Arguments of ``open_sequence``: path, and camera and options as texts.
+        every: Seconds from one checkpoint to the next; None chooses by what they cost.
+        report: Whether a report is made.
+    """
+
+    recording: dict[str, Any]
+    every: float | None = None
+    report: bool = False
+
+
+@dataclass(eq=False)
+class RunState:
+    """Where a run stands.
+
+    Attributes:
+        slam, record: The system and the metrics of the pass that goes on.
+        calibration, model: Of the camera, as given.
+        number: Number of the pass, from 0.
+        next: Number of the frame that comes next.
+        finished: System and metrics of the first pass, during the second.
+    """
+
+    slam: "Slam"
+    record: RunRecord
+    calibration: "Calibration | None" = None
+    model: "DepthModel | None" = None
+    number: int = 0
+    next: int = 0
+    finished: "tuple[Slam, RunRecord] | None" = None
+
+    def tree(self) -> dict[str, Any]:
+        """What is stored of it."""
+        slam, record = self.finished or (None, None)
+        return {
+            "slam": self.slam, "record": self.record, "calibration": self.calibration, "model": self.model,
+            "number": self.number, "next": self.next, "finished_slam": slam, "finished_record": record,
+            "clocks": [list(one.elapsed()) for one in (self.record, record) if one is not None],
+        }  # fmt: skip
+
+    @classmethod
+    def of_tree(cls, tree: dict[str, Any]) -> "RunState":
+        """The state that ``tree`` described."""
+        slam, record = tree["finished_slam"], tree["finished_record"]
+        for one, clock in zip([tree["record"], record], tree["clocks"], strict=False):
+            one.continue_from(*clock)
+        finished = None if slam is None else (slam, record)
+        calibration, model = tree["calibration"], tree["model"]
+        return cls(tree["slam"], tree["record"], calibration, model, tree["number"], tree["next"], finished)
+
+
+class RunStore:
+    """Stores the state of a run in its folder.
+
+    Args:
+        out: The run folder, locked by this process.
+        every: Seconds from one checkpoint to the next; None chooses by what they cost.
+        notice: Receives sentences on what cannot be stored.
+
+    Raises:
+        DudmapError: The database cannot be created.
+    """
+
+    def __init__(self, out: Path, every: float | None, notice: "Callable[[str], None]") -> None:
+        try:
+            self.database = StateDatabase(out / DATABASE)
+        except (OSError, sqlite3.Error) as error:
+            raise DudmapError(f"the state of the run cannot be stored in {out / DATABASE}: {error}") from error
+        self.checkpoints = Checkpoints(self.database, every, notice)
+        self._out, self._every, self._notice = out, every, notice
+
+    def order(self, sequence: "Sequence", options: dict[str, Any]) -> None:
+        """Store what the run is, before anything that takes time.
+
+        Args:
+            sequence: The recording.
+            options: Everything else that a continued run needs, as plain values.
+
+        Raises:
+            DudmapError: It cannot be written.
+        """
+        about = {"options": options, "recording": recording_fingerprint(sequence), "code": code_fingerprint()}
+        times = {"versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
+        try:
+            self.database.write_meta(about | times)
+        except sqlite3.Error as error:
+            raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
+
+    def begin(self, state: RunState) -> None:
+        """Store the state before the first frame."""
+        self.checkpoints.take(state.tree(), {"pass": 0, "next": 0, "frame": ""}, wait=True)
+
+    def frame(self, state: RunState, frame: "Frame | Exception") -> None:
+        """A frame was processed; take a checkpoint if one is due."""
+        if not isinstance(frame, Exception):
+            self.checkpoints.add_file(self._out / "masks" / f"{frame.timestamp:.6f}.png")
+        if self.checkpoints.is_due:
+            self.checkpoints.take(state.tree(), _position(state, frame))
+
+    def end(self, state: RunState) -> None:
+        """All frames are processed, and the results will be written: store the last state unless the run was short."""
+        if not self.checkpoints.is_short:
+            self.checkpoints.take(state.tree(), {"pass": state.number, "next": state.next, "frame": ""}, wait=True)
+
+    def reopened(self) -> "RunStore":
+        """The same after ``close``, to go on from what is stored."""
+        return RunStore(self._out, self._every, self._notice)
+
+    def close(self, *, finished: bool) -> None:
+        """Close the database, and remove it where the run is finished, so that only its results remain."""
+        self.checkpoints.close()
+        if finished:
+            remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
+
+
+def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
+    """The database of an unfinished run, and what describes the run.
+
+    Raises:
+        StateError: There is none, the run is finished, or another version wrote it.
+    """
+    if not (out / DATABASE).is_file():
+        raise StateError(_why_nothing(out))
+    reader = StateReader(out / DATABASE)
+    meta = reader.meta()
+    if not meta:
+        raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
+    check_code(meta, out / DATABASE)
+    options, begun = meta.get("options"), any(key in meta for key in PLACE)
+    options = options if isinstance(options, dict) and isinstance(meta.get("recording"), str) else {}
+    known = all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
+    if not known or (begun and not all(schema.fits(meta.get(key), kind) for key, kind in PLACE.items())):
+        raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
+    return reader, meta
+
+
+def check_recording(sequence: "Sequence", meta: dict[str, Any], out: Path) -> None:
+    """Check that a recording is the one that a stored run is of.
+
+    Raises:
+        StateError: It is not.
+    """
+    last = meta.get("frame")
+    same = recording_fingerprint(sequence) == meta["recording"]
+    if not same or (last and frame_fingerprint(sequence, meta["next"] - 1) != last):
+        raise StateError(
+            f"the recording {sequence.name} is not as it was when the run in {out} began; bring the old one back, or "
+            "begin anew with dudmap run"
+        )
+
+
+def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") -> RunState:
+    """Where a stored run stands.
+
+    Args:
+        reader: Its database.
+        store: Goes on storing there.
+        slam, other: New systems of the same camera and configuration, one for each pass.
+
+    Raises:
+        StateError: The database is damaged.
+    """
+    current = {"slam": slam, "record": RunRecord(), "finished_slam": other, "finished_record": RunRecord()}
+    tree = restore(reader, current, store.database, slam.device)
+    with damaged(StateError, reader.path):
+        state = RunState.of_tree(tree)
+        if not schema.fits_fields(state):
+            raise ValueError(f"it is no state of a run: {sorted(tree)}")
+        return state
+
+
+def _position(state: RunState, frame: "Frame | Exception") -> dict[str, Any]:
+    """Where a run stands, for everyone who reads the database."""
+    return {"pass": state.number, "next": state.next, "frame": images_fingerprint(frame),
+            "updated": datetime.now().isoformat(" ", "seconds")}  # fmt: skip
+
+
+def _why_nothing(out: Path) -> str:
+    """Sentence on why a folder holds no run that can be continued."""
+    try:
+        metrics = read_json(out / "metrics.json")
+        if metrics["complete"]:
+            return f"the run in {out} is finished ({metrics['frames']} frames); there is nothing to resume"
+    except DAMAGE:
+        pass
+    return f"{out} holds no state of a run ({DATABASE}); expected the folder of an interrupted dudmap run"

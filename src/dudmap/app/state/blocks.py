@@ -1,0 +1,279 @@
+"""Blocks of the maps on their way into the database and back: only those that changed are copied and written."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.map.block_pager import Region
+from dudmap.core.map.block_window import BlockWindow
+from dudmap.core.map.fine_blocks import FineBlocks
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.voxel_blocks import BLOCK, BlockRecords, VoxelBlocks, grown
+from dudmap.errors import StateError
+
+LARGEST_TABLE = 2**26
+"""Largest number of places of the hash table of a map: that of 50 million blocks."""
+VOXELS = 2 * BLOCK**3
+"""Words of 32 bits of a block: the geometry of its voxels, then their colours, as in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapSnapshot:
+    """What changed in a map since the last checkpoint.
+
+    Attributes:
+        number: Number of the map in the database.
+        map_id, frame: The map in this process, and its number of fused frames.
+        slots: (n,) int32 slots that were written.
+        keys: (n,) int64 keys of their blocks; -1 for a slot that was released.
+        voxels: (n, VOXELS) int32.
+        away: Number of the content of each region that has left the memory.
+        regions: Those of them that the database lacks.
+    """
+
+    number: int
+    map_id: int
+    frame: int
+    slots: NDArray[np.int32]
+    keys: NDArray[np.int64]
+    voxels: NDArray[np.int32]
+    away: dict[Region, int] = field(default_factory=dict)
+    regions: list[tuple[Region, BlockRecords]] = field(default_factory=list)
+
+
+@dataclass(eq=False)
+class StoredMap:
+    """What is known of a map in the database: its number, the frame that it was stored after, the keys by slot, and the
+    numbers of the contents of its regions."""
+
+    number: int
+    frame: int
+    keys: NDArray[np.int64]
+    regions: dict[Region, int] = field(default_factory=dict)
+
+    def replaced(self, changed: MapSnapshot) -> NDArray[np.int64]:
+        """Keys (n,) that are no longer those of a slot that changed."""
+        known = changed.slots < len(self.keys)
+        old, new = self.keys[changed.slots[known]], changed.keys[known]
+        return old[(old >= 0) & (old != new)]
+
+    def update(self, changed: MapSnapshot) -> None:
+        """Take over what was written."""
+        needed = int(changed.slots.max(initial=-1)) + 1
+        if needed > len(self.keys):
+            grown = np.full(2 * needed, -1, np.int64)
+            grown[: len(self.keys)] = self.keys
+            self.keys = grown
+        self.keys[changed.slots] = changed.keys
+        self.frame, self.regions = changed.frame, changed.away
+
+
+class StoredMaps:
+    """Knows which blocks are in the database as they are in memory.
+
+    Attributes:
+        by_id: The maps in the database by ``TsdfVolume.map_id``.
+    """
+
+    def __init__(self) -> None:
+        self.by_id: dict[int, StoredMap] = {}
+        self._promised: dict[int, int] = {}  # numbers of maps that are not in the database yet
+
+    def snapshot(self, volume: TsdfVolume) -> tuple[dict[str, Any], MapSnapshot]:
+        """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state.
+
+        Raises:
+            StateError: There are too many maps.
+        """
+        stored = self.by_id.get(volume.map_id)
+        if stored is None:
+            number = self._free_number(volume.map_id)
+            slots = volume.active_slots
+        else:
+            number, (slots, _) = stored.number, volume.written_since(stored.frame)
+        blocks = volume.blocks
+        keys = np.where(blocks.entry_of[slots] >= 0, block_keys(number, blocks.slot_coords[slots]), -1)
+        if stored is not None:  # slots that are no longer there since all blocks have left the memory
+            vacated = blocks.num_slots + np.flatnonzero(stored.keys[blocks.num_slots :] >= 0).astype(np.int32)
+            slots, keys = np.append(slots, vacated), np.append(keys, np.full(len(vacated), -1))
+        voxels = np.zeros((len(slots), VOXELS), np.int32)
+        kept = slots[slots < blocks.num_slots]
+        voxels[: len(kept), : VOXELS // 2] = blocks.geometry[kept]
+        voxels[: len(kept), VOXELS // 2 :] = blocks.colors[kept]
+        away, known = {}, {} if stored is None else stored.regions
+        regions = []
+        if volume.pager is not None:
+            away = volume.pager.away()
+            unknown = [region for region, (serial, *_) in away.items() if known.get(region) != serial]
+            regions = [(region, volume.pager.records(region)) for region in unknown]
+        serials = {region: serial for region, (serial, *_) in away.items()}
+        frame = volume.num_integrated
+        changed = MapSnapshot(number, volume.map_id, frame, slots, keys, voxels, serials, regions)
+        return _index(volume) | {"away": _away_rows(away)}, changed
+
+    def commit(self, maps: list[MapSnapshot]) -> None:
+        """The blocks of these maps are in the database, and no other maps."""
+        for changed in maps:
+            self.by_id.setdefault(changed.map_id, StoredMap(changed.number, 0, np.empty(0, np.int64))).update(changed)
+        kept = {changed.map_id for changed in maps}
+        self.by_id = {map_id: stored for map_id, stored in self.by_id.items() if map_id in kept}
+        self._promised = {}
+
+    def add(self, volume: TsdfVolume, number: int) -> None:
+        """A map has been read from the database."""
+        blocks = volume.blocks
+        coords = blocks.slot_coords[: blocks.num_slots]
+        keys = np.where(blocks.entry_of[: blocks.num_slots] >= 0, block_keys(number, coords), -1)
+        regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
+        self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, keys, regions)
+
+    def _free_number(self, map_id: int) -> int:
+        """Number for a map that is not in the database; the same until the next ``commit``."""
+        if map_id not in self._promised:
+            used = {stored.number for stored in self.by_id.values()} | set(self._promised.values())
+            free = next(number for number in range(len(used) + 1) if number not in used)
+            if free >= MAX_MAPS:
+                raise StateError(f"there are more than {MAX_MAPS} maps, which the database cannot hold")
+            self._promised[map_id] = free
+        return self._promised[map_id]
+
+
+def _index(volume: TsdfVolume) -> dict[str, Any]:
+    """Everything of the blocks and the window of a map except the voxels."""
+    window = {"near": volume.window.near, "origin": volume.window.origin}
+    return _index_of(volume.blocks) | window | {"levels": [_fine_index(level) for level in volume.levels]}
+
+
+def _index_of(blocks: VoxelBlocks) -> dict[str, Any]:
+    """Everything of blocks except the voxels."""
+    n, m = blocks.num_entries, blocks.num_slots
+    return {
+        "coords": blocks.coords[:n], "free_count": blocks.free_count[:n], "slot_of": blocks.slot_of[:n],
+        "entry_of": blocks.entry_of[:m], "slot_coords": blocks.slot_coords[:m], "written": blocks.written[:m],
+        "fused": blocks.fused[:m], "released": blocks._released, "table": len(blocks.table),
+    }  # fmt: skip
+
+
+def _fine_index(level: FineBlocks) -> dict[str, Any]:
+    """The same of a finer level, with the voxels: they are few, and are stored as arrays."""
+    m = level.blocks.num_slots
+    voxels = {"geometry": level.blocks.geometry[:m], "colors": level.blocks.colors[:m], "calm": level.calm[:m]}
+    return _index_of(level.blocks) | voxels
+
+
+def _away_rows(away: dict[Region, tuple[int, int, int, int]]) -> NDArray[np.int64]:
+    """Coordinates, number of the content, and numbers of blocks (n, 7) of regions that have left the memory."""
+    return np.array([(*region, *numbers) for region, numbers in away.items()], np.int64).reshape(-1, 7)
+
+
+def restore_map(
+    volume: TsdfVolume,
+    index: dict[str, Any],
+    keys: NDArray[np.int64],
+    slots: NDArray[np.int64],
+    voxels: NDArray,
+    read_region: Callable[[Region], BlockRecords],
+) -> None:
+    """Fill a map, whose other attributes are set.
+
+    Args:
+        volume: The map.
+        index: Its part of the tree.
+        keys, slots, voxels: (n,), (n,), (n, VOXELS) of all its rows in the database.
+        read_region: Reads a region from there that has left the memory.
+
+    Raises:
+        StateError: The rows do not fit the index.
+    """
+    frame_number, left = volume._frame_number, volume._left
+    volume.clear()
+    volume._frame_number, volume._left = frame_number, left
+    owned = _check_index(index)
+    order = np.argsort(slots)
+    number = int(keys[0] >> MAP_SHIFT) if len(keys) else 0
+    if not np.array_equal(slots[order], owned) or not np.array_equal(
+        keys[order], block_keys(number, index["slot_coords"][owned])
+    ):
+        raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
+    blocks = volume.blocks
+    _restore_blocks(blocks, index, paged=volume.pager is not None)
+    blocks.geometry[slots], blocks.colors[slots] = voxels[:, : VOXELS // 2], voxels[:, VOXELS // 2 :]
+    _restore_levels(volume, index["levels"])
+    if volume.pager is not None:
+        away = {(x, y, z): tuple(numbers) for x, y, z, *numbers in index["away"].tolist()}
+        volume.pager.continue_from(away, read_region)
+    _restore_window(volume.window, blocks, index)
+
+
+def _check_index(index: dict[str, Any]) -> NDArray[np.int64]:
+    """Check that the parts of an index fit each other; slots (n,) that own voxels.
+
+    Raises:
+        StateError: They do not.
+    """
+    n, m = len(index["coords"]), len(index["entry_of"])
+    sizes = (len(index["free_count"]), n), (len(index["slot_of"]), n), (len(index["slot_coords"]), m)
+    owned = np.flatnonzero(index["entry_of"] >= 0)
+    if (
+        any(a != b for a, b in (*sizes, (len(index["written"]), m), (len(index["fused"]), m)))
+        or not np.array_equal(index["slot_of"][index["entry_of"][owned]], owned)
+        or not isinstance(index["table"], int)
+        or not 0.8 * min(index["table"], LARGEST_TABLE) >= n
+        or index["table"] > LARGEST_TABLE
+    ):
+        raise StateError("the stored map is damaged: the parts of its index do not fit each other")
+    return owned
+
+
+def _restore_blocks(blocks: VoxelBlocks, index: dict[str, Any], *, paged: bool) -> None:
+    """Fill empty blocks, but for their voxels, with an index; with room for more slots where a map is paged."""
+    n, m = len(index["coords"]), len(index["entry_of"])
+    capacity = max(m, len(blocks.geometry)) if paged else m
+    blocks.num_entries = n
+    blocks.coords, blocks.free_count, blocks.slot_of = index["coords"], index["free_count"], index["slot_of"]
+    for name in ("slot_coords", "written", "fused"):
+        setattr(blocks, name, grown(index[name], capacity, 0))
+    blocks.entry_of, blocks._released = grown(index["entry_of"], capacity, -1), index["released"]
+    blocks.geometry, blocks.colors = (np.zeros((capacity, BLOCK**3), np.int32) for _ in range(2))
+    blocks.use_slots(m)
+    blocks.table = np.full(index["table"], hashing.EMPTY, dtype=np.int32)
+    hashing.rebuild(blocks.table, blocks.coords, n)
+
+
+def _restore_levels(volume: TsdfVolume, indices: list[dict[str, Any]]) -> None:
+    """Fill the finer levels of a map whose coarsest one is complete.
+
+    Raises:
+        StateError: A level does not fit its index or the next coarser one.
+    """
+    parents = volume.blocks
+    for level, index in zip(volume.levels, indices, strict=True):
+        _check_index(index)
+        blocks, m = level.blocks, len(index["entry_of"])
+        _restore_blocks(blocks, index, paged=volume.pager is not None)
+        if {len(index[name]) for name in ("geometry", "colors", "calm")} != {m}:
+            raise StateError("the stored map is damaged: blocks with smaller voxels lack some of them")
+        blocks.geometry[:m], blocks.colors[:m] = index["geometry"], index["colors"]
+        if not np.all(level.link(parents)):
+            raise StateError("the stored map is damaged: blocks with smaller voxels lie in no larger block")
+        level.calm[:m] = index["calm"]
+        parents = blocks
+
+
+def _restore_window(window: BlockWindow, blocks: VoxelBlocks, index: dict[str, Any]) -> None:
+    """Fill the window where it was; the order of the slots in it, in which they are fused, is kept."""
+    if index["origin"] is None:
+        return
+    window.origin = index["origin"]
+    window.cells.fill(-1)
+    cells = window.cells.reshape(tuple(window.shape))
+    inside = np.empty(blocks.num_entries, dtype=np.int32)
+    count = hashing.fill_window(cells, window.origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
+    window.near = index["near"]
+    if not np.array_equal(np.sort(window.near), np.sort(inside[:count])):
+        raise StateError("the stored map is damaged: the blocks around the camera are not those of the map")

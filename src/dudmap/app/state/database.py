@@ -1,0 +1,416 @@
+"""The database of a run: one SQLite file, one transaction per checkpoint.
+
+Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
+frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
+write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
+"""
+
+import hashlib
+import json
+import math
+import sqlite3
+import weakref
+import zlib
+from collections.abc import Iterable, Sequence
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.state.block_keys import MAP_SHIFT
+from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
+from dudmap.app.state.frames import FrameSnapshot, StoredFrames
+from dudmap.app.state.tree import Snapshot, lines
+from dudmap.core.map.block_pager import Region
+from dudmap.core.map.region_store import COLUMNS, blobs_of, records_of
+from dudmap.core.map.voxel_blocks import BlockRecords
+from dudmap.core.places.frame_store import EncodedFrame
+from dudmap.errors import StateError
+from dudmap.input_files import (
+    DAMAGE,
+    LARGEST_FILE,
+    LARGEST_RATIO,
+    LARGEST_TREE,
+    RATIO_FREE_BYTES,
+    SAFE_KINDS,
+    inflated,
+    parse_json,
+)
+from dudmap.own_folder import OwnFolder
+
+APPLICATION = 0x44554453
+"""Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
+SCHEMA = 2
+CHUNK = 1 << 16
+"""Bytes of an array that are stored together; a part that did not change is not written again."""
+STEPS, LIMIT = 10_000, 100_000
+"""Instructions of SQLite between two looks at ctrl-C, and looks after which a statement is ended; a row takes 10 to
+50 instructions."""
+ROWS = 4096
+"""Blocks that are read at once."""
+TABLES = """
+CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
+CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
+CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
+CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
+CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, level INTEGER, crc INTEGER NOT NULL, coords BLOB,
+                      free_count BLOB, owners BLOB, geometry BLOB, colors BLOB, fused BLOB,
+                      PRIMARY KEY (map, x, y, z, level));
+CREATE TABLE frames (store INTEGER, number INTEGER, depth BLOB NOT NULL, color BLOB NOT NULL, mask BLOB NOT NULL,
+                     PRIMARY KEY (store, number));
+"""
+
+
+class StateDatabase:
+    """Writes checkpoints. For one thread at a time.
+
+    Args:
+        path: The file; created with its tables if it does not exist.
+
+    Attributes:
+        maps, frames: Know what is in the database.
+
+    Raises:
+        OSError: The file is a link or anything but a plain file.
+        sqlite3.Error: It cannot be created or opened.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.maps, self.frames = StoredMaps(), StoredFrames()
+        with OwnFolder(path.parent, linked=True) as folder:
+            folder.check(path.name, alone=True)  # it is written in place
+        self._constants: dict[int, tuple[NDArray, list[str]]] = {}  # chunks of an array that never changes
+        self._chunks: set[str] = set()
+        self._connection = sqlite3.connect(path, isolation_level=None, check_same_thread=False, timeout=5)
+        weakref.finalize(self, self._connection.close)
+        self._execute("PRAGMA trusted_schema = OFF")
+        self._execute("PRAGMA journal_mode = WAL")
+        self._execute("PRAGMA synchronous = FULL")  # a commit is on the disk when it returns
+        if not self._execute("SELECT 1 FROM sqlite_master").fetchone():
+            self._connection.executescript(
+                f"BEGIN; PRAGMA application_id = {APPLICATION}; PRAGMA user_version = {SCHEMA}; {TABLES} COMMIT;"
+            )
+        self._chunks = {row[0].hex() for row in self._execute("SELECT key FROM chunks")}
+
+    def write_meta(self, values: dict[str, Any]) -> None:
+        """Set values that describe the run, all of them or none.
+
+        Raises:
+            sqlite3.Error: They cannot be written.
+        """
+        rows = json.dumps({key: json.dumps(value) for key, value in values.items()})
+        self._connection.execute("INSERT OR REPLACE INTO meta SELECT key, value FROM json_each(?)", [rows])
+
+    def write(self, snapshot: Snapshot, meta: dict[str, Any]) -> None:
+        """Store a snapshot that was taken with ``maps`` and ``frames``, as one transaction.
+
+        Raises:
+            sqlite3.Error: It cannot be written; the database holds the checkpoint before.
+        """
+        arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
+        described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays], "records": []}
+        parts = {key: part for _, found in arrays for key, part in found.items()}
+        for records in snapshot.records:
+            one, found = self._described(np.frombuffer(lines(records).encode(), np.uint8), constant=False)
+            described["records"].append(one)
+            parts |= found
+        used = {key for one in described["arrays"] + described["records"] for key in one["chunks"]}
+        tree = zlib.compress(json.dumps(described).encode(), 1)
+        self._execute("BEGIN IMMEDIATE")
+        try:
+            self._write_maps(snapshot.maps)
+            self._write_frames(snapshot.frames)
+            new = ((bytes.fromhex(key), parts[key]) for key in used - self._chunks)
+            self._connection.executemany("INSERT OR IGNORE INTO chunks VALUES (?, ?)", new)
+            old = ((bytes.fromhex(key),) for key in self._chunks - used)
+            self._connection.executemany("DELETE FROM chunks WHERE key = ?", old)
+            self._execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", zlib.crc32(tree), tree)
+            self.write_meta(meta)
+            self._execute("COMMIT")
+        except BaseException:
+            if self._connection.in_transaction:
+                self._execute("ROLLBACK")
+            raise
+        self.maps.commit(snapshot.maps)
+        self.frames.commit(snapshot.frames)
+        self._chunks = used
+        alive = {id(snapshot.arrays[n]) for n in snapshot.constant}
+        self._constants = {key: value for key, value in self._constants.items() if key in alive}
+        self._execute("PRAGMA wal_checkpoint(TRUNCATE)")  # without effect while another process reads
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def _execute(self, statement: str, *values: object) -> sqlite3.Cursor:
+        return self._connection.execute(statement, values)
+
+    def _write_maps(self, maps: list[MapSnapshot]) -> None:
+        run, known = self._connection.executemany, {stored.number: stored for stored in self.maps.by_id.values()}
+        current = {changed.map_id for changed in maps}
+        gone = {stored.number for map_id, stored in self.maps.by_id.items() if map_id not in current}
+        for number in gone:
+            self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
+            self._execute("DELETE FROM regions WHERE map = ?", number)
+        for changed in maps:
+            number, stored = changed.number, known.get(changed.number)
+            if stored is not None:
+                run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
+                back = ((number, *region) for region in stored.regions.keys() - changed.away.keys())
+                run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
+            for region, records in changed.regions:
+                self._execute("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", number, *region)
+                rows = ((number, *region, *row) for row in _region_rows(records))
+                run(f"INSERT INTO regions VALUES ({', '.join('?' * 12)})", rows)
+            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
+
+    def _write_frames(self, frames: list[FrameSnapshot]) -> None:
+        for changed in frames:
+            gone = ((changed.number, serial) for serial in changed.gone)
+            self._connection.executemany("DELETE FROM frames WHERE store = ? AND number = ?", gone)
+            rows = ((changed.number, serial, *parts) for serial, parts in changed.frames.items())
+            self._connection.executemany("INSERT INTO frames VALUES (?, ?, ?, ?, ?)", rows)
+
+    def _described(self, array: NDArray, constant: bool) -> tuple[dict[str, Any], dict[str, bytes]]:
+        """Type, shape and chunks of an array, and the content of the chunks that may be new."""
+        transposed = array.ndim > 1 and array.flags.f_contiguous and not array.flags.c_contiguous
+        about = {"dtype": array.dtype.str, "shape": array.shape, "transposed": transposed}
+        known = self._constants.get(id(array))
+        if constant and known is not None and known[0] is array:
+            return about | {"chunks": known[1]}, {}
+        data = np.ascontiguousarray(array.T if transposed else array).reshape(-1).view(np.uint8).data
+        pieces = [data[start : start + CHUNK] for start in range(0, len(data), CHUNK)]
+        keys = [hashlib.blake2b(piece, digest_size=16).hexdigest() for piece in pieces]
+        if constant:
+            self._constants[id(array)] = array, keys
+        return about | {"chunks": keys}, {key: bytes(piece) for key, piece in zip(keys, pieces, strict=True)
+                                          if key not in self._chunks}  # fmt: skip
+
+
+class StateReader:
+    """Reads the database of a run, also of one that goes on: what is read is the state of one checkpoint.
+
+    Args:
+        path: The file.
+
+    Raises:
+        StateError: There is none, or it is no database of this version.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        if not path.is_file():
+            raise StateError(f"there is no state of a run at {path}")
+        if path.with_name(f"{path.name}-journal").exists():  # SQLite would do what is in it, also to other files
+            raise StateError(f"there is a {path.name}-journal beside {path}, which no run leaves; remove it")
+        _check_size(path)
+        self._left = 0
+        try:
+            self._connection = sqlite3.connect(f"file:{quote(str(path.resolve()))}?mode=ro", uri=True, timeout=5,
+                                               isolation_level=None, check_same_thread=False)  # fmt: skip
+            weakref.finalize(self, self._connection.close)
+            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, LARGEST_FILE)
+            self._connection.set_progress_handler(self._is_too_long, STEPS)
+            for safety in ("trusted_schema = OFF", "cell_size_check = ON"):
+                self._connection.execute(f"PRAGMA {safety}")
+            self._connection.execute("BEGIN")  # one state for all that is read
+            found = [self._connection.execute(f"PRAGMA {name}").fetchone()[0] for name in _HEADER]
+        except sqlite3.Error as error:
+            raise StateError(f"{path} is not a readable state of a run: {error}") from error
+        if found[0] != APPLICATION:
+            raise StateError(f"{path} is not the state of a run")
+        if found[1] != SCHEMA:
+            raise StateError(f"{path} was written in version {found[1]} of the format; this version reads {SCHEMA}")
+        if list(self._rows(_TABLES_OF)) != _own_tables() or list(self._rows("PRAGMA quick_check(1)")) != [("ok",)]:
+            raise StateError(f"{path} is damaged or not of this program: its tables are not those of a state")
+
+    def meta(self) -> dict[str, Any]:
+        """What describes the run, by name.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        return {key: _parsed(value, self.path) for key, value in self._rows("SELECT key, value FROM meta")}
+
+    def state(self) -> tuple[Any, list[NDArray], list[list[Any]]] | None:
+        """Tree, arrays and records of the checkpoint; None if there is none yet.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        rows = list(self._rows("SELECT crc, tree FROM state"))
+        if not rows:
+            return None
+        crc, packed = rows[0]
+        try:
+            if zlib.crc32(packed) != crc:
+                raise ValueError("its checksum is wrong")
+            described = parse_json(inflated(packed, LARGEST_TREE), exact=True)
+            chunks = {bytes.hex(key): content for key, content in self._rows("SELECT key, content FROM chunks")}
+            parts = [key for one in described["arrays"] + described["records"] for key in one["chunks"]]
+            total, held = sum(len(chunks[key]) for key in parts), sum(map(len, chunks.values()))
+            if total > max(RATIO_FREE_BYTES, LARGEST_RATIO * held):  # a part may stand in many arrays
+                raise ValueError(f"its arrays have {total} bytes, and {held} are stored")
+            arrays = [_array(about, chunks) for about in described["arrays"]]
+            texts = [_array(about, chunks).tobytes().decode() for about in described["records"]]
+            records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
+            return described["tree"], arrays, records
+        except (*DAMAGE, MemoryError) as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+
+    def blocks(
+        self, map_number: int, first: int = 0, last: int = (1 << MAP_SHIFT) - 1
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+        """Keys (n,), slots (n,) and voxels (n, VOXELS) of the blocks of a map with Morton codes in a range.
+
+        Raises:
+            StateError: The database is damaged.
+        """
+        start = map_number << MAP_SHIFT
+        select = "SELECT key, slot, crc, voxels FROM blocks WHERE key BETWEEN ? AND ? ORDER BY key"
+        rows = list(self._rows(select, start | first, start | last))
+        for key, slot, crc, content in rows:
+            whole = isinstance(slot, int) and isinstance(content, bytes) and len(content) == 4 * VOXELS
+            if not whole or zlib.crc32(content) != crc:
+                raise StateError(
+                    f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
+                )
+        voxels = np.empty((len(rows), VOXELS), np.int32)
+        for n in range(0, len(rows), ROWS):
+            part = b"".join(row[3] for row in rows[n : n + ROWS])
+            voxels[n : n + ROWS] = np.frombuffer(part, np.int32).reshape(-1, VOXELS)
+        return np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64), voxels
+
+    def region(self, map_number: int, region: Region) -> BlockRecords:
+        """Blocks of a region of a map that had left the memory.
+
+        Raises:
+            StateError: They are missing, or the database is damaged.
+        """
+        columns, where = ", ".join(COLUMNS), "map = ? AND x = ? AND y = ? AND z = ?"
+        select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
+        rows = list(self._rows(select, map_number, *region))
+        try:
+            whole = all(row[0] == n and _checksum(row[2:]) == row[1] for n, row in enumerate(rows))
+            if not rows or not whole:
+                raise ValueError("it is missing or not as it was written")
+            return records_of([row[2:] for row in rows])
+        except (ValueError, TypeError) as error:
+            raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
+
+    def frame(self, store: int, serial: int) -> EncodedFrame:
+        """A stored frame by its serial: depth, colour and mask as files.
+
+        Raises:
+            StateError: It is missing, or the database is damaged.
+        """
+        select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
+        rows = list(self._rows(select, store, serial))
+        if not rows or not all(isinstance(content, bytes) for content in rows[0]):
+            raise StateError(f"the state of the run in {self.path} is damaged: stored frame {serial} is missing")
+        depth, color, mask = rows[0]
+        return depth, color, mask
+
+    def frames(self, store: int) -> list[int]:
+        """Serials of the stored frames of a store, ascending."""
+        return [row[0] for row in self._rows("SELECT number FROM frames WHERE store = ? ORDER BY number", store)]
+
+    def release(self) -> None:
+        """Let go of the state that was current when the file was opened; later reads see the newest."""
+        self._connection.execute("COMMIT")
+
+    def close(self) -> None:
+        """Close the file."""
+        self._connection.close()
+
+    def _rows(self, statement: str, *values: object) -> Iterable[Sequence[Any]]:
+        self._left = LIMIT
+        try:
+            yield from self._connection.execute(statement, values)
+        except (sqlite3.Error, UnicodeDecodeError) as error:
+            if "interrupted" in str(error) and self._left > 0:  # what ctrl-C raises in the handler ends here
+                raise KeyboardInterrupt from None
+            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+
+    def _is_too_long(self) -> bool:
+        """Whether a statement must end; called by SQLite, so that ctrl-C is heard."""
+        self._left -= 1
+        return self._left <= 0
+
+
+_HEADER = "application_id", "user_version"
+_TABLES_OF = "SELECT type, name, tbl_name, sql FROM sqlite_master ORDER BY name"
+
+
+def _own_tables() -> list[tuple[str, ...]]:
+    """What ``_TABLES_OF`` finds in a new database."""
+    with closing(sqlite3.connect(":memory:")) as connection:
+        connection.executescript(TABLES)
+        return list(connection.execute(_TABLES_OF))
+
+
+def _check_size(path: Path) -> None:
+    """Refuse a file that is much larger than what of it is on the disk.
+
+    Raises:
+        StateError: It is.
+    """
+    status = path.stat()
+    stored = 512 * getattr(status, "st_blocks", status.st_size)
+    if status.st_size > max(RATIO_FREE_BYTES, LARGEST_RATIO * stored):
+        raise StateError(f"{path} is damaged or not of this program: {stored} of its {status.st_size} bytes are there")
+
+
+def _region_rows(records: BlockRecords) -> Iterable[list[Any]]:
+    """Level, checksum and arrays of the blocks of a region, level by level."""
+    for level, blobs in enumerate(blobs_of(records)):
+        yield [level, _checksum(blobs), *blobs]
+
+
+def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
+    crc = 0
+    for blob in blobs:
+        crc = zlib.crc32(blob, crc)
+    return crc
+
+
+def _key_range(number: int) -> tuple[int, int]:
+    return number << MAP_SHIFT, (number + 1) << MAP_SHIFT
+
+
+def _block_rows(changed: MapSnapshot) -> Iterable[tuple[int, int, int, bytes]]:
+    for slot, key, voxels in zip(changed.slots.tolist(), changed.keys.tolist(), changed.voxels, strict=True):
+        if key >= 0:
+            content = voxels.tobytes()
+            yield key, slot, zlib.crc32(content), content
+
+
+def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
+    """An array from its chunks; it may be written."""
+    dtype, shape = np.dtype(about["dtype"]), tuple(about["shape"])
+    if dtype.kind not in SAFE_KINDS or any(type(length) is not int or length < 0 for length in shape) or len(shape) > 8:
+        raise ValueError(f"found an array of {dtype} with the shape {shape}; expected numbers or text")
+    if math.prod(shape) * dtype.itemsize != sum(len(chunks[key]) for key in about["chunks"]):
+        raise ValueError(f"an array of {dtype} with the shape {shape} has not the size of its parts")
+    data = b"".join(_checked(key, chunks[key]) for key in about["chunks"])
+    stored = np.frombuffer(data, np.uint8).view(dtype) if data else np.empty(0, dtype)
+    if about["transposed"]:
+        return stored.reshape(shape[::-1]).T.copy(order="K")
+    return stored.reshape(shape).copy()
+
+
+def _checked(key: str, content: bytes) -> bytes:
+    if hashlib.blake2b(content, digest_size=16).hexdigest() != key:
+        raise ValueError("an array is not as it was written")
+    return content
+
+
+def _parsed(text: str, path: Path) -> Any:  # noqa: ANN401
+    try:
+        return parse_json(text, exact=True)
+    except (ValueError, TypeError, AttributeError) as error:
+        raise StateError(f"the state of the run in {path} is damaged: {error}") from error

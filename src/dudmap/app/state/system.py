@@ -1,0 +1,178 @@
+"""A system and what belongs to it, from and into a database."""
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.pipeline.environment import versions
+from dudmap.app.state.blocks import restore_map
+from dudmap.app.state.database import StateDatabase, StateReader
+from dudmap.app.state.identity import code_fingerprint
+from dudmap.app.state.tree import Snapshot, TreeReader, TreeWriter
+from dudmap.config import Config
+from dudmap.core.backends.device import make_backend
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.errors import StateError
+from dudmap.input_files import damaged
+
+if TYPE_CHECKING:
+    from dudmap.core.slam import Slam
+
+
+def take_snapshot(value: object, database: StateDatabase, *, wait: bool = True) -> Snapshot:
+    """The state of a value, without what the database holds already.
+
+    Args:
+        value: A system, or a dictionary that holds one.
+        database: Where it will be written.
+        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
+
+    Raises:
+        StateError: There is something that cannot be stored.
+    """
+    return TreeWriter(database.maps, database.frames, wait=wait).take(value)
+
+
+def restore(reader: StateReader, current: object, database: StateDatabase | None = None, device: str = "cpu") -> Any:  # noqa: ANN401
+    """The value that was stored last.
+
+    Args:
+        reader: The database, which stays open as long as the system lives: it reads stored frames when it needs them.
+        current: A new value of the same kind; see ``TreeReader.restore``.
+        database: Takes note of what it holds already, where the run goes on in the same database.
+        device: Device of the maps that ``current`` lacks.
+
+    Raises:
+        StateError: The database is damaged or of another version, or holds no state yet.
+    """
+    stored = reader.state()
+    if stored is None:
+        raise StateError(f"{reader.path} holds no checkpoint yet")
+    tree, arrays, records = stored
+
+    def load_map(volume: TsdfVolume, number: int, index: dict[str, Any]) -> None:
+        restore_map(volume, index, *reader.blocks(number), lambda region: reader.region(number, region))
+        if database is not None:
+            database.maps.add(volume, number)
+
+    def load_frames(store: FrameStore, number: int) -> None:
+        if reader.frames(number) != store.serials:
+            raise StateError(f"the state of the run in {reader.path} is damaged: stored frames are missing")
+        store.continue_from(lambda serial: reader.frame(number, serial))
+        if database is not None:
+            database.frames.add(store, number)
+
+    reading = TreeReader(arrays, records, load_map, load_frames, lambda: make_backend(device))
+    value = reading.restore(tree, current)
+    reader.release()
+    return value
+
+
+def save_system(slam: "Slam", path: str | Path) -> None:
+    """Write the whole state of a system, from which ``resume_system`` goes on, replacing an older file at the end.
+
+    Raises:
+        StateError: The file cannot be written.
+    """
+    import sqlite3
+
+    path = Path(path)
+    part = path.with_name(f".{path.name}.part")
+    about = {"camera": asdict(slam.first_camera), "config": slam.config.model_dump_json()}
+    try:
+        part.unlink(missing_ok=True)
+        database = StateDatabase(part)
+        try:
+            database.write(take_snapshot(slam, database), about | {"code": code_fingerprint(), "versions": versions()})
+        finally:
+            database.close()
+        part.replace(path)
+    except (OSError, sqlite3.Error) as error:
+        part.unlink(missing_ok=True)
+        raise StateError(f"the state cannot be written to {path}: {error}") from error
+
+
+def resume_system(path: str | Path, device: str | None = None) -> "Slam":
+    """A system in the state that ``save_system`` wrote: the frames that follow give the same results, bit for bit.
+
+    With another ``device`` than that of the run the results differ by roundings. The file stays open and must stay as
+    it is while the system lives: stored frames are read from it.
+
+    Raises:
+        StateError: The file is missing, damaged, or was written by another version.
+    """
+    from dudmap.core.slam import Slam
+
+    path = Path(path)
+    reader = StateReader(path)
+    meta = reader.meta()
+    check_code(meta, path)
+    with damaged(StateError, path):
+        camera = Camera(**meta["camera"] | {"distortion": tuple(meta["camera"]["distortion"])})
+        config = on_device(Config.model_validate_json(meta["config"]), device)
+    slam = Slam(camera, config)
+    return restore(reader, slam, device=slam.device)
+
+
+def on_device(config: Config, device: str | None) -> Config:
+    """The configuration with another device; None keeps that of the run."""
+    return config if device is None else config.override([f"device={device}"])
+
+
+def check_code(meta: dict[str, Any], path: Path) -> None:
+    """Check that a state was written by this version.
+
+    Raises:
+        StateError: It was not.
+    """
+    if meta.get("code") != code_fingerprint():
+        raise StateError(
+            f"{path} was written by another version of dudmap or its libraries ({meta.get('versions', 'unknown')}); "
+            f"expected {versions()}, or begin anew with dudmap run"
+        )
+
+
+def differences(a: Snapshot, b: Snapshot) -> list[str]:
+    """Where two snapshots of whole systems differ, one place a line; empty if they are equal bit for bit."""
+    out: list[str] = []
+    _compare(a.tree, b.tree, a, b, "state", out)
+    for one, two in zip(a.maps, b.maps, strict=True):
+        if not (np.array_equal(one.slots, two.slots) and np.array_equal(one.voxels, two.voxels)):
+            out.append(f"voxels of map {one.number}")
+    for one, two in zip(a.frames, b.frames, strict=True):
+        if one.frames != two.frames:
+            out.append(f"stored frames {one.number}")
+    return out
+
+
+_ARRAYS = "array", "numbers", "stack"
+
+
+def _compare(a: Any, b: Any, one: Snapshot, two: Snapshot, place: str, out: list[str]) -> None:  # noqa: ANN401
+    if isinstance(a, dict) and isinstance(b, dict):
+        for key in a.keys() | b.keys():
+            where = f"{place}.{key}" if key not in ("attributes", "values", "list", "tuple") else place
+            if key not in a or key not in b:
+                out.append(f"{where} is on one side only")
+            elif key in _ARRAYS and isinstance(a[key], int) and isinstance(b[key], int):
+                if not _same(one.arrays[a[key]], two.arrays[b[key]]):
+                    out.append(where)
+            elif key == "records":
+                if one.records[a[key]] != two.records[b[key]]:
+                    out.append(where)
+            else:
+                _compare(a[key], b[key], one, two, where, out)
+    elif isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        for n, (left, right) in enumerate(zip(a, b, strict=True)):
+            _compare(left, right, one, two, f"{place}[{n}]", out)
+    elif a != b and not (a != a and b != b):  # two NaN are equal
+        out.append(f"{place}: {a!r} and {b!r}"[:200])
+
+
+def _same(a: NDArray, b: NDArray) -> bool:
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()

@@ -1,0 +1,396 @@
+"""The state of a system as a tree of plain values and arrays, and a system with the state of such a tree.
+
+The tree is found by walking through all attributes of all objects, so that no class needs to list what it remembers,
+and an attribute that is added later is stored without further work. What cannot be stored (a thread, an open file, a
+function) is an error unless ``wiring.py`` says how it is made again. Nothing is executed when a tree is read: objects
+are made of the classes of a table only, without calling them, and receive the attributes that ``schema.py`` allows.
+
+A node is a number, a text, None, or an object with one key that names its kind.
+"""
+
+import json
+from collections import deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from dudmap.app.state import schema, wiring
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.spec import Backend
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.frame_file import FrameFile
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.errors import DatasetError, StateError
+from dudmap.input_files import DAMAGE
+
+if TYPE_CHECKING:
+    from dudmap.app.state.blocks import MapSnapshot, StoredMaps
+    from dudmap.app.state.frames import FrameSnapshot, StoredFrames
+
+Node = Any
+"""A tree of plain values, as JSON has them."""
+LONG = 32
+"""Length from which on a list of equal things is stored as one array."""
+
+
+@dataclass(eq=False)
+class Snapshot:
+    """The state of a system at one moment, which no later change reaches.
+
+    Attributes:
+        tree: The tree; ``arrays`` and ``records`` are referred to by number.
+        arrays: Copies, except of what never changes.
+        records: Lists of plain values.
+        constant: Numbers of the arrays that never change.
+        maps, frames: What changed in the maps and stored frames since the last checkpoint.
+    """
+
+    tree: Node = None
+    arrays: list[NDArray] = field(default_factory=list)
+    records: list[list[Any]] = field(default_factory=list)
+    constant: set[int] = field(default_factory=set)
+    maps: "list[MapSnapshot]" = field(default_factory=list)
+    frames: "list[FrameSnapshot]" = field(default_factory=list)
+
+
+class NotSettledError(Exception):
+    """Something is being computed in the background; the state can be stored at a later frame."""
+
+
+class TreeWriter:
+    """Takes a snapshot.
+
+    Args:
+        maps, frames: Know what of the maps and of the stored frames is in the database already.
+        wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
+    """
+
+    def __init__(self, maps: "StoredMaps", frames: "StoredFrames", *, wait: bool) -> None:
+        self.snapshot = Snapshot()
+        self._maps, self._frames, self._wait = maps, frames, wait
+        self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
+
+    def take(self, value: object) -> Snapshot:
+        """The snapshot of a value and everything that it refers to.
+
+        Raises:
+            StateError: There is something that cannot be stored.
+            NotSettledError: See ``wait``.
+        """
+        self.snapshot.tree = self._node(value, "state")
+        return self.snapshot
+
+    def _node(self, value: Any, place: str, *, constant: bool = False) -> Node:  # noqa: ANN401
+        if value is None or type(value) in (bool, int, float, str):
+            return value
+        if isinstance(value, np.generic):
+            return {"scalar": value.dtype.str, "value": value.item()}
+        if id(value) in self._seen:
+            return {"same": self._seen[id(value)][0]}
+        number = len(self._seen)
+        self._seen[id(value)] = number, value
+        if type(value).__name__ in wiring.BACKENDS:
+            return {"backend": number}
+        if isinstance(value, np.ndarray):
+            return {"array": self._array(value, place, constant=constant), "id": number}
+        if isinstance(value, BaseModel):
+            return {"model": _class_name(value, place), "json": value.model_dump_json(), "id": number}
+        if isinstance(value, np.random.Generator):
+            return {"random": value.bit_generator.state, "id": number}
+        if isinstance(value, Future):
+            return {"result": self._node(self._result(value), place), "id": number}
+        if isinstance(value, tuple | list | deque | dict | set | frozenset):
+            return self._container(value, place, number, constant=constant)
+        return self._object(value, place, number)
+
+    def _container(self, value: Any, place: str, number: int, *, constant: bool) -> Node:  # noqa: ANN401
+        if isinstance(value, tuple):
+            items = [self._node(item, f"{place}[{n}]", constant=constant) for n, item in enumerate(value)]
+            node = {"tuple": items, "id": number}
+            return node | {"class": _class_name(value, place)} if type(value) is not tuple else node
+        if isinstance(value, list):
+            return {"list": self._items(value, place), "id": number}
+        if isinstance(value, deque):
+            return {"deque": self._items(list(value), place), "limit": value.maxlen, "id": number}
+        if isinstance(value, dict):
+            keys, content = list(value), list(value.values())
+            return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
+        return {"frozenset" if isinstance(value, frozenset) else "set": self._items(sorted(value), place), "id": number}
+
+    def _items(self, items: list[Any], place: str) -> Node:
+        """Items of a list: one by one, or as an array where they are many of one kind."""
+        kinds = {type(item) for item in items} if len(items) >= LONG else set()
+        if len(kinds) == 1:
+            kind = kinds.pop()
+            if kind in (int, float) and not (kind is int and any(abs(item) >= 1 << 63 for item in items)):
+                return {"numbers": self._add(np.array(items, np.int64 if kind is int else np.float64))}
+            if kind is np.ndarray and items[0].size <= 64 and len({(a.shape, a.dtype) for a in items}) == 1:
+                return {"stack": self._add(np.stack(items))}
+            if kind.__name__ in wiring.COLUMNS and schema.is_state_class(kind):
+                names = list(wiring.attributes(items[0]))
+                columns = [self._items([getattr(item, name) for item in items], f"{place}.{name}") for name in names]
+                return {"columns": schema.name_of(kind), "names": names, "values": columns, "count": len(items)}
+        return [self._node(item, f"{place}[{n}]") for n, item in enumerate(items)]
+
+    def _object(self, value: object, place: str, number: int) -> Node:
+        cls = type(value)
+        if not schema.is_state_class(cls) or not hasattr(value, "__dict__"):
+            raise StateError(f"{place} is a {cls.__module__}.{cls.__qualname__}, which cannot be stored")
+        evaluated, records = wiring.EVALUATED.get(cls.__name__, ()), wiring.RECORDS.get(cls.__name__, ())
+        node: dict[str, Node] = {"object": schema.name_of(cls), "id": number}
+        if isinstance(value, TsdfVolume):
+            state, changed = self._maps.snapshot(value)
+            self.snapshot.maps.append(changed)
+            node |= {"map": changed.number, "blocks": self._node(state, place)}
+        if isinstance(value, FrameStore):
+            changed = self._frames.snapshot(value)
+            self.snapshot.frames.append(changed)
+            node |= {"store": changed.number}
+        content = {}
+        for name, attribute in wiring.attributes(value).items():
+            where = f"{place}.{name}"
+            if name in records:
+                self.snapshot.records.append(list(attribute))
+                content[name] = {"records": len(self.snapshot.records) - 1}
+            elif name in evaluated:
+                content[name] = {"call": self._node(attribute(), where)}
+            else:
+                content[name] = self._node(attribute, where, constant=cls.__name__ in wiring.CONSTANT)
+        return node | {"attributes": content}
+
+    def _array(self, array: NDArray, place: str, *, constant: bool) -> int:
+        if array.dtype.hasobject:
+            raise StateError(f"{place} is an array of objects, which cannot be stored")
+        number = self._add(array if constant else array.copy(order="K"))
+        if constant:
+            self.snapshot.constant.add(number)
+        return number
+
+    def _add(self, array: NDArray) -> int:
+        self.snapshot.arrays.append(array)
+        return len(self.snapshot.arrays) - 1
+
+    def _result(self, future: "Future[Any]") -> Any:  # noqa: ANN401
+        if not (future.done() or self._wait):
+            raise NotSettledError
+        return future.result()
+
+
+class TreeReader:
+    """Gives a system the state of a tree.
+
+    Args:
+        arrays: Arrays by number, which become part of the system.
+        records: Lists of plain values by number.
+        load_map: Fills a map, given its number in the database and what the tree says of its blocks.
+        load_frames: Connects a frame store with the stored frames of a number.
+        make_backend: Makes a back end where the given system has none in that place.
+    """
+
+    def __init__(
+        self,
+        arrays: Sequence[NDArray],
+        records: Sequence[list[Any]],
+        load_map: Callable[[TsdfVolume, int, dict[str, Any]], None],
+        load_frames: Callable[[FrameStore, int], None],
+        make_backend: Callable[[], Backend] = CpuBackend,
+    ) -> None:
+        self._arrays, self._records = arrays, records
+        self._load_map, self._load_frames, self._make_backend = load_map, load_frames, make_backend
+        self._made: dict[int, Any] = {}
+        self._at: list[str] = []  # where the tree is being read
+        self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
+        self._taken: set[int] = set()  # identities of the objects of the given system that are in use
+
+    def restore(self, node: Node, current: object) -> Any:  # noqa: ANN401
+        """The value of a tree.
+
+        Args:
+            node: The tree.
+            current: A new value of the same kind, whose objects are used, so that they stay connected.
+
+        Raises:
+            StateError: The tree is damaged or of another version.
+        """
+        try:
+            value = self._value(node, current)
+            if not schema.is_alike(value, current):
+                raise ValueError(f"found {type(value).__name__}; expected {type(current).__name__}")
+            return value
+        except (*DAMAGE, DatasetError, MemoryError) as error:
+            place = "".join(["state", *self._at])
+            what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
+            raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
+
+    def _within(self, place: str, node: Node, current: Any = None) -> Any:  # noqa: ANN401
+        """Value of a part of the tree, whose place an error names."""
+        self._at.append(place)
+        value = self._value(node, current)
+        self._at.pop()
+        return value
+
+    def _value(self, node: Node, current: Any = None) -> Any:  # noqa: ANN401
+        if not isinstance(node, dict):
+            return node
+        if "same" in node:
+            return self._made[node["same"]]
+        if "backend" in node:
+            usable = type(current).__name__ in wiring.BACKENDS and id(current) not in self._taken
+            return self._use(node["backend"], current if usable else self._make_backend())
+        if "scalar" in node:
+            kind = np.dtype(node["scalar"])
+            if kind.kind not in "biuf" or not isinstance(node["value"], bool | int | float):
+                raise ValueError(f"found a {kind} of {type(node['value']).__name__}; expected a number")
+            return kind.type(node["value"])
+        if "object" in node:
+            return self._object(node, current)
+        value = self._leaf(node) if "list" not in node and "dict" not in node and "deque" not in node else None
+        if value is None:
+            return self._mutable(node, current)
+        self._made[node["id"]] = value
+        return value
+
+    def _use(self, number: int, value: Any) -> Any:  # noqa: ANN401
+        """Note that an object stands for a number of the tree and for no other."""
+        self._made[number] = value
+        self._taken.add(id(value))
+        return value
+
+    def _leaf(self, node: dict[str, Node]) -> Any:  # noqa: ANN401
+        """A value that holds no reference to itself."""
+        if "array" in node:
+            return self._arrays[node["array"]]
+        if "model" in node:
+            cls = schema.class_of(node["model"])
+            if not issubclass(cls, BaseModel):
+                raise ValueError(f"{cls.__name__} is no configuration")
+            return cls.model_validate_json(node["json"])
+        if "random" in node:
+            generator = np.random.default_rng(0)
+            generator.bit_generator.state = node["random"]
+            return generator
+        if "result" in node:
+            future: Future[Any] = Future()
+            future.set_result(self._value(node["result"]))
+            return future
+        if "tuple" in node:
+            items = self._items(node["tuple"])
+            if "class" not in node:
+                return tuple(items)
+            cls: Any = schema.class_of(node["class"])
+            if not issubclass(cls, tuple) or len(items) != len(getattr(cls, "_fields", ())):
+                raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
+            return tuple.__new__(cls, items)
+        items = self._items(node["frozenset"] if "frozenset" in node else node["set"])
+        return frozenset(items) if "frozenset" in node else set(items)
+
+    def _mutable(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
+        """A list, deque or dictionary, which may be part of its own content."""
+        if "list" in node:
+            value: Any = []
+            self._made[node["id"]] = value
+            value += self._items(node["list"], current)
+        elif "deque" in node:
+            value = deque(maxlen=node["limit"])
+            self._made[node["id"]] = value
+            value.extend(self._items(node["deque"]))
+        else:
+            value = {}
+            self._made[node["id"]] = value
+            keys = self._items(node["dict"])
+            known = [current.get(key) for key in keys] if isinstance(current, dict) else []
+            content = self._items(node["values"], known)
+            if not all(map(schema.is_alike, content, known or content)):
+                raise ValueError(f"found values of other types than those of {keys}")
+            value.update(zip(keys, content, strict=True))
+        return value
+
+    def _items(self, node: Node, current: Any = None) -> list[Any]:  # noqa: ANN401
+        if isinstance(node, list):
+            known = current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
+            return [self._within(f"[{n}]", item, one) for n, (item, one) in enumerate(zip(node, known, strict=True))]
+        if "numbers" in node:
+            return self._arrays[node["numbers"]].tolist()
+        if "stack" in node:
+            stack = self._arrays[node["stack"]]
+            if len(stack) > schema.LARGEST_COUNT:
+                raise ValueError(f"found {len(stack)} arrays; expected {schema.LARGEST_COUNT} or less")
+            return [row.copy() for row in stack]
+        cls = schema.class_of(node["columns"])
+        columns = [self._items(column) for column in node["values"]]
+        schema.check_attributes(cls, dict.fromkeys(node["names"]), {})
+        out = []
+        for values in zip(*columns, strict=True):
+            one = object.__new__(cls)
+            for name, value in zip(node["names"], values, strict=True):
+                schema.check_value(cls, name, value, None)
+                object.__setattr__(one, name, value)
+            out.append(one)
+        return out
+
+    def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
+        cls = schema.class_of(node["object"])
+        usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
+        if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
+            raise ValueError(f"{cls.__name__} is no class of plain objects")
+        value: Any = self._use(node["id"], current if usable else object.__new__(cls))
+        content = node["attributes"]
+        like = self._new.setdefault(cls, wiring.attributes(current)) if usable else self._new.get(cls, {})
+        schema.check_attributes(cls, content, like)
+        if not usable:
+            for name, default in _defaults(cls).items():
+                object.__setattr__(value, name, default)
+        for name, attribute in content.items():
+            self._at.append(f".{name}")
+            made = self._attribute(attribute, getattr(current, name, None))
+            schema.check_value(cls, name, made, like.get(name))
+            object.__setattr__(value, name, made)
+            self._at.pop()
+        if cls is Camera:
+            value.__post_init__()  # its size decides how much memory is taken
+        if "map" in node:
+            self._load_map(value, node["map"], self._value(node["blocks"]))
+        if "store" in node:
+            self._load_frames(value, node["store"])
+        return value
+
+    def _attribute(self, node: Node, current: Any) -> Any:  # noqa: ANN401
+        if isinstance(node, dict) and "records" in node:
+            return self._records[node["records"]]
+        if isinstance(node, dict) and "call" in node:
+            result = self._value(node["call"])
+            return lambda: result
+        return self._value(node, current)
+
+
+def _defaults(cls: type) -> dict[str, Any]:
+    """Values of the attributes that are not stored, of an object that is made without its constructor."""
+    made: dict[str, dict[str, Any]] = {
+        "BlockPager": {"_store": None, "_executor": None},
+        "FrameStore": {"registered": None, "_file": FrameFile(), "_encoder": None, "_pending": deque()},
+        "LoopCloser": {"_executor": None},
+        "Observation": {"_halvings": [], "_recorded_halvings": []},
+    }  # fmt: skip
+    return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
+
+
+def _is_frozen(cls: type) -> bool:
+    parameters = getattr(cls, "__dataclass_params__", None)
+    return parameters is not None and parameters.frozen
+
+
+def _class_name(value: object, place: str) -> str:
+    if not schema.is_state_class(type(value)):
+        raise StateError(f"{place} is a {schema.name_of(type(value))}, which cannot be stored")
+    return schema.name_of(type(value))
+
+
+def lines(records: list[Any]) -> str:
+    """Plain values as lines of JSON."""
+    return "".join(json.dumps(record) + "\n" for record in records)

@@ -1,0 +1,140 @@
+"""The page in the browser while a run goes on: its own thread, fed through a slot for one frame."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dudmap.app.pipeline.observer import RunObserver
+from dudmap.app.viewing.mesh_feed import MeshFeed
+from dudmap.app.viewing.snapshot import FrameFigures, FrameImages
+from dudmap.errors import FrameError
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from dudmap.app.pipeline.frame_source import FrameRead
+    from dudmap.app.viewing.window import Window
+    from dudmap.core.result import FrameResult
+    from dudmap.core.slam import Slam
+
+PERIOD = 0.1
+"""Shortest time between two updates of the page, seconds."""
+
+
+@dataclass
+class _News:
+    """What the page does not show yet: the figures of all frames, and the images of the latest one."""
+
+    figures: list[FrameFigures] = field(default_factory=list)
+    images: FrameImages | None = None
+    poses: "dict[float, NDArray] | None" = None
+    restart: bool = False
+
+
+class LiveView(RunObserver):
+    """Shows a run in a window while it goes on.
+
+    The thread of the run copies what is to be shown into a slot; another thread takes it from there. Images that were
+    not taken in time are replaced by those of a later frame, so that the run never waits for the page.
+
+    Args:
+        window: The page.
+
+    Attributes:
+        costs: Milliseconds that each frame took in the thread of the run.
+    """
+
+    def __init__(self, window: "Window") -> None:
+        self.costs: list[float] = []
+        self._window = window
+        self._news = _News()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._error: Exception | None = None
+        self._slam: Slam | None = None
+        self._feed = MeshFeed()
+        self._thread = threading.Thread(target=self._show, name="dudmap-view", daemon=True)
+        self._thread.start()
+
+    def start(self, slam: "Slam", out: Path, count: int | None) -> None:
+        """Begin with an empty page."""
+        self._slam = slam
+        none = np.zeros(0, dtype=np.int32)
+        slam.atlas.volume.extract_chunks(none, none.astype(np.int64))  # loads the kernel, which would delay a frame
+        self._window.set_camera(slam.camera)
+        with self._changed:
+            self._news = _News(restart=True)
+
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
+        """Put a frame into the slot."""
+        start = time.perf_counter()
+        assert self._slam is not None
+        images = None if isinstance(read.frame, FrameError) else FrameImages.of(read.frame, result)
+        self._feed.offer(self._slam.atlas.volume)
+        self._put(FrameFigures.of(result, ms), images, self._poses() if result.corrected else None)
+        self.costs.append(1000 * (time.perf_counter() - start))
+
+    def finish(self, out: Path) -> None:
+        """Show the final trajectory and mesh."""
+        if self._slam is not None and self._error is None:
+            self._feed.offer(self._slam.atlas.volume, now=True)
+            self._put(None, None, self._poses())
+
+    def close(self) -> None:
+        """End the thread once all is shown.
+
+        Raises:
+            Exception: What made the thread of the page fail.
+        """
+        with self._changed:
+            self._closed = True
+            self._changed.notify()
+        self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def _poses(self) -> "dict[float, NDArray]":
+        """Poses of the largest submap by time, after all corrections."""
+        assert self._slam is not None
+        path = self._slam.trajectory
+        return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
+
+    def _put(
+        self, figures: FrameFigures | None, images: FrameImages | None, poses: "dict[float, NDArray] | None"
+    ) -> None:
+        with self._changed:
+            news = self._news
+            if figures is not None:
+                news.figures.append(figures)
+            news.images = images or news.images
+            news.poses = poses if poses is not None else news.poses
+            self._changed.notify()
+
+    def _take(self) -> _News | None:
+        """All news; waits for some. None once the run is over and all is shown."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._closed or self._has_news())
+            if not self._has_news():
+                return None
+            news, self._news = self._news, _News()
+            return news
+
+    def _has_news(self) -> bool:
+        return bool(self._news.figures or self._news.restart or self._news.poses or self._feed.has_copy)
+
+    def _show(self) -> None:
+        try:
+            while (news := self._take()) is not None:
+                if news.restart:
+                    self._window.clear()
+                self._window.show_mesh(self._feed.take())
+                self._window.add_frames(news.figures, news.poses)
+                if news.images is not None and news.figures:
+                    self._window.add_images(news.figures[-1].timestamp, news.images.pictures())
+                time.sleep(PERIOD)
+        except Exception as error:  # handed to the thread of the run, which raises it in close
+            self._error = error

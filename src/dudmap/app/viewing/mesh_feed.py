@@ -1,0 +1,99 @@
+"""The changed parts of a growing map, at a bounded cost per frame."""
+
+import threading
+import time
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
+
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map.incremental_mesh import Chunk, IncrementalMesh
+from dudmap.core.map.volume_mirror import VolumeMirror
+
+if TYPE_CHECKING:
+    from dudmap.core.map.volume import TsdfVolume
+
+BUDGET_MS = 1.0
+"""Mean time per frame for copying the map, milliseconds: a third of what watching a run may cost."""
+BLOCKS = 512
+"""Blocks that one hand-over copies at most: 2 MB, about a millisecond, so that no frame is held up for long."""
+LONGEST_WAIT = 15
+"""Frames after which the budget allows another hand-over in any case: half a second of a camera."""
+
+
+@dataclass
+class MeshChanges:
+    """Parts of the mesh that replace those shown so far.
+
+    Attributes:
+        chunks: Mesh of each changed part; None where there is no surface any more.
+        reset: Whether all parts shown before are void, since the map is another one.
+    """
+
+    chunks: dict[Chunk, Mesh | None] = field(default_factory=dict)
+    reset: bool = False
+
+
+class MeshFeed:
+    """Hands a growing map from the thread that changes it to one that extracts its mesh.
+
+    Each frame saves up ``budget_ms``; when that covers what the last hand-over took, and the other thread is done with
+    the one before, up to ``BLOCKS`` changed blocks are copied. The other thread extracts the changed parts of the mesh
+    from the copy.
+
+    Args:
+        budget_ms: Mean time per frame, milliseconds.
+    """
+
+    def __init__(self, budget_ms: float = BUDGET_MS) -> None:
+        self._budget = budget_ms
+        self._saved = self._cost = 0.0
+        self._volume: TsdfVolume | None = None
+        self._mirror: VolumeMirror | None = None
+        self._extracted: VolumeMirror | None = None
+        self._mesh: IncrementalMesh | None = None
+        self._ready = threading.Condition()
+        self._waiting = False  # a copy waits for its extraction
+
+    @property
+    def has_copy(self) -> bool:
+        """Whether ``take`` would find something new."""
+        return self._waiting
+
+    def offer(self, volume: "TsdfVolume", *, now: bool = False) -> None:
+        """Copy what changed in a volume if budget and receiver allow it; with ``now``, as soon as the receiver does."""
+        self._saved += self._budget
+        with self._ready:
+            if now:
+                self._ready.wait_for(lambda: not self._waiting)
+            if self._waiting or (self._saved < min(self._cost, LONGEST_WAIT * self._budget) and not now):
+                return
+            start = time.perf_counter()
+            if self._mirror is None or self._volume is not volume:
+                self._volume, self._mirror = volume, VolumeMirror(volume)
+            self._mirror.update(None if now else BLOCKS)
+            self._cost, self._saved, self._waiting = 1000 * (time.perf_counter() - start), 0.0, True
+
+    def take(self) -> MeshChanges:
+        """What changed since the last call; empty if nothing new was copied."""
+        if not self._waiting or self._mirror is None:
+            return MeshChanges()
+        reset = self._extracted is not self._mirror
+        if self._mesh is None or reset:
+            self._mesh, self._extracted = IncrementalMesh(self._mirror.volume), self._mirror
+        try:
+            changed = self._mesh.update()
+            return MeshChanges({key: self._mesh.chunks.get(key) for key in changed}, reset)
+        finally:
+            with self._ready:
+                self._waiting = False
+                self._ready.notify()
+
+    def changes(self, volume: "TsdfVolume", *, now: bool = False) -> MeshChanges:
+        """``offer`` and ``take`` in one thread, both at the expense of the budget."""
+        start = time.perf_counter()
+        self.offer(volume, now=now)
+        if not self._waiting:
+            return MeshChanges()
+        out = self.take()
+        self._cost = 1000 * (time.perf_counter() - start)
+        return out

@@ -1,0 +1,217 @@
+"""The report of a run: one HTML page that needs neither network nor server."""
+
+import base64
+import json
+import re
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap import __version__
+from dudmap.app.viewing.markup import Html, html, joined, script_source
+from dudmap.app.viewing.packed_mesh import packed
+from dudmap.app.viewing.plots import plots
+from dudmap.app.viewing.run_files import RunFiles
+from dudmap.app.viewing.thumbnails import Thumbnails
+from dudmap.atomic_file import write_text
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh_simplification import simplified
+from dudmap.errors import DudmapError, printable
+from dudmap.input_files import damaged
+
+REPORT = "report.html"
+TRIANGLES = 200_000
+"""Triangles of the mesh in the page: about 1.5 MB, and fluent without a graphics card."""
+POSES = 5000
+"""Poses in the page; those of a longer run are thinned evenly."""
+POLICY = "default-src 'none'; script-src {scripts}; style-src 'unsafe-inline'; img-src data: blob:; base-uri 'none'"
+"""Content security policy: the page's own scripts by their hashes, its styles and pictures, and nothing else."""
+LISTED = 200
+"""Lost or unreadable frames that are listed one by one."""
+CARDS = {
+    "frames": ("frames", 1, "{:.0f}"),
+    "lost": ("lost", 1, "{:.0f}"),
+    "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
+    "dynamic_share_mean": ("moves", 100, "{:.1f} %"),
+    "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
+    "ate_rmse_m": ("ATE RMSE", 100, "{:.2f} cm"),
+    "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
+}
+"""Key of metrics.json to label, factor and format of the figures at the top of the page."""
+
+
+def write_report(folder: str | Path, out: str | Path | None = None) -> Path:
+    """Write the report of a run folder and return its path.
+
+    The page holds the mesh (at most ``TRIANGLES``, the full one stays in mesh.ply) with trajectory, camera and moving
+    objects in 3D, the thumbnails, plots, all figures, the configuration, and what was lost and why.
+
+    Args:
+        folder: The run folder.
+        out: The HTML file; None for report.html in the run folder.
+
+    Raises:
+        DudmapError: The folder is no complete run folder or of a newer version, or the page cannot be written.
+    """
+    path = Path(out) if out is not None else Path(folder) / REPORT
+    run = RunFiles.load(folder)
+    with damaged(DudmapError, f"the run folder {folder}"):
+        page = report_page(run)
+    try:
+        write_text(path, page)
+    except OSError as error:
+        raise DudmapError(f"cannot write the report {path}: {error.strerror or error}") from error
+    return path
+
+
+def report_page(run: RunFiles) -> str:
+    """HTML text of the report."""
+    found = run.mesh
+    about, mesh = (None, "") if found is None or len(found.faces) == 0 else packed(simplified(found, TRIANGLES))
+    license, three, script = (_asset(name) for name in ("three.LICENSE.txt", "three.min.js", "report.js"))
+    library = f"\n/* three.js\n{license}*/\n{three}"
+    parts = {
+        "policy": POLICY.format(scripts=" ".join(script_source(text) for text in (library, script))),
+        "version": __version__,
+        "title": printable(run.metrics.get("sequence") or run.folder.name),
+        "verdict": _verdict(run.metrics),
+        "cards": _cards(run.metrics),
+        "strips": _strip(run),
+        "losses": _losses(run.metrics),
+        "plots": joined(
+            html("<figure>{svg}<figcaption>{title}</figcaption></figure>", svg=Html(svg), title=title)
+            for title, svg in plots(run).items()
+        ),
+        "table": _table(run.metrics),
+        "config": run.config or "The run folder has no config.toml.",
+        "run": Html(json.dumps(scene_data(run) | {"mesh": about}, allow_nan=False).replace("<", "\\u003c")),
+        "mesh": mesh,
+        "css": _asset("report.css"),
+        "library": Html(library),
+        "script": script,
+    }
+    return re.sub(r"\{\{(\w+)\}\}", lambda match: html("{part}", part=parts[match[1]]), _asset("report.html"))
+
+
+def scene_data(run: RunFiles) -> dict[str, Any]:
+    """Camera, and per shown pose its time, position with quaternion (x y z qx qy qz qw), and moving objects."""
+    chosen = np.unique(np.linspace(0, len(run.trajectory) - 1, min(POSES, len(run.trajectory))).astype(int))
+    Ts = run.trajectory.Ts_world_camera[chosen]
+    times = run.trajectory.timestamps[chosen]
+    poses = [[*T[:3, 3].round(4).tolist(), *np.round(se3.rotation_to_quat_xyzw(T[:3, :3]), 5).tolist()] for T in Ts]
+    camera = run.metrics.get("camera", {})
+    movers = [
+        [
+            {"id": m.id, "box": m.box.round(3).tolist(), "speed": round(m.speed, 3)}
+            for m in run.movers.get(f"{t:.6f}", [])
+        ]
+        for t in times
+    ]
+    return {
+        "camera": {key: camera[key] for key in ("fx", "fy", "cx", "cy", "width", "height") if key in camera},
+        "times": times.round(6).tolist(),
+        "poses": poses,
+        "movers": movers,
+    }
+
+
+class ReportObserver(Thumbnails):
+    """Keeps the thumbnails of a run and writes its report at the end."""
+
+    def finish(self, out: Path) -> None:
+        """Write report.html."""
+        write_report(out)
+
+
+def _asset(name: str) -> Html:
+    return Html((files("dudmap.app.viewing") / "page" / name).read_text(encoding="utf-8"))
+
+
+def _verdict(metrics: dict[str, Any]) -> str:
+    """Sentence on whether the run is complete."""
+    tracked = f"{metrics.get('tracked', 0)} of {metrics.get('frames', 0)} frames were tracked"
+    if metrics.get("complete"):
+        return f"Processed to the end; {tracked}."
+    return f"Incomplete: {metrics.get('stopped_by') or 'the run was stopped'}; {tracked}."
+
+
+def _cards(metrics: dict[str, Any]) -> Html:
+    return joined(
+        html("<li><b>{value}</b><span>{label}</span></li>", value=form.format(factor * metrics[key]), label=label)
+        for key, (label, factor, form) in CARDS.items()
+        if isinstance(metrics.get(key), int | float)
+    )
+
+
+def _strip(run: RunFiles) -> Html:
+    """Columns of colour image and mask; depth and residuals are kept for the frame at the slider."""
+    if not run.thumbnails:
+        return Html("<p>This run kept no images (it was made with --no-report).</p>")
+    start = float(next(iter(run.thumbnails)))
+    columns = []
+    for stamp, images in run.thumbnails.items():
+        data = {kind: "data:image/jpeg;base64," + base64.b64encode(jpg).decode() for kind, jpg in images.items()}
+        at = f"{float(stamp) - start:.1f} s"
+        hidden = joined(
+            html(' data-{kind}="{data}"', kind=kind, data=data[kind]) for kind in ("depth", "residuals") if kind in data
+        )
+        shown = joined(
+            html('<img src="{data}" alt="{kind} at {at}" loading="lazy">', data=data[kind], kind=kind, at=at)
+            for kind in ("color", "mask")
+            if kind in data
+        )
+        figure = '<figure data-t="{stamp}"{hidden}>{shown}{at}</figure>'
+        columns.append(html(figure, stamp=stamp, hidden=hidden, shown=shown, at=at))
+    return html('<div class="strip">{columns}</div>', columns=joined(columns))
+
+
+def _losses(metrics: dict[str, Any]) -> Html:
+    """Lost frames by reason, unreadable frames, and frames that were left out of the map."""
+    lost, unreadable = metrics.get("lost_frames", []), metrics.get("unreadable_frames", [])
+    notes = [
+        (metrics.get("skipped_similar"), "redundant views have a pose but are not in the map"),
+        (metrics.get("blind"), "images without contrast were tracked by distances alone and are not in the map"),
+        (metrics.get("uncertain"), "frames with uncertain poses or labels are not in the map"),
+        (metrics.get("degenerate"), "of them do not show all directions of motion"),
+        (metrics.get("dropped"), "frames arrived too fast and were dropped"),
+        ((metrics.get("maps") or 1) - 1, "submaps could not be joined with the main one"),
+    ]
+    rows: list[object] = [f"warning: {text}" for text in metrics.get("warnings", [])]
+    rows += [f"{count} {text}" for count, text in notes if count]
+    reasons: dict[str, list[float]] = {}
+    for row in lost:
+        reasons.setdefault(str(row["reason"]), []).append(float(row["timestamp"]))
+    for reason, stamps in sorted(reasons.items(), key=lambda item: -len(item[1])):
+        times = ", ".join(f"{stamp:.3f}" for stamp in stamps[:LISTED])
+        more = f" and {len(stamps) - LISTED} more" if len(stamps) > LISTED else ""
+        row = "{count} lost: {reason}<details><summary>times, s</summary>{times}{more}</details>"
+        rows.append(html(row, count=len(stamps), reason=reason, times=times, more=more))
+    rows += [f"unreadable: {text}" for text in unreadable[:LISTED]]
+    if len(unreadable) > LISTED:
+        rows.append(f"{len(unreadable) - LISTED} more frames were unreadable")
+    if not rows:
+        return Html("<p>Nothing: every frame was read and tracked, and every view is in the map.</p>")
+    return html("<ul>{rows}</ul>", rows=joined(html("<li>{row}</li>", row=row) for row in rows))
+
+
+def _table(metrics: dict[str, Any]) -> Html:
+    left_out = ("warnings", "lost_frames", "unreadable_frames")
+    rows = joined(
+        html("<tr><td>{key}</td><td>{value}</td></tr>", key=key, value=_text(value))
+        for key, value in metrics.items()
+        if key not in left_out
+    )
+    return html("<table>{rows}</table>", rows=rows)
+
+
+def _text(value: object) -> str:
+    """Value of metrics.json as text; trees as one line of JSON."""
+    if isinstance(value, dict):
+        return ", ".join(f"{key} {_text(item)}" for key, item in value.items())
+    if isinstance(value, list):
+        return ", ".join(_text(item) for item in value)
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return "-" if value is None else str(value)

@@ -1,0 +1,314 @@
+"""A page in the browser with the map, the camera, what moves, images and plots, served by viser."""
+
+import io
+import socket
+import sys
+import threading
+from contextlib import redirect_stdout
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.viewing.glb import glb
+from dudmap.app.viewing.mesh_feed import MeshChanges
+from dudmap.app.viewing.page_access import PageAccess
+from dudmap.app.viewing.picking import first_hit
+from dudmap.app.viewing.snapshot import KINDS, FrameFigures, jpeg
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map.incremental_mesh import Chunk
+from dudmap.errors import DudmapError
+from dudmap.extras import extra
+
+if TYPE_CHECKING:
+    from dudmap.core.geometry.camera import Camera
+
+MAX_IMAGES = 300
+"""Frames whose images are kept for the time slider: about 20 MB; more are thinned evenly."""
+PLOT_POINTS = 500
+"""Points of a plot over time."""
+MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
+PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
+
+
+class Window:
+    """The page; safe to use from several threads.
+
+    Args:
+        host: Address to serve at; 127.0.0.1 for this machine only.
+        port: Port to serve at.
+        title: Title of the page.
+        token: Secret part of the address; None makes one unless ``host`` is this machine only.
+
+    Attributes:
+        access: Who may see it.
+
+    Raises:
+        MissingExtraError: viser is not installed.
+        DudmapError: The port is in use, or the token is invalid.
+    """
+
+    def __init__(self, host: str, port: int, title: str, token: str | None = None) -> None:
+        with extra("view", "the page in the browser"):
+            import viser  # pyright: ignore[reportMissingImports]
+        self.access = PageAccess(host, port, token)
+        _check_port(host, port)
+        self._lock = threading.RLock()
+        with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
+            self._server = viser.ViserServer(host=host, port=port, verbose=False)
+        self.access.guard(self._server)
+        self.url = self.access.url
+        self._camera: Camera | None = None
+        self._handles: dict[str, Any] = {}
+        self._chunks: dict[Chunk, Mesh] = {}
+        self._frames: list[FrameFigures] = []
+        self._images: dict[float, dict[str, bytes]] = {}
+        self._marks: list[NDArray[np.float64]] = []
+        self._shown = -1
+        self._server.gui.set_panel_label(title)
+        self._make_controls(title)
+        scene = self._server.scene
+        scene.set_up_direction("-y")
+        scene.on_click()(lambda event: self.mark(np.array(event.ray_origin), np.array(event.ray_direction)))
+        self._server.initial_camera.position = (0.0, -0.9, -1.6)
+        self._server.initial_camera.look_at = (0.0, 0.0, 1.5)
+
+    def set_camera(self, camera: "Camera") -> None:
+        """The camera whose frustum is shown."""
+        with self._lock:
+            self._camera = camera
+
+    def stay(self) -> None:
+        """Show single frames instead of the latest one."""
+        self._follow.value = False
+
+    def clear(self) -> None:
+        """Remove all frames and the map."""
+        with self._lock:
+            self.show_mesh(MeshChanges(reset=True))
+            self._frames.clear()
+            self._images.clear()
+            self._shown = -1
+
+    def show_mesh(self, changes: MeshChanges) -> None:
+        """Replace the changed parts of the map."""
+        with self._lock:
+            if changes.reset:
+                for key in self._chunks:
+                    self._remove(_mesh_name(key))
+                self._chunks.clear()
+            for key, mesh in changes.chunks.items():
+                if mesh is None or len(mesh.faces) == 0:
+                    self._chunks.pop(key, None)
+                    self._remove(_mesh_name(key))
+                else:
+                    self._chunks[key] = mesh
+                    visible = self._show_map.value
+                    name = _mesh_name(key)
+                    self._handles[name] = self._server.scene.add_glb(name, glb(mesh), visible=visible)
+
+    def add_frames(self, frames: list[FrameFigures], poses: dict[float, NDArray] | None = None) -> None:
+        """Append frames; ``poses`` (4, 4) by time replace those of earlier frames after a correction."""
+        with self._lock:
+            self._frames += frames
+            if poses is not None:
+                self._frames = [_moved(frame, poses) for frame in self._frames]
+            if not self._frames:
+                return
+            self._slider.max = max(len(self._frames) - 1, 1)
+            self._draw_path()
+            self._draw_plots()
+            if self._follow.value:
+                self.show_frame(len(self._frames) - 1)
+
+    def add_images(self, timestamp: float, pictures: dict[str, NDArray[np.uint8]]) -> None:
+        """Images (h, w, 3) of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
+        self.add_files(timestamp, {kind: jpeg(picture) for kind, picture in pictures.items()})
+
+    def add_files(self, timestamp: float, files: dict[str, bytes]) -> None:
+        """JPEG files of a frame by the names of ``KINDS``."""
+        with self._lock:
+            self._images[timestamp] = files
+            if len(self._images) > MAX_IMAGES:
+                for stamp in list(self._images)[1:-1:2]:
+                    del self._images[stamp]
+            if self._follow.value:
+                self._draw_images(timestamp)
+
+    def show_frame(self, number: int) -> None:
+        """Show camera, moving objects and images of a frame."""
+        with self._lock:
+            if not 0 <= number < len(self._frames):
+                return
+            frame = self._frames[number]
+            self._shown = number
+            if self._slider.value != number:
+                self._slider.value = number
+            state = f"lost: {frame.lost_reason}" if frame.T_world_camera is None else "tracked"
+            self._state.content = (
+                f"**{frame.timestamp - self._frames[0].timestamp:.2f} s**, {state}, {frame.ms:.0f} ms, "
+                f"{frame.dynamic_share:.0%} moves"
+            )
+            self._draw_camera(frame)
+            self._draw_movers(frame)
+            if not self._follow.value and self._images:
+                self._draw_images(min(self._images, key=lambda stamp: abs(stamp - frame.timestamp)))
+
+    def mark(self, origin: NDArray[np.float64], direction: NDArray[np.float64]) -> None:
+        """Mark the point of the map on a ray; two marked points give their distance."""
+        with self._lock:
+            point = first_hit(origin, direction, self._chunks.values())
+            if point is None:
+                return
+            self._marks = [*self._marks[-1:], point] if len(self._marks) == 1 else [point]
+            text = "point: x {:.3f}, y {:.3f}, z {:.3f} m".format(*point)
+            ends = np.array([self._marks[0], point])
+            if len(self._marks) == 2:
+                text += f"; **{np.linalg.norm(ends[1] - ends[0]):.3f} m** from the one before"
+            self._point.content = text
+            self._add("/marks/points", "add_point_cloud", points=ends, colors=MARK_COLOR, point_size=0.02)
+            self._add("/marks/line", "add_line_segments", points=ends[None], colors=MARK_COLOR, thickness=0.006)
+
+    def stop(self) -> None:
+        """End the server."""
+        with redirect_stdout(io.StringIO()):
+            self._server.stop()
+
+    # -- controls -----------------------------------------------------------------------------------------------------
+
+    def _make_controls(self, title: str) -> None:
+        gui = self._server.gui
+        gui.configure_theme(control_layout="fixed", control_width="large", show_logo=False, show_share_button=False)
+        gui.add_markdown(f"### {title}")
+        self._state = gui.add_markdown("waiting for the first frame")
+        self._slider = gui.add_slider("frame", min=0, max=1, step=1, initial_value=0)
+        self._follow = gui.add_checkbox("follow the run", initial_value=True)
+        self._slider.on_update(lambda event: self._slide(event))
+        self._follow.on_update(lambda _: self.show_frame(len(self._frames) - 1) if self._follow.value else None)
+        self._show_map = gui.add_checkbox("map", initial_value=True)
+        self._show_path = gui.add_checkbox("trajectory", initial_value=True)
+        self._show_camera = gui.add_checkbox("camera", initial_value=True)
+        self._show_movers = gui.add_checkbox("what moves", initial_value=True)
+        for control in (self._show_map, self._show_path, self._show_camera, self._show_movers):
+            control.on_update(lambda _: self._apply_visibility())
+        self._point = gui.add_markdown("click on the map for a point, again for a distance")
+        empty = np.zeros((48, 64, 3), dtype=np.uint8)
+        self._pictures = {kind: gui.add_image(empty, label=kind, format="jpeg") for kind in KINDS}
+        nothing, seconds = (np.zeros(1), np.zeros(1)), _series("s")
+        self._time_plot = gui.add_uplot(nothing, (seconds, _series("ms per frame")), title="time, ms", height=150)
+        self._residual_plot = gui.add_uplot(
+            nothing, (seconds, _series("residual")), title="residual at 1 m, mm", height=150
+        )
+
+    def _slide(self, event: Any) -> None:  # noqa: ANN401 - an event of viser
+        if event.client is None or self._slider.value == self._shown:  # set by the program
+            return
+        with self._lock:
+            self._follow.value = False
+            self.show_frame(int(self._slider.value))
+
+    def _apply_visibility(self) -> None:
+        wanted = {
+            "/map/": self._show_map.value, "/path": self._show_path.value, "/camera": self._show_camera.value,
+            "/movers/": self._show_movers.value,
+        }  # fmt: skip
+        with self._lock:
+            for name, handle in self._handles.items():
+                for prefix, visible in wanted.items():
+                    if name.startswith(prefix):
+                        handle.visible = visible
+
+    # -- scene --------------------------------------------------------------------------------------------------------
+
+    def _draw_path(self) -> None:
+        points = np.array([frame.T_world_camera[:3, 3] for frame in self._frames if frame.T_world_camera is not None])
+        if len(points) < 2:
+            return
+        points = points[np.unique(np.linspace(0, len(points) - 1, 2000).astype(int))]
+        segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
+        self._add(
+            "/path", "add_line_segments", points=segments, colors=PATH_COLOR, thickness=0.008,
+            visible=self._show_path.value,
+        )  # fmt: skip
+
+    def _draw_camera(self, frame: FrameFigures) -> None:
+        if frame.T_world_camera is None or self._camera is None:
+            return
+        x, y, z, w = se3.rotation_to_quat_xyzw(frame.T_world_camera[:3, :3])
+        place = {"wxyz": (w, x, y, z), "position": frame.T_world_camera[:3, 3]}
+        if "/camera" in self._handles:
+            self._handles["/camera"].wxyz, self._handles["/camera"].position = place["wxyz"], place["position"]
+            return
+        height, width = self._camera.shape
+        fov = 2 * np.arctan(height / 2 / self._camera.fy)
+        self._add(
+            "/camera", "add_camera_frustum", fov=float(fov), aspect=width / height, scale=0.15, color=CAMERA_COLOR,
+            visible=self._show_camera.value, **place,
+        )  # fmt: skip
+
+    def _draw_movers(self, frame: FrameFigures) -> None:
+        for name in [name for name in self._handles if name.startswith("/movers/")]:
+            self._remove(name)
+        visible = self._show_movers.value
+        for mover in frame.movers:
+            color, center = MOVER_COLORS[mover.id % len(MOVER_COLORS)], mover.box.mean(axis=0)
+            self._add(
+                f"/movers/{mover.id}/box", "add_box", color=color, dimensions=mover.box[1] - mover.box[0],
+                position=center, wireframe=True, visible=visible,
+            )  # fmt: skip
+            above = np.array([center[0], mover.box[0, 1], center[2]])
+            text = f"{mover.id}: {mover.speed:.2f} m/s"
+            self._add(f"/movers/{mover.id}/label", "add_label", text=text, position=above, visible=visible)
+
+    def _draw_images(self, timestamp: float) -> None:
+        import cv2
+
+        for kind, data in self._images.get(timestamp, {}).items():
+            decoded = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR)
+            self._pictures[kind].image = np.asarray(decoded)[..., ::-1]
+
+    def _draw_plots(self) -> None:
+        step = max(1, len(self._frames) // PLOT_POINTS)
+        chosen = self._frames[::step]
+        t = np.array([frame.timestamp for frame in chosen]) - self._frames[0].timestamp
+        self._time_plot.data = (t, np.array([frame.ms for frame in chosen]))
+        residuals = 1000 * np.array([frame.residual for frame in chosen])
+        self._residual_plot.visible = bool(np.isfinite(residuals).any())  # a run folder does not hold them
+        self._residual_plot.data = (t, np.nan_to_num(residuals))
+
+    def _add(self, name: str, method: str, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
+        self._handles[name] = getattr(self._server.scene, method)(name, **values)
+
+    def _remove(self, name: str) -> None:
+        handle = self._handles.pop(name, None)
+        if handle is not None:
+            handle.remove()
+
+
+def _mesh_name(key: Chunk) -> str:
+    return "/map/{}_{}_{}".format(*key)
+
+
+def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known where viser is installed
+    return {"label": label, "stroke": "#c2410c", "width": 1.5}
+
+
+def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
+    """The frame with the corrected pose of its time, if there is one."""
+    return replace(frame, T_world_camera=poses.get(frame.timestamp, frame.T_world_camera))
+
+
+def _check_port(host: str, port: int) -> None:
+    """Check that the page can be served there; viser would take another port without a word."""
+    with socket.socket() as probe:
+        if sys.platform != "win32":  # where it would let two programs take one port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            reason = error.strerror or error
+            raise DudmapError(
+                f"cannot show a page at {host}:{port} ({reason}); name another --port or --host"
+            ) from None

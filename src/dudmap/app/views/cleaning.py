@@ -1,0 +1,327 @@
+"""A recording as it would have been without the things that move."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.views.background import Background, BackgroundRenderer
+from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError, FrameError
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.exporting.view_synthesis import index_at
+from dudmap.io.sequences.images import read_mask
+
+if TYPE_CHECKING:
+    from dudmap.io.sequences import Sequence
+
+MARGIN = 6 / 640
+"""Width by which masks grow, as a share of the image's: blur, mixed pixels and the disparity window of the sensor."""
+REACH = 24 / 640
+"""Pixels so near a mask that lie in front of the map belong to it: in a finished map only what moved is in front."""
+IN_FRONT = 0.04
+"""A reading is in front of the map if it is nearer by this share: 2.5 standard deviations of a Kinect at 5 m
+(0.0012 m + 0.0019 (z - 0.4)^2)."""
+SHADOW = 48 / 640
+"""Largest width of the shadow without readings beside what stands in front of the projector, as a share of the image's:
+baseline times focal length over distance, 0.075 m * 525 / 0.8 m for a Kinect."""
+LEFT_OVER = 5.0
+"""A pixel beside a mask whose colour is so many standard deviations (1.48 median absolute deviations of all such pixels
+of the frame) from the background's belongs to what moves: feet on the floor, which the depth cannot tell apart."""
+LEAST_DIFFERENCE = 40.0
+"""Smallest such difference, of 255; less is hardly seen, and made by shadows and by changes of the exposure as well."""
+SOURCES = 150
+"""Largest number of frames that lend their colours, spread evenly; 640x480 pixels of one take 2 MB."""
+
+
+class Cleaned(NamedTuple):
+    """A frame without what moves.
+
+    Attributes:
+        frame: As recorded.
+        moving: (h, w) bool, replaced pixels of the colour image.
+        replaced: (H, W) bool, replaced pixels of the depth image: the same, and shadows without readings.
+        background: What the pixels were replaced by.
+    """
+
+    frame: Frame
+    moving: NDArray[np.bool_]
+    replaced: NDArray[np.bool_]
+    background: Background
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """What ``clean`` did.
+
+    Attributes:
+        frames: Number of frames written.
+        left_out: Numbers of the frames without a pose or a readable image.
+        replaced: Mean share of the pixels that was replaced.
+        unknown: Mean share of the pixels whose background no frame saw.
+    """
+
+    frames: int
+    left_out: tuple[int, ...]
+    replaced: float
+    unknown: float
+
+
+class Cleaner:
+    """Replaces what moves in the frames of a recording, given a run over it.
+
+    Args:
+        run: The run, with map and masks.
+        sequence: The recording.
+
+    Attributes:
+        indices: Numbers of the frames that have a pose and a mask.
+        registered: Whether the pixels of depth and colour images correspond.
+
+    Raises:
+        DatasetError: The run has no masks, none of its poses belongs to the recording, or it does not say where the
+            colour camera of the recording is.
+        MapError: There is no map.
+    """
+
+    def __init__(self, run: RunContent, sequence: "Sequence") -> None:
+        self.run, self.sequence = run, sequence
+        masks = run.mask_files()
+        stamps = np.array(sorted(masks))
+        self._poses: dict[int, NDArray[np.float64]] = {}
+        self._masks: dict[int, Path] = {}
+        for index, moment in enumerate(sequence.timestamps.tolist()):
+            pose, mask = index_at(run.trajectory.timestamps, moment), index_at(stamps, moment)
+            if pose is not None and mask is not None:
+                self._poses[index] = run.trajectory.Ts_world_camera[pose]
+                self._masks[index] = masks[float(stamps[mask])]
+        self.indices = tuple(self._poses)
+        if not self.indices:
+            raise DatasetError(
+                f"no frame of {sequence.name} has a pose in {run.folder}; name the run of this recording"
+            )
+        self.registered = sequence.calibration is None
+        if run.calibration is None and not self.registered:
+            raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
+        color_camera = sequence.camera if run.calibration is None else run.calibration.camera
+        self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera, registered=self.registered)
+        self._is_prepared = False
+
+    def prepare(self) -> None:
+        """Read the frames that lend their colours."""
+        step = max(1, -(-len(self.indices) // SOURCES))
+        for index in self.indices[::step]:
+            try:
+                frame = self.sequence[index]
+            except FrameError:
+                continue
+            T_world_camera, T_world_color = self._poses[index], self._color_pose(frame)
+            moving = self._renderer.in_color(self.moving(index, frame), frame, T_world_camera, T_world_color)
+            self._renderer.add(frame, moving, T_world_camera, T_world_color)
+        self._is_prepared = True
+
+    def moving(self, index: int, frame: Frame) -> NDArray[np.bool_]:
+        """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a margin.
+
+        Raises:
+            DatasetError: The mask has another size.
+        """
+        mask, width = read_mask(self._masks[index]), self.sequence.camera.width
+        if mask.shape != frame.depth.shape:
+            raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")
+        behind = self._renderer.map_depth(self._poses[index])
+        in_front = (frame.depth > 0) & (frame.depth < (1 - IN_FRONT) * behind)
+        return grown(mask | (in_front & grown(mask, REACH * width)), MARGIN * width)
+
+    def clean(self, index: int) -> Cleaned:
+        """Frame number ``index`` without what moves."""
+        if not self._is_prepared:
+            self.prepare()
+        frame, T_world_camera = self.sequence[index], self._poses[index]
+        T_world_color = self._color_pose(frame)
+        replaced = self.moving(index, frame)
+        moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
+        behind = self._renderer.map_depth(T_world_camera)
+        asked, surely = grown(moving, REACH * moving.shape[1]), None
+        if self.registered:  # what is too near for the sensor has no readings, and its colours tell it
+            asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
+            surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
+        color, known = self._renderer.colors(frame, asked, T_world_color)
+        left = unlike(frame.color, color, asked & ~moving & known, surely)
+        if self.registered:
+            replaced = replaced | left
+        replaced = with_shadow(replaced, frame.depth, behind)
+        moving = moving | left
+        background = self._renderer.render(frame, replaced, moving, T_world_camera, (color, known))
+        return Cleaned(frame, moving, replaced, background)
+
+    def _color_pose(self, frame: Frame) -> NDArray[np.float64]:
+        return self.run.color_pose(frame.timestamp if frame.color_timestamp is None else frame.color_timestamp)
+
+
+def grown(mask: NDArray[np.bool_], width: float) -> NDArray[np.bool_]:
+    """Mask (H, W) grown by about so many pixels, at least one."""
+    import cv2
+
+    radius = max(1, round(width))
+    disk = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * radius + 1, 2 * radius + 1))
+    return cv2.dilate(mask.astype(np.uint8), disk) > 0
+
+
+def connected(mask: NDArray[np.bool_], others: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Mask (H, W) with the other pixels that are connected with it through such pixels."""
+    import cv2
+
+    _, pieces = cv2.connectedComponents((mask | others).astype(np.uint8), connectivity=8)
+    touched = np.unique(pieces[mask])
+    return np.isin(pieces, touched[touched > 0])
+
+
+def with_shadow(
+    moving: NDArray[np.bool_], depth: NDArray[np.float32], behind: NDArray[np.float32]
+) -> NDArray[np.bool_]:
+    """Mask (H, W) with the pixels that touch it, have no reading, and whose background (H, W) is known: the sensor's
+    projector does not reach them past what moves."""
+    return connected(moving, grown(moving, SHADOW * moving.shape[1]) & (depth == 0) & (behind > 0))
+
+
+def unlike(
+    image: NDArray[np.uint8],
+    expected: NDArray[np.uint8],
+    where: NDArray[np.bool_],
+    surely: NDArray[np.bool_] | None = None,
+) -> NDArray[np.bool_]:
+    """Pixels (h, w) of an image whose colours differ from the expected ones more than is usual; single ones and lines
+    are edges that are a pixel off, and left out.
+
+    Args:
+        image, expected: (h, w, 3) uint8.
+        where: The pixels that are asked.
+        surely: Pixels that show what is expected, by which "usual" is judged; None for all that are asked.
+    """
+    import cv2
+
+    judged = where if surely is None or not (where & surely).any() else where & surely
+    if not judged.any():
+        return where
+    difference = np.abs(image.astype(np.float32) - expected).max(axis=2)
+    usual = float(np.median(difference[judged]))
+    spread = 1.48 * float(np.median(np.abs(difference[judged] - usual)))
+    far = where & (difference > max(usual + LEFT_OVER * spread, LEAST_DIFFERENCE))
+    blobs = cv2.morphologyEx(far.astype(np.uint8), cv2.MORPH_OPEN, np.ones((3, 3), np.uint8))
+    return where & grown(blobs > 0, 1)
+
+
+def clean_recording(
+    run: RunContent,
+    sequence: "Sequence",
+    out: Path,
+    progress: "Callable[[int, int], None] | None" = None,
+    max_frames: int | None = None,
+) -> CleanReport:
+    """Write the recording without what moves, in TUM layout.
+
+    The folder receives rgb/, depth/, their lists rgb.txt, depth.txt and associations.txt, intrinsics.txt,
+    groundtruth.txt if it is known, trajectory.txt (poses of the run), replaced/ and unknown/ (255 = pixels that were
+    replaced, and those of them whose background no frame saw: their depth is 0, their colour continues what surrounds
+    them), with replaced.txt and unknown.txt. Colour of a camera of its own stays in its own geometry, intrinsics.txt
+    says where that camera is, and replaced_color/ and unknown_color/ are the same for it.
+
+    Args:
+        run: A run over the recording, with map and masks.
+        sequence: The recording.
+        out: New or empty folder.
+        progress: Called with the number of finished frames and of all.
+        max_frames: Only so many frames from the start; None for all.
+
+    Raises:
+        DatasetError: The folder is not empty, or run and recording do not fit together.
+        MapError: There is no map.
+        OSError: A file cannot be written.
+    """
+    if out.exists() and (not out.is_dir() or any(path.name != "run" for path in out.iterdir())):
+        raise DatasetError(f"{out} exists and is not an empty folder; name another one")
+    cleaner = Cleaner(run, sequence)
+    masks = ("replaced", "unknown") + (() if cleaner.registered else ("replaced_color", "unknown_color"))
+    for name in ("rgb", "depth", *masks):
+        (out / name).mkdir(parents=True, exist_ok=True)
+    lines: list[tuple[str, str]] = []
+    wanted = range(len(sequence))[:max_frames]
+    indices = [index for index in cleaner.indices if index in wanted]
+    shares, left_out = [], sorted(set(wanted) - set(indices))
+    for done, index in enumerate(indices, start=1):
+        try:
+            cleaned = cleaner.clean(index)
+        except FrameError:
+            left_out.append(index)
+            continue
+        lines.append(_write_frame(out, cleaned, sequence.camera.depth_scale))
+        shares.append((float(cleaned.moving.mean()), float(_unknown_color(cleaned).mean())))
+        if progress is not None:
+            progress(done, len(indices))
+    _write_lists(out, run, sequence, lines, masks)
+    replaced, unknown = np.mean(shares, axis=0) if shares else (0.0, 0.0)
+    return CleanReport(len(lines), tuple(sorted(left_out)), float(replaced), float(unknown))
+
+
+def _unknown_color(cleaned: Cleaned) -> NDArray[np.bool_]:
+    return cleaned.moving & ~cleaned.background.known
+
+
+def _write_frame(out: Path, cleaned: Cleaned, depth_scale: float) -> tuple[str, str]:
+    """Write the images of a frame; returns the times of colour and depth as text."""
+    import cv2
+
+    frame, background = cleaned.frame, cleaned.background
+    stamp = f"{frame.timestamp:.6f}"
+    color_stamp = stamp if frame.color_timestamp is None else f"{frame.color_timestamp:.6f}"
+    units = np.rint(background.depth * depth_scale)
+    unknown, masks = cleaned.replaced & (background.depth == 0), {}
+    if (out / "replaced_color").is_dir():
+        masks = {"replaced_color": cleaned.moving, "unknown_color": _unknown_color(cleaned)}
+    else:
+        unknown |= _unknown_color(cleaned)
+    masks |= {"replaced": cleaned.replaced, "unknown": unknown}
+    images = {
+        f"rgb/{color_stamp}.png": background.color[..., ::-1],
+        f"depth/{stamp}.png": np.where(units > 65535, 0, units).astype(np.uint16),
+        **{f"{name}/{stamp}.png": mask.astype(np.uint8) * 255 for name, mask in masks.items()},
+    }
+    for name, image in images.items():
+        write_bytes(out / name, cv2.imencode(".png", image)[1].tobytes(), sync=False)
+    return color_stamp, stamp
+
+
+def _write_lists(
+    out: Path, run: RunContent, sequence: "Sequence", lines: list[tuple[str, str]], masks: tuple[str, ...]
+) -> None:
+    camera = sequence.camera
+    lists = {
+        "rgb.txt": [f"{color} rgb/{color}.png" for color, _ in lines],
+        "associations.txt": [f"{color} rgb/{color}.png {depth} depth/{depth}.png" for color, depth in lines],
+        **{f"{name}.txt": [f"{t} {name}/{t}.png" for _, t in lines] for name in ("depth", *masks)},
+    }
+    for name, rows in lists.items():
+        text = "\n".join([f"# {sequence.name} without what moves, by dudmap clean", *rows])
+        write_text(out / name, text + "\n")
+    numbers = [*_numbers(camera), f"depth_scale {camera.depth_scale}"]
+    if sequence.calibration is not None and run.calibration is not None:
+        numbers += [f"color_{line}" for line in _numbers(run.calibration.camera)]
+        T = np.linalg.inv(run.calibration.T_color_depth)
+        numbers.append("T_depth_color " + " ".join(f"{value:.9g}" for value in T.reshape(-1)))
+    write_text(out / "intrinsics.txt", "\n".join(numbers) + "\n")
+    run.trajectory.save(out / "trajectory.txt")
+    if sequence.ground_truth is not None:
+        sequence.ground_truth.save(out / "groundtruth.txt")
+
+
+def _numbers(camera: Camera) -> list[str]:
+    """Lines of intrinsics.txt."""
+    lines = [f"{key} {getattr(camera, key)}" for key in ("fx", "fy", "cx", "cy", "width", "height")]
+    lens = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False)
+    return [*lines, *(f"{key} {value}" for key, value in lens)]

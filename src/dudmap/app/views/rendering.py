@@ -1,0 +1,145 @@
+"""Artificial camera views: the map seen along a trajectory (thesis section 4.5.3)."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.app.views.video import CODECS, VideoWriter
+from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import ConfigError, DatasetError
+from dudmap.io.exporting.gravity import up_of
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+
+EMPTY = 32
+"""Grey value of pixels that show no surface."""
+
+
+def orbit(run: RunContent, up: NDArray[np.float64], sweep_deg: float, frames: int, fps: float) -> Trajectory:
+    """Trajectory on an arc about the middle of what the cameras looked at, at their mean distance and height.
+
+    The arc lies about the mean place of the cameras, ``sweep_deg`` wide, there and back; from 360 on it is a circle.
+
+    Args:
+        run: The run.
+        up: (3,) unit vector against gravity.
+        sweep_deg: Width of the arc, degrees.
+        frames: Number of poses.
+        fps: Poses per second.
+    """
+    middle = np.median(run.surface.vertices.astype(np.float64), axis=0)
+    arm = run.trajectory.Ts_world_camera[:, :3, 3].mean(axis=0) - middle
+    height = float(arm @ up)
+    level = arm - height * up
+    if np.linalg.norm(level) < 0.5:  # a camera among what it sees: look at it from a metre away
+        level = -run.trajectory.Ts_world_camera[:, :3, 2].mean(axis=0)
+        level -= (level @ up) * up
+        level /= max(float(np.linalg.norm(level)), 1e-9)
+    side = np.cross(up, level)
+    share = np.arange(frames) / frames
+    angles = 2 * np.pi * share if sweep_deg >= 360 else np.radians(sweep_deg) / 2 * np.sin(2 * np.pi * share)
+    places = [middle + np.cos(a) * level + np.sin(a) * side + height * up for a in angles]
+    return Trajectory(np.arange(frames) / fps, np.array([looking_at(place, middle, up) for place in places]))
+
+
+def looking_at(place: NDArray[np.float64], target: NDArray[np.float64], up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pose (4, 4) of a camera at a place that looks at a target, with ``up`` towards the upper edge of the image.
+
+    Raises:
+        ConfigError: It would look straight up or down.
+    """
+    forward = target - place
+    right = np.cross(forward, up)
+    if np.linalg.norm(right) < 1e-6 * max(float(np.linalg.norm(forward)), 1.0):
+        raise ConfigError("the orbit looks straight along --up; give another direction, or a trajectory")
+    T = np.eye(4)
+    T[:3, 2], T[:3, 0] = forward / np.linalg.norm(forward), right / np.linalg.norm(right)
+    T[:3, 1] = np.cross(T[:3, 2], T[:3, 0])
+    T[:3, 3] = place
+    return T
+
+
+def render_run(
+    run: RunContent,
+    trajectory: Trajectory,
+    out: Path,
+    *,
+    size: tuple[int, int] | None = None,
+    fps: float = 30.0,
+    progress: Callable[[int, int], None] | None = None,
+) -> int:
+    """Write the map as a camera on a trajectory sees it; returns the number of frames.
+
+    A file name with a known ending gives a video. Anything else is a folder, which receives a recording in TUM layout:
+    rgb/, depth/ and their lists, intrinsics.txt and groundtruth.txt.
+
+    Args:
+        run: The run.
+        trajectory: Poses in the world of the run.
+        out: Video or folder.
+        size: Width and height, pixels; None for those of the recording.
+        fps: Of a video.
+        progress: Called with the number of finished frames and of all.
+
+    Raises:
+        ConfigError: The ending is unknown.
+        DatasetError: The folder is not empty.
+        MapError: There is no map.
+        OSError: A file cannot be written.
+    """
+    camera = run.volume.camera if size is None else run.volume.camera.resized(*size)
+    if out.suffix and not out.is_dir():
+        with VideoWriter(out, (camera.width, camera.height), fps) as video:
+            for number, T in enumerate(trajectory.Ts_world_camera, start=1):
+                video.write(_view(run, T, camera)[0])
+                if progress is not None:
+                    progress(number, len(trajectory))
+        return len(trajectory)
+    if out.exists() and (not out.is_dir() or any(out.iterdir())):
+        raise DatasetError(f"{out} exists and is not an empty folder; name another one, or a video ({_endings()})")
+    _write_folder(run, trajectory, out, camera, progress)
+    return len(trajectory)
+
+
+def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDArray[np.uint8], NDArray[np.float32]]:
+    """Colour (H, W, 3) and depth (H, W) in metres of the map."""
+    seen = run.volume.raycast(T, camera)
+    return np.where(seen.depth[..., None] > 0, seen.color, np.uint8(EMPTY)), seen.depth
+
+
+def _write_folder(
+    run: RunContent, trajectory: Trajectory, out: Path, camera: Camera, progress: Callable[[int, int], None] | None
+) -> None:
+    import cv2
+
+    for name in ("rgb", "depth"):
+        (out / name).mkdir(parents=True, exist_ok=True)
+    lists: dict[str, list[str]] = {"rgb": [], "depth": []}
+    for number, (stamp, T) in enumerate(zip(trajectory.timestamps, trajectory.Ts_world_camera, strict=True), start=1):
+        color, depth = _view(run, T, camera)
+        units = np.rint(depth * camera.depth_scale)
+        images = {"rgb": color[..., ::-1], "depth": np.where(units > 65535, 0, units).astype(np.uint16)}
+        for name, image in images.items():
+            path = f"{name}/{stamp:.6f}.png"
+            write_bytes(out / path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
+            lists[name].append(f"{stamp:.6f} {path}")
+        if progress is not None:
+            progress(number, len(trajectory))
+    for name, lines in lists.items():
+        write_text(out / f"{name}.txt", "\n".join([f"# views of {run.folder.name}", *lines]) + "\n")
+    keys = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
+    write_text(out / "intrinsics.txt", "".join(f"{key} {getattr(camera, key)}\n" for key in keys))
+    trajectory.save(out / "groundtruth.txt")
+
+
+def up_for_orbit(run: RunContent, up: tuple[float, float, float] | None) -> NDArray[np.float64]:
+    """Unit vector (3,) against gravity, given or found in the map."""
+    return up_of(run, ExportOptions(up=up))
+
+
+def _endings() -> str:
+    return ", ".join(CODECS)

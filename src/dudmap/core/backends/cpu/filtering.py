@@ -1,0 +1,283 @@
+"""Loops over one image: depth limits, hole filling, depth-adaptive bilateral filter, intensities, halving.
+
+Rows are cut into slices before the inner loop: an index that the compiler cannot prove positive costs numba's
+wrap-around test, and with it the vectorisation (measured: a factor 4).
+"""
+
+import numpy as np
+
+from dudmap.core.backends.threads import kernel, scalar, written_out
+
+f32 = np.float32
+ABSENT = np.float32(-1e9)
+"""Depth of a pixel without a reading inside the filter: so distant that its range weight vanishes."""
+OUTSIDE = np.float32(-2e9)
+"""Depth of a pixel outside the image inside the filter."""
+LONGEST_RUN = 3
+"""Longest run of missing pixels, in the row or the column, of a small hole."""
+MIN_NEIGHBOURS = 8
+"""Readings that the 5x5 neighbourhood of a filled pixel must hold."""
+
+
+@kernel
+def limit_depth(depth, low, high, out):
+    """Readings of ``depth`` (H, W) float32 within [low, high] metres; all others, also NaN, become 0."""
+    source, target = depth.reshape(-1), out.reshape(-1)
+    for n in range(source.size):
+        z = source[n]
+        target[n] = z if (z >= low) & (z <= high) else np.float32(0)
+
+
+@scalar
+def between(z, a, b, gap):
+    """Whether a reading ``z`` lies between two others by more than ``gap`` of both; none of them may be missing."""
+    low, high = min(a, b), max(a, b)
+    return (low > np.float32(0)) & (z > low + gap) & (z < high - gap)
+
+
+@kernel
+def drop_mixed(row_start, row_stop, depth, noise, noise_floor, slope, out):
+    """Readings of ``depth`` (H, W) without those between a foreground and a background (flying pixels), which become 0.
+
+    A pixel whose light comes from two surfaces reads a depth between them. It lies behind the one neighbour and in
+    front of the other, one or two pixels away in its row or column, by more than ``max(noise_floor, noise z^2) + slope
+    z``, which no readable surface does.
+
+    Args:
+        row_start, row_stop: Rows.
+        depth: (H, W) float32, metres, 0 = none.
+        noise, noise_floor: Tolerance, 1/m and metres.
+        slope: Step per pixel of the steepest surface that a sensor still reads, as a share of the depth.
+        out: (H, W) float32 out.
+    """
+    h, w = depth.shape
+    zero = np.float32(0)
+    for v in range(row_start, row_stop):
+        middle, row = depth[v], out[v]
+        row[:] = middle
+        for k in range(1, 3):
+            before, here, after = middle[: w - 2 * k], middle[k : w - k], middle[2 * k :]
+            target = row[k : w - k]
+            steepest = np.float32(k) * slope
+            for u in range(here.size):
+                z = here[u]
+                gap = max(noise_floor, noise * z * z) + steepest * z
+                target[u] = zero if between(z, before[u], after[u], gap) else target[u]
+            if v >= k and v + k < h:
+                above, below = depth[v - k], depth[v + k]
+                for u in range(w):
+                    z = middle[u]
+                    gap = max(noise_floor, noise * z * z) + steepest * z
+                    row[u] = zero if between(z, above[u], below[u], gap) else row[u]
+
+
+@scalar
+def is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor):
+    """Whether the run of missing pixels around a missing pixel is short and its two ends lie on one surface.
+
+    Args:
+        a1, a2, a3: Readings one, two and LONGEST_RUN = three pixels before it, 0 = none.
+        b1, b2, b3: Likewise after it.
+        slope, noise_floor: See ``fill_holes``.
+    """
+    zero, one, two, three = f32(0), f32(1), f32(2), f32(3)
+    a, b = a1 if a1 > zero else a2 if a2 > zero else a3, b1 if b1 > zero else b2 if b2 > zero else b3
+    before, after = (
+        one if a1 > zero else two if a2 > zero else three,
+        one if b1 > zero else two if b2 > zero else three,
+    )
+    near = min(a, b)
+    short = before + after <= f32(LONGEST_RUN + 1)
+    return (near > zero) & short & (abs(a - b) <= max(noise_floor, slope * near * near))
+
+
+@kernel
+def fill_holes(row_start, row_stop, depth, slope, noise_floor, out):
+    """Give pixels of small holes the mean of their valid 5x5 neighbours (thesis section 4.3).
+
+    A pixel without a reading is filled if (1) the run of missing pixels it lies in, along its row or along its column,
+    is at most LONGEST_RUN long and ends on one surface, and (2) its 5x5 neighbourhood holds at least MIN_NEIGHBOURS
+    readings, all within ``max(noise_floor, slope z^2)`` of each other. Thus depth edges, whose sides
+    differ by more, are not bridged, and large holes, whose runs are longer in both directions, keep their border.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (H, W) float32, metres, 0 = none.
+        slope: Largest spread over squared depth, 1/m.
+        noise_floor: Largest spread near the lens, metres.
+        out: (H, W) float32 out.
+    """
+    h, w = depth.shape
+    line = np.zeros(w + 2 * LONGEST_RUN, np.float32)
+    holes = np.empty(w, np.uint8)
+    zero, one = np.float32(0), np.float32(1)
+    for v in range(row_start, row_stop):
+        row, target = depth[v], out[v]
+        for u in range(w):
+            line[np.uintp(u + LONGEST_RUN)] = target[u] = row[u]
+        above, above2, above3 = depth[max(v - 1, 0)], depth[max(v - 2, 0)], depth[max(v - 3, 0)]
+        below, below2, below3 = depth[min(v + 1, h - 1)], depth[min(v + 2, h - 1)], depth[min(v + 3, h - 1)]
+        # rows outside the image have no reading
+        i1, i2, i3 = one if v > 0 else zero, one if v > 1 else zero, one if v > 2 else zero
+        j1, j2, j3 = one if v + 1 < h else zero, one if v + 2 < h else zero, one if v + 3 < h else zero
+        for u in range(w):
+            k = np.uintp(u)
+            a1, a2, a3 = line[np.uintp(u + 2)], line[np.uintp(u + 1)], line[k]
+            b1, b2, b3 = line[np.uintp(u + 4)], line[np.uintp(u + 5)], line[np.uintp(u + 6)]
+            in_row = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
+            a1, a2, a3 = i1 * above[k], i2 * above2[k], i3 * above3[k]
+            b1, b2, b3 = j1 * below[k], j2 * below2[k], j3 * below3[k]
+            in_column = is_small_hole(a1, a2, a3, b1, b2, b3, slope, noise_floor)
+            holes[k] = (line[np.uintp(u + 3)] <= zero) & (in_row | in_column)
+        for u in range(w):
+            if holes[u] == 0:
+                continue
+            total, low, high, count = np.float32(0), np.float32(np.inf), np.float32(0), 0
+            for y in range(max(v - 2, 0), min(v + 3, h)):
+                for x in range(max(u - 2, 0), min(u + 3, w)):
+                    q = depth[y, x]
+                    if q > 0:
+                        total += q
+                        low, high = min(low, q), max(high, q)
+                        count += 1
+            if count >= MIN_NEIGHBOURS and high - low <= max(noise_floor, slope * low * low):
+                out[v, u] = total / np.float32(count)
+
+
+@scalar
+def range_weight(difference, inverse):
+    """Weight (1 - d^2 inverse)^8 of a depth difference d, 0 beyond d^2 inverse = 1; ``inverse`` = 1 / (16 sigma_c^2).
+
+    Approximates the Gaussian exp(-d^2 / (2 sigma_c^2)) by arithmetic that vectorises.
+    """
+    w = max(np.float32(1) - difference * difference * inverse, np.float32(0))
+    w = w * w
+    w = w * w
+    return w * w
+
+
+@kernel
+def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
+    """Add one tap on each side of every pixel of a line to the sums of the filter, none where one lies outside.
+
+    The sum over a pair of opposite taps is free of the slope of the surface; a single tap at the border of the image,
+    where new surface enters the map, would pull every slanted surface towards the side that remains.
+    """
+    for u in range(middle.size):
+        z, scale = middle[u], inverse[u]
+        d, e = before[u] - z, after[u] - z
+        inside = spatial if min(before[u], after[u]) > OUTSIDE else np.float32(0)
+        s, t = range_weight(d, scale) * inside, range_weight(e, scale) * inside
+        numerator[u] += s * d + t * e
+        denominator[u] += s + t
+
+
+@kernel
+def _start(middle, alpha, inverse, numerator, denominator):
+    """Sums of the filter with the centre tap alone, and 1 / (16 sigma_c^2) of each pixel."""
+    for u in range(middle.size):
+        z = middle[u]
+        sigma = max(alpha * z * z, np.float32(1e-4))
+        inverse[u] = np.float32(1 / 16) / (sigma * sigma)
+        numerator[u] = np.float32(0)
+        denominator[u] = np.float32(1)
+
+
+@kernel
+def bilateral(row_start, row_stop, padded, alpha, spatial, out):
+    """Depth-adaptive bilateral filter (thesis eq. 4.8-4.11), separable: down the columns, then along the rows.
+
+    Unlike in the thesis, taps whose opposite lies outside the image are left out (``_accumulate``).
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        padded: (H + 2r, W + 2r) float32, metres, ABSENT where there is no reading, OUTSIDE in the border of r pixels.
+        alpha: sigma_c over squared depth, 1/m.
+        spatial: (r + 1,) float32 weights by pixel distance.
+        out: (H, W) float32 out; 0 where there is no reading.
+    """
+    r = spatial.size - 1
+    w = padded.shape[1] - 2 * r
+    column = np.empty(w + 2 * r, np.float32)
+    numerator = np.empty(w + 2 * r, np.float32)
+    denominator = np.empty(w + 2 * r, np.float32)
+    inverse = np.empty(w + 2 * r, np.float32)
+    for v in range(row_start, row_stop):
+        middle = padded[v + r]
+        _start(middle, alpha, inverse, numerator, denominator)
+        for k in range(1, r + 1):
+            before, after = padded[v + r - k], padded[v + r + k]
+            _accumulate(middle, before, after, inverse, spatial[k], numerator, denominator)
+        for u in range(column.size):
+            column[u] = middle[u] + numerator[u] / denominator[u]
+        middle = column[r : r + w]
+        _start(middle, alpha, inverse, numerator, denominator)
+        for k in range(1, r + 1):
+            before, after = column[r - k : r - k + w], column[r + k : r + k + w]
+            _accumulate(middle, before, after, inverse, spatial[k], numerator, denominator)
+        row = out[v]
+        for u in range(w):
+            z = middle[u]
+            row[u] = z + numerator[u] / denominator[u] if z > np.float32(0) else np.float32(0)
+
+
+@kernel
+def pad(row_start, row_stop, depth, margin, out):
+    """Copy rows of ``depth`` into the middle of ``out`` (H + 2 margin, W + 2 margin), ABSENT for no reading."""
+    w = depth.shape[1]
+    for v in range(row_start, row_stop):
+        source, target = depth[v], out[v + margin][margin : margin + w]
+        for u in range(w):
+            z = source[u]
+            target[u] = z if z > np.float32(0) else ABSENT
+
+
+@kernel
+def intensities(row_start, row_stop, rgb, out):
+    """Intensity 0.299 R + 0.587 G + 0.114 B in 0..1 of ``rgb`` (H, W, 3) uint8 into ``out`` (H, W) float32."""
+    red, green, blue = np.float32(0.299 / 255), np.float32(0.587 / 255), np.float32(0.114 / 255)
+    for v in range(row_start, row_stop):
+        source, shade = rgb[v].reshape(-1), out[v]
+        for u in range(shade.size):
+            r, g, b = source[np.uintp(3 * u)], source[np.uintp(3 * u + 1)], source[np.uintp(3 * u + 2)]
+            shade[u] = red * np.float32(r) + green * np.float32(g) + blue * np.float32(b)
+
+
+@kernel
+def halve_intensity(row_start, row_stop, image, out):
+    """Mean of each 2x2 block of ``image`` (2h or 2h + 1, 2w or 2w + 1) into ``out`` (h, w)."""
+    quarter = np.float32(0.25)
+    for v in range(row_start, row_stop):
+        upper, lower, target = image[2 * v], image[2 * v + 1], out[v]
+        for u in range(target.size):
+            k = np.uintp(2 * u)
+            j = np.uintp(2 * u + 1)
+            target[u] = quarter * ((upper[k] + upper[j]) + (lower[k] + lower[j]))
+
+
+@written_out
+def foreground_mean(a, b, c, d, band):
+    """Mean of those of four readings that lie within ``max(band, band z)`` behind the nearest z; 0 without any."""
+    zero, one, far = f32(0), f32(1), f32(1e9)
+    a, b = a if a > zero else far, b if b > zero else far
+    c, d = c if c > zero else far, d if d > zero else far
+    near = min(min(a, b), min(c, d))
+    limit = near + band * max(one, near)
+    wa, wb = one if a <= limit else zero, one if b <= limit else zero
+    wc, wd = one if c <= limit else zero, one if d <= limit else zero
+    mean = (wa * a + wb * b + wc * c + wd * d) / (wa + wb + wc + wd)
+    return mean if near < far else zero
+
+
+@kernel
+def halve_depth(row_start, row_stop, depth, band, out):
+    """Mean of the readings of each 2x2 block that lie within ``max(band, band z)`` behind its nearest reading z.
+
+    Foreground and background are never mixed; a block without a reading gives 0.
+    """
+    for v in range(row_start, row_stop):
+        upper, lower, target = depth[2 * v], depth[2 * v + 1], out[v]
+        for u in range(target.size):
+            k = np.uintp(2 * u)
+            j = np.uintp(2 * u + 1)
+            target[u] = foreground_mean(upper[k], upper[j], lower[k], lower[j], band)

@@ -1,0 +1,113 @@
+"""Hash table from block coordinates to map entries (thesis eq. 4.48; Teschner et al. 2003, Niessner et al. 2013).
+
+Open addressing with linear probing over a table of any size; a cell holds an entry's number or -1. Entries are
+never removed: a block that becomes free space keeps its entry and releases its voxels.
+"""
+
+import numpy as np
+
+from dudmap.core.backends.threads import kernel
+
+EMPTY = -1
+"""Content of a free cell of the table."""
+
+
+@kernel
+def _cell(x, y, z, size):
+    """First cell of block (x, y, z): the thesis' hash, mixed (Knuth's multiplicative method), scaled to the table."""
+    mixed = ((x * 73856093) ^ (y * 19349669) ^ (z * 83492791)) * np.int64(-7046029254386353131)
+    return (((mixed >> 32) & 0xFFFFFFFF) * size) >> 32
+
+
+@kernel
+def find(table, coords, x, y, z):
+    """Entry of block (x, y, z), or -1."""
+    cell = _cell(x, y, z, table.size)
+    while table[cell] != EMPTY:
+        entry = table[cell]
+        if coords[entry, 0] == x and coords[entry, 1] == y and coords[entry, 2] == z:
+            return entry
+        cell = cell + 1 if cell + 1 < table.size else 0
+    return EMPTY
+
+
+@kernel
+def find_all(table, coords, wanted):
+    """Entries (n,) int32 of blocks ``wanted`` (n, 3), -1 where there is none."""
+    out = np.empty(len(wanted), np.int32)
+    for n in range(len(wanted)):
+        out[n] = find(table, coords, np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2]))
+    return out
+
+
+@kernel
+def insert_all(table, coords, num_entries, wanted):
+    """Entries (n,) int32 of blocks ``wanted`` (n, 3) and the new number of entries; unknown blocks are added.
+
+    ``table`` and ``coords`` must have room for all of them.
+    """
+    out = np.empty(len(wanted), np.int32)
+    for n in range(len(wanted)):
+        x, y, z = np.int64(wanted[n, 0]), np.int64(wanted[n, 1]), np.int64(wanted[n, 2])
+        cell = _cell(x, y, z, table.size)
+        entry = -1
+        while table[cell] != EMPTY:
+            other = table[cell]
+            if coords[other, 0] == x and coords[other, 1] == y and coords[other, 2] == z:
+                entry = other
+                break
+            cell = cell + 1 if cell + 1 < table.size else 0
+        if entry < 0:
+            entry = num_entries
+            num_entries += 1
+            table[cell] = entry
+            coords[entry, 0], coords[entry, 1], coords[entry, 2] = x, y, z
+        out[n] = entry
+    return out, num_entries
+
+
+@kernel
+def rebuild(table, coords, num_entries):
+    """Fill an all-empty ``table`` with entries 0 to ``num_entries``."""
+    for entry in range(num_entries):
+        cell = _cell(np.int64(coords[entry, 0]), np.int64(coords[entry, 1]), np.int64(coords[entry, 2]), table.size)
+        while table[cell] != EMPTY:
+            cell = cell + 1 if cell + 1 < table.size else 0
+        table[cell] = entry
+
+
+@kernel
+def in_use(slots, entry_of):
+    """Those of the slots (n,) that an entry has."""
+    kept, count = np.empty_like(slots), 0
+    for slot in slots:
+        kept[count] = slot
+        count += np.int64(entry_of[slot] >= 0)
+    return kept[:count]
+
+
+@kernel
+def fill_window(window, origin, coords, slot_of, num_entries, inside):
+    """Write every entry that lies in the window: its voxel slot, or ``-2 - entry`` for one without voxels.
+
+    Args:
+        window: (Wx, Wy, Wz) int32 in and out.
+        origin: (3,) int64 coordinates of its first block.
+        coords, slot_of, num_entries: The entries.
+        inside: (num_entries,) int32 out, the slots in the window.
+
+    Returns:
+        Number of slots in the window.
+    """
+    count = 0
+    for entry in range(num_entries):
+        x = coords[entry, 0] - origin[0]
+        y = coords[entry, 1] - origin[1]
+        z = coords[entry, 2] - origin[2]
+        if 0 <= x < window.shape[0] and 0 <= y < window.shape[1] and 0 <= z < window.shape[2]:
+            slot = slot_of[entry]
+            window[x, y, z] = slot if slot >= 0 else -2 - entry
+            if slot >= 0:
+                inside[count] = slot
+                count += 1
+    return count

@@ -1,0 +1,297 @@
+"""Label images: mixture of residual densities, mean-field smoothing, region growing, upsampling to full resolution.
+
+The scalar formulas stand first, each in a function of its own; the loops over histograms and images follow.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
+
+f64, exp, sqrt = np.float64, np.exp, np.sqrt
+UPSAMPLING_BAND = 60
+"""Image rows per band of the upsampling."""
+DISTANCE_COST = np.float32(1e-4)
+"""Cost of one low-resolution pixel of image distance in the upsampling, metres of depth difference: less than a depth
+sensor resolves, so that the distance decides between equal depths only."""
+SMALLEST = np.float64(1e-300)
+"""Least sum of two densities: keeps the quotient of two that vanish finite."""
+MISSING_COST = np.float32(64)
+"""Cost of pairing a pixel that has a depth with one that has none, metres: more than any depth difference."""
+
+
+@scalar
+def half_normal(square, prior, sigma):
+    """Density of a component of the mixture up to the common factor sqrt(2 / pi) (thesis eq. 4.56).
+
+    Args:
+        square: Squared normalised residual.
+        prior: Prior of the component.
+        sigma: Its standard deviation.
+    """
+    return prior / sigma * exp(f64(-0.5) * square / (sigma * sigma))
+
+
+@scalar
+def dynamic_responsibility(square, prior, static, dynamic):
+    """Posterior probability that a residual belongs to the dynamic component (E-step; thesis eq. 4.53).
+
+    Args:
+        square: Squared normalised residual.
+        prior: Prior of the dynamic component.
+        static, dynamic: Standard deviations of the components.
+    """
+    p = half_normal(square, f64(1) - prior, static)
+    q = half_normal(square, prior, dynamic)
+    return q / max(p + q, SMALLEST)
+
+
+@scalar
+def bounded_sigma(squares, mass, low, high):
+    """Maximum-likelihood standard deviation of a half-normal density within bounds (M-step; thesis eq. 4.55).
+
+    Args:
+        squares: Sum of the squared residuals, weighted by the responsibilities.
+        mass: Sum of the responsibilities.
+        low, high: Bounds.
+    """
+    return min(max(sqrt(squares / max(mass, f64(1e-9))), low), high)
+
+
+@scalar
+def tanh(x):
+    """Hyperbolic tangent for |x| <= 5 within 3e-4 (Lambert's continued fraction), in arithmetic that vectorises."""
+    square = x * x
+    top = x * (np.float32(135135) + square * (np.float32(17325) + square * (np.float32(378) + square)))
+    bottom = np.float32(135135) + square * (np.float32(62370) + square * (np.float32(3150) + square * np.float32(28)))
+    return top / bottom
+
+
+@scalar
+def mean_spin(log_odds):
+    """Expectation of a spin (static = 1, dynamic = -1) with these log odds static : dynamic: tanh(log_odds / 2)."""
+    return tanh(np.float32(0.5) * log_odds)
+
+
+@scalar
+def same_surface(z, z_neighbour, tolerance):
+    """Whether two neighbouring pixels both have a depth, and depths that differ by no more than ``tolerance``."""
+    zero = np.float32(0)
+    return (z_neighbour > zero) & (z > zero) & (abs(z_neighbour - z) <= tolerance)
+
+
+@scalar
+def depth_cost(z, z_low):
+    """Cost of giving a full-resolution pixel of depth ``z`` the label of a low-resolution one: their depth difference,
+    metres, or ``MISSING_COST`` where only one of them has a depth."""
+    zero = np.float32(0)
+    return abs(z_low - z) if (z > zero) == (z_low > zero) else MISSING_COST
+
+
+@kernel
+def fit_mixture(counts, centers, iterations, start, prior_bounds, static_bounds, separation, max_sigma):
+    """Expectation maximisation of two half-normal densities on a histogram (thesis eq. 4.52-4.56).
+
+    Args:
+        counts: (n,) float64.
+        centers: (n,) float64, normalised residuals.
+        iterations: Most iterations.
+        start: First prior of the dynamic density, standard deviations of the static and of the dynamic one.
+        prior_bounds: Bounds of the prior of the dynamic density.
+        static_bounds: Bounds of the standard deviation of the static density.
+        separation: Least ratio of the standard deviations, dynamic : static.
+        max_sigma: Largest standard deviation of the dynamic density.
+
+    Returns:
+        Prior of the dynamic density, standard deviations of the static and of the dynamic one; ``start`` where the
+        histogram is empty.
+    """
+    total = counts.sum()
+    prior, static, dynamic = start
+    if total == 0:
+        return prior, static, dynamic
+    for _ in range(iterations):
+        mass, static_squares, dynamic_squares = 0.0, 0.0, 0.0
+        for n in range(len(counts)):
+            square = centers[n] * centers[n]
+            share = dynamic_responsibility(square, prior, static, dynamic)
+            mass += share * counts[n]
+            dynamic_squares += share * counts[n] * square
+            static_squares += (1 - share) * counts[n] * square
+        new_prior = min(max(mass / total, prior_bounds[0]), prior_bounds[1])
+        new_static = bounded_sigma(static_squares, total - mass, static_bounds[0], static_bounds[1])
+        new_dynamic = bounded_sigma(dynamic_squares, mass, separation * new_static, max_sigma)
+        step = max(abs(new_static - static), abs(new_dynamic - dynamic))
+        converged = abs(new_prior - prior) < 1e-4 and step < 1e-3
+        prior, static, dynamic = new_prior, new_static, new_dynamic
+        if converged:
+            break
+    return prior, static, dynamic
+
+
+@kernel
+def grow_regions(seeds, open_pixels, depth, tolerance):
+    """Flood fill from seeds over open pixels that does not cross depth edges.
+
+    Args:
+        seeds: (h, w) bool.
+        open_pixels: (h, w) bool, pixels a region may grow into.
+        depth: (h, w) float32, metres, 0 = none.
+        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+
+    Returns:
+        (h, w) int32 number of each pixel's region from 1, 0 = none, and the number of regions.
+    """
+    h, w = depth.shape
+    stack = np.empty(h * w, np.int32)
+    labels = np.zeros((h, w), np.int32)
+    count = 0
+    for v0 in range(h):
+        for u0 in range(w):
+            if not seeds[v0, u0] or labels[v0, u0] != 0:
+                continue
+            count += 1
+            labels[v0, u0] = count
+            stack[0] = v0 * w + u0
+            top = 1
+            while top > 0:
+                top -= 1
+                v, u = stack[top] // w, stack[top] % w
+                z = depth[v, u]
+                for k in range(4):
+                    vn = v + (1 if k == 0 else -1 if k == 1 else 0)
+                    un = u + (1 if k == 2 else -1 if k == 3 else 0)
+                    if vn < 0 or un < 0 or vn >= h or un >= w or labels[vn, un] != 0:
+                        continue
+                    if not (open_pixels[vn, un] or seeds[vn, un]) or depth[vn, un] <= 0:
+                        continue
+                    if abs(depth[vn, un] - z) <= tolerance[v, u]:
+                        labels[vn, un] = count
+                        stack[top] = vn * w + un
+                        top += 1
+    return labels, count
+
+
+@kernel
+def mean_field(evidence, depth, tolerance, coupling, iterations):
+    """Static probabilities with neighbourhood consistency (cliques of thesis algorithm 3), by mean-field iteration.
+
+    With the spin s = 1 for static and -1 for dynamic, each sweep sets the expectation of every spin to
+
+        <s_i> = tanh((e_i + coupling / 8 * sum_j <s_j>) / 2)
+
+    over the neighbours j among the 8 that lie on the same surface.
+
+    Args:
+        evidence: (h, w) float32 log odds static : dynamic of each pixel alone, at most 6; 0 = unknown.
+        depth: (h, w) float32, metres, 0 = none.
+        tolerance: (h, w) float32, largest depth step to a neighbour of the same surface, metres.
+        coupling: Log odds that all neighbours together can add, at most 4.
+        iterations: Sweeps.
+
+    Returns:
+        (h, w) float32 static probability.
+    """
+    h, w = depth.shape
+    zero, half = np.float32(0), np.float32(0.5)
+    per_neighbour = np.float32(coupling) / np.float32(8)
+    # with a border, so that every pixel has eight neighbours
+    z = np.zeros((h + 2, w + 2), np.float32)
+    spin, new = np.zeros((h + 2, w + 2), np.float32), np.zeros((h + 2, w + 2), np.float32)
+    for v in range(h):
+        for u in range(w):
+            z[v + 1, u + 1] = depth[v, u]
+            spin[v + 1, u + 1] = mean_spin(evidence[v, u])
+    total = np.empty(w, np.float32)
+    for _ in range(iterations):
+        for v in range(h):
+            for u in range(w):
+                total[u] = zero
+            for k in range(9):
+                dv, du = k // 3, k % 3
+                weight = zero if k == 4 else np.float32(1)  # a pixel is not its own neighbour
+                for u in range(w):
+                    n = np.uintp(u + du)
+                    same = same_surface(z[v + 1, np.uintp(u + 1)], z[v + dv, n], tolerance[v, u])
+                    total[u] += weight * spin[v + dv, n] if same else zero
+            for u in range(w):
+                new[v + 1, np.uintp(u + 1)] = mean_spin(evidence[v, u] + per_neighbour * total[u])
+        spin, new = new, spin
+    probability = np.empty((h, w), np.float32)
+    for v in range(h):
+        for u in range(w):
+            probability[v, u] = half + half * spin[v + 1, np.uintp(u + 1)]
+    return probability
+
+
+def upsample_labels(
+    low: NDArray[np.bool_], low_depth: NDArray[np.float32], depth: NDArray[np.float32], stride: int
+) -> NDArray[np.bool_]:
+    """Labels at full resolution: each pixel takes that of the adjacent low-resolution pixel with the nearest depth.
+
+    Args:
+        low: (h, w) bool.
+        low_depth: (h, w) float32, metres, 0 = none.
+        depth: (H, W) float32, metres, 0 = none.
+        stride: Full-resolution pixels per low-resolution pixel; low-resolution pixel k covers the columns (and rows)
+            from k * stride to (k + 1) * stride - 1.
+
+    Returns:
+        (H, W) bool.
+    """
+    out = np.empty(depth.shape, dtype=np.uint8)
+    marks = low.astype(np.uint8)
+    run_bands(
+        lambda start, stop: upsample_rows(start, stop, marks, low_depth, depth, stride, out),
+        bands(depth.shape[0], UPSAMPLING_BAND),
+    )
+    return out.view(np.bool_)
+
+
+@kernel
+def upsample_rows(row_start, row_stop, low, low_depth, depth, stride, out):
+    """Rows ``row_start`` to ``row_stop`` of ``upsample_labels``; ``low`` and ``out`` are uint8."""
+    h, w = low.shape
+    width = depth.shape[1]
+    zero = np.float32(0)
+    # cost of the image distance to the low-resolution columns on the left and on the right of each pixel
+    across = np.empty((2, width), np.float32)
+    for u in range(width):
+        across[0, u] = DISTANCE_COST * np.float32((2 * u + 1 - stride) % (2 * stride)) / np.float32(2 * stride)
+        across[1, u] = DISTANCE_COST - across[0, u]
+    # depth and label of the four low-resolution pixels whose centres surround each pixel, from the upper left on
+    adjacent, marks = np.empty((4, width), np.float32), np.empty((4, width), np.float32)
+    last = np.int64(-(2**31))
+    first, stop = 0, 0
+    for v in range(row_start, row_stop):
+        y = (2 * v + 1 - stride) // (2 * stride)
+        if y != last:
+            last = y
+            upper, lower = min(max(y, 0), h - 1), min(max(y + 1, 0), h - 1)
+            first, stop = w, 0  # the marked columns
+            for x in range(w):
+                if low[upper, x] | low[lower, x]:
+                    first, stop = min(first, x), x + 1
+            first, stop = max(first - 1, 0) * stride, min((stop + 1) * stride, width)
+            for u in range(first, stop):
+                x = (2 * u + 1 - stride) // (2 * stride)
+                left, right = min(max(x, 0), w - 1), min(max(x + 1, 0), w - 1)
+                adjacent[0, u], marks[0, u] = low_depth[upper, left], np.float32(low[upper, left])
+                adjacent[1, u], marks[1, u] = low_depth[upper, right], np.float32(low[upper, right])
+                adjacent[2, u], marks[2, u] = low_depth[lower, left], np.float32(low[lower, left])
+                adjacent[3, u], marks[3, u] = low_depth[lower, right], np.float32(low[lower, right])
+        target = out[v]
+        target[:] = 0  # what has no marked pixel beside it
+        row = depth[v]
+        below = DISTANCE_COST * np.float32((2 * v + 1 - stride) % (2 * stride)) / np.float32(2 * stride)
+        for u in range(first, stop):
+            n = np.uintp(u)
+            z = row[n]
+            best, label = np.float32(1e9), zero
+            for k in range(4):
+                candidate = marks[k, n]
+                cost = depth_cost(z, adjacent[k, n]) + (across[k & 1, n] + (below if k < 2 else DISTANCE_COST - below))
+                better = cost < best
+                best = cost if better else best
+                label = candidate if better else label
+            target[n] = np.uint8(label)

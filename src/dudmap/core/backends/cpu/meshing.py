@@ -1,0 +1,389 @@
+"""Marching cubes over voxel blocks with shared vertices (Lorensen & Cline 1987; thesis section 4.5).
+
+A vertex belongs to the lattice edge it lies on and an edge to the voxel at its lower end, so that every vertex exists
+once, also where blocks meet. Four passes over the blocks: the case of each cell, the vertices that each voxel
+owns, and, once the offset of each block is known, vertices and triangles. The tables are arguments, not globals: a
+global array is frozen into the compiled code, and numba's cache does not notice when its module changes.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.links import links
+from dudmap.core.backends.cpu.tables import TRIANGLE_COUNT, TRIANGLES
+from dudmap.core.backends.parameters import MeshArrays, MeshParameters
+from dudmap.core.backends.threads import bands, kernel, run_bands
+from dudmap.core.formulas.surface import crossing, mixed_channel, slope
+
+BAND = 256
+"""Blocks of one band."""
+
+
+@kernel
+def _corner_words(geometry, near, row, words):
+    """Words (9, 9, 9) of a block's voxels and of those one step beyond its upper sides; 0 where there is no block."""
+    for m in range(8):
+        dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
+        slot = near[row, m]
+        nx, ny, nz = (1 if dx else 8), (1 if dy else 8), (1 if dz else 8)
+        for i in range(nx):
+            for j in range(ny):
+                target = words[8 * dx + i, 8 * dy + j, 8 * dz : 8 * dz + nz]
+                if slot < 0:
+                    target[:] = 0
+                else:
+                    first = (i * 8 + j) * 8
+                    target[:] = geometry[slot, first : first + nz]
+
+
+@kernel
+def _classify(start, stop, geometry, near, min_weight, max_jump, triangle_count, cases):
+    """Case of each cell of blocks ``start`` to ``stop``; cells without a surface or a trusted corner keep their 0.
+
+    A cell across which the distance jumps by more than ``max_jump`` steps is an occlusion boundary, where the band
+    behind one object meets the free space beside it, and holds no surface.
+
+    Returns:
+        (stop - start,) int64 triangles per block.
+    """
+    words = np.empty((9, 9, 9), np.int32)
+    signs = np.empty(729, np.int32)
+    unsure = np.empty(729, np.int32)
+    flat = words.reshape(-1)
+    count = np.zeros(stop - start, np.int64)
+    for row in range(start, stop):
+        _corner_words(geometry, near, row, words)
+        negative = np.int32(0)
+        for n in range(729):
+            inside = np.int32(1) if flat[n] < 0 else np.int32(0)
+            negative += inside
+            signs[n] = inside
+            unsure[n] = 0 if ((flat[n] >> 8) & 0xFF) >= min_weight else 1
+        total = np.int64(0)
+        if 0 < negative < 729:
+            for i in range(8):
+                for j in range(8):
+                    base = (i * 9 + j) * 9
+                    for k in range(8):
+                        n = np.uintp(base + k)
+                        case = signs[n] | (signs[n + np.uintp(1)] << 1)
+                        case |= (signs[n + np.uintp(9)] << 2) | (signs[n + np.uintp(10)] << 3)
+                        case |= (signs[n + np.uintp(81)] << 4) | (signs[n + np.uintp(82)] << 5)
+                        case |= (signs[n + np.uintp(90)] << 6) | (signs[n + np.uintp(91)] << 7)
+                        bad = unsure[n] | unsure[n + np.uintp(1)] | unsure[n + np.uintp(9)]
+                        bad |= unsure[n + np.uintp(10)] | unsure[n + np.uintp(81)] | unsure[n + np.uintp(82)]
+                        bad |= unsure[n + np.uintp(90)] | unsure[n + np.uintp(91)]
+                        case = 0 if bad != 0 or case == 255 else case
+                        if case != 0:
+                            low, high = np.int32(32767), np.int32(-32768)
+                            for m in range(8):
+                                corner = n + np.uintp(81 * (m >> 2) + 9 * ((m >> 1) & 1) + (m & 1))
+                                low, high = min(low, flat[corner] >> 16), max(high, flat[corner] >> 16)
+                            case = 0 if high - low > max_jump else case
+                        cases[row, (i * 8 + j) * 8 + k] = case
+                        total += np.int64(triangle_count[case])
+        count[row - start] = total
+    return count
+
+
+@kernel
+def _find_vertices(start, stop, geometry, near, behind, cases, flags):
+    """Bit ``axis`` of ``flags`` for each voxel whose edge along that axis carries a vertex of a cell with triangles.
+
+    Returns:
+        (stop - start,) int64 vertices per block.
+    """
+    words = np.empty((9, 9, 9), np.int32)
+    used = np.empty((9, 9, 9), np.uint8)  # cells -1 to 7 in each direction
+    count = np.zeros(stop - start, np.int64)
+    for row in range(start, stop):
+        any_used = False
+        for m in range(8):
+            dx, dy, dz = m >> 2, (m >> 1) & 1, m & 1
+            other = behind[row, m]
+            for i in range(7 if dx else 0, 8):
+                for j in range(7 if dy else 0, 8):
+                    for k in range(7 if dz else 0, 8):
+                        case = cases[other, (i * 8 + j) * 8 + k] if other >= 0 else np.uint8(0)
+                        used[0 if dx else i + 1, 0 if dy else j + 1, 0 if dz else k + 1] = case
+                        any_used |= case != 0
+        if not any_used:
+            flags[row, :] = 0
+            continue
+        _corner_words(geometry, near, row, words)
+        total = 0
+        for i in range(8):
+            for j in range(8):
+                for k in range(8):
+                    word = words[i, j, k]
+                    flag = 0
+                    middle = used[i + 1, j + 1, k + 1]
+                    if (word ^ words[i + 1, j, k]) < 0 and (
+                        middle | used[i + 1, j, k + 1] | used[i + 1, j + 1, k] | used[i + 1, j, k]
+                    ):
+                        flag |= 1
+                        total += 1
+                    if (word ^ words[i, j + 1, k]) < 0 and (
+                        middle | used[i, j + 1, k + 1] | used[i + 1, j + 1, k] | used[i, j + 1, k]
+                    ):
+                        flag |= 2
+                        total += 1
+                    if (word ^ words[i, j, k + 1]) < 0 and (
+                        middle | used[i, j + 1, k + 1] | used[i + 1, j, k + 1] | used[i, j, k + 1]
+                    ):
+                        flag |= 4
+                        total += 1
+                    flags[row, (i * 8 + j) * 8 + k] = flag
+        count[row - start] = total
+    return count
+
+
+@kernel
+def _step_block(near, behind, row_of, row, axis, sign):
+    """Row of the block next to ``row`` along an axis, or -1."""
+    if row < 0 or sign == 0:
+        return row
+    m = 4 >> axis
+    if sign < 0:
+        return np.int64(behind[row, m])
+    slot = near[row, m]
+    return np.int64(row_of[slot]) if slot >= 0 else np.int64(-1)
+
+
+@kernel
+def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
+    """Words (10, 10, 10) of a block's voxels and of those one step beyond all its sides; 0 where no block is reached.
+
+    A block across a corner with mixed signs is reached through a neighbour, in either order of the axes; a voxel
+    that is missed there makes one normal slightly less accurate.
+    """
+    for part in range(27):
+        sx, sy, sz = part // 9 - 1, (part // 3) % 3 - 1, part % 3 - 1
+        other = _step_block(near, behind, row_of, row, 0, sx)
+        other = _step_block(near, behind, row_of, other, 1, sy)
+        other = _step_block(near, behind, row_of, other, 2, sz)
+        if other < 0:
+            other = _step_block(near, behind, row_of, row, 2, sz)
+            other = _step_block(near, behind, row_of, other, 1, sy)
+            other = _step_block(near, behind, row_of, other, 0, sx)
+        x0, y0, z0 = (7 if sx < 0 else 0), (7 if sy < 0 else 0), (7 if sz < 0 else 0)
+        nx, ny, nz = (1 if sx else 8), (1 if sy else 8), (1 if sz else 8)
+        tx, ty, tz = 8 * sx + x0 + 1, 8 * sy + y0 + 1, 8 * sz + z0 + 1
+        for i in range(nx):
+            for j in range(ny):
+                target = words[tx + i, ty + j, tz : tz + nz]
+                if other < 0:
+                    target[:] = 0
+                else:
+                    first = ((x0 + i) * 8 + y0 + j) * 8 + z0
+                    target[:] = geometry[slots[other], first : first + nz]
+
+
+@kernel
+def _slope(words, n, step):
+    """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
+    return slope(words[n], words[n + step], words[n - step])
+
+
+@kernel
+def _write_vertices(
+    start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, begin, voxel_size,
+    first, vertices, vertex_colors, normals,
+):  # fmt: skip
+    """Position, colour and normal of each vertex; ``first`` gets each voxel's first vertex within its block."""
+    words = np.empty((10, 10, 10), np.int32)
+    flat = words.reshape(-1)
+    for row in range(start, stop):
+        number = begin[row]
+        if number == begin[row + 1]:
+            continue
+        _surrounded_words(geometry, slots, near, behind, row_of, row, words)
+        slot = slots[row]
+        for n in range(512):
+            flag = flags[row, n]
+            first[row, n] = number - begin[row]
+            if flag == 0:
+                continue
+            x, y, z = n >> 6, (n >> 3) & 7, n & 7
+            here = (x + 1) * 100 + (y + 1) * 10 + z + 1
+            for axis in range(3):
+                if not (flag >> axis) & 1:
+                    continue
+                step = 100 if axis == 0 else (10 if axis == 1 else 1)
+                a, b = np.float32(flat[here] >> 16), np.float32(flat[here + step] >> 16)
+                t = crossing(a, b)
+                ex, ey, ez = x + (axis == 0), y + (axis == 1), z + (axis == 2)
+                vertices[number, 0] = voxel_size * (8 * coords[slot, 0] + x + (t if axis == 0 else 0.0))
+                vertices[number, 1] = voxel_size * (8 * coords[slot, 1] + y + (t if axis == 1 else 0.0))
+                vertices[number, 2] = voxel_size * (8 * coords[slot, 2] + z + (t if axis == 2 else 0.0))
+                other = near[row, (ex >> 3) * 4 + (ey >> 3) * 2 + (ez >> 3)]
+                c = colors[slot, n]
+                e = colors[other, ((ex & 7) * 8 + (ey & 7)) * 8 + (ez & 7)]
+                for channel in range(3):
+                    shift = 20 - 10 * channel
+                    low, high = np.float32((c >> shift) & 1023), np.float32((e >> shift) & 1023)
+                    vertex_colors[number, channel] = np.uint8(mixed_channel(low, high, t))
+                square = np.float32(1e-20)
+                for direction in range(3):
+                    across = 100 if direction == 0 else (10 if direction == 1 else 1)
+                    if direction == axis:
+                        steepness = b - a
+                    else:
+                        low = _slope(flat, here, across)
+                        steepness = low + (_slope(flat, here + step, across) - low) * t
+                    normals[number, direction] = steepness
+                    square += steepness * steepness
+                scale = np.float32(1) / np.sqrt(square)
+                for direction in range(3):
+                    normals[number, direction] *= scale
+                number += 1
+
+
+@kernel
+def _write_faces(start, stop, near, row_of, cases, flags, first_vertex, first, begin, triangle_count, triangles, faces):
+    """Triangles of the cells of blocks ``start`` to ``stop`` as numbers of vertices."""
+    for row in range(start, stop):
+        number = begin[row]
+        if number == begin[row + 1]:
+            continue
+        for n in range(512):
+            case = cases[row, n]
+            if case == 0:
+                continue
+            x, y, z = n >> 6, (n >> 3) & 7, n & 7
+            for k in range(3 * np.int64(triangle_count[case])):
+                corner, axis = np.int64(triangles[case, k, 0]), np.int64(triangles[case, k, 1])
+                i, j, m = x + (corner >> 2), y + ((corner >> 1) & 1), z + (corner & 1)
+                owner = row
+                if (i | j | m) & 8:
+                    owner = np.int64(row_of[near[row, (i >> 3) * 4 + (j >> 3) * 2 + (m >> 3)]])
+                voxel = ((i & 7) * 8 + (j & 7)) * 8 + (m & 7)
+                below = flags[owner, voxel] & ((1 << axis) - 1)
+                vertex = first_vertex[owner] + np.int64(first[owner, voxel]) + (below & 1) + (below >> 1)
+                faces[number + k // 3, k % 3] = vertex
+            number += np.int64(triangle_count[case])
+
+
+@kernel
+def _split(begin, num_vertices, faces, vertex_ids, local_faces, first_vertex):
+    """Copy shared vertices for each chunk: chunk c has the faces ``begin[c]`` to ``begin[c + 1]``.
+
+    Args:
+        begin: (chunks + 1,) int64.
+        num_vertices: Number of shared vertices.
+        faces: (F, 3) int32.
+        vertex_ids: (>= sum of the chunks' vertices,) int32 out: the shared vertex that each vertex is a copy of.
+        local_faces: (F, 3) int32 out, vertices numbered within the chunk.
+        first_vertex: (chunks + 1,) int64 out, into ``vertex_ids``.
+    """
+    known_in = np.full(num_vertices, -1, np.int32)
+    local = np.empty(num_vertices, np.int32)
+    total = 0
+    for chunk in range(len(begin) - 1):
+        first_vertex[chunk] = total
+        for face in range(begin[chunk], begin[chunk + 1]):
+            for k in range(3):
+                vertex = faces[face, k]
+                if known_in[vertex] != chunk:
+                    known_in[vertex] = chunk
+                    local[vertex] = total - first_vertex[chunk]
+                    vertex_ids[total] = vertex
+                    total += 1
+                local_faces[face, k] = local[vertex]
+    first_vertex[len(begin) - 1] = total
+
+
+def extract(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.integer],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+) -> MeshArrays:
+    """Triangles of the zero level of the given blocks; see ``Backend.extract_mesh``."""
+    vertices, faces, vertex_colors, normals, _ = extract_surface(
+        geometry, colors, slots, coords, neighbours, parameters, len(slots)
+    )
+    return MeshArrays(vertices, faces, vertex_colors, normals)
+
+
+def extract_chunks(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.integer],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+    chunks: NDArray[np.integer],
+) -> list[MeshArrays]:
+    """Meshes of groups of blocks that share no vertices; see ``Backend.extract_chunks``."""
+    num_chunks = int(chunks.max(initial=-1)) + 1
+    order = np.argsort(np.where(chunks < 0, num_chunks, chunks), kind="stable")
+    per_chunk = np.bincount(chunks[chunks >= 0], minlength=num_chunks)
+    vertices, faces, vertex_colors, normals, first_face = extract_surface(
+        geometry, colors, slots[order], coords, neighbours[order], parameters, int(per_chunk.sum())
+    )
+    begin = first_face[_offsets([per_chunk])]
+    ids, local_faces = np.empty(faces.size, dtype=np.int32), np.empty_like(faces)
+    first = np.empty(num_chunks + 1, dtype=np.int64)
+    _split(begin, len(vertices), faces, ids, local_faces, first)
+    ids = ids[: first[-1]]
+    vertices, vertex_colors, normals = vertices[ids], vertex_colors[ids], normals[ids]
+    out = []
+    for chunk in range(num_chunks):  # copies: a view would keep the arrays of all chunks alive
+        own, faces_of = slice(first[chunk], first[chunk + 1]), slice(begin[chunk], begin[chunk + 1])
+        parts = vertices[own], local_faces[faces_of], vertex_colors[own], normals[own]
+        out.append(MeshArrays(*(part.copy() for part in parts)))
+    return out
+
+
+def extract_surface(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    slots: NDArray[np.int32],
+    coords: NDArray[np.integer],
+    neighbours: NDArray[np.int32],
+    parameters: MeshParameters,
+    num_meshed: int,
+) -> tuple[NDArray[np.float32], NDArray[np.int32], NDArray[np.uint8], NDArray[np.float32], NDArray[np.int64]]:
+    """Vertices, faces, colours and normals of the cells of the first ``num_meshed`` blocks, and the number of the first
+    face (n + 1,) of each block."""
+    n = len(slots)
+    slots, near, behind, row_of = links(slots, neighbours, len(geometry))
+    ranges = bands(n, BAND)
+    cases = np.zeros((n, 512), dtype=np.uint8)
+    flags = np.empty((n, 512), dtype=np.uint8)
+    least = max(int(parameters.min_weight), 1)
+    jump = int(min(parameters.max_jump / parameters.sdf_unit, 1 << 20))
+    triangles = run_bands(
+        lambda start, stop: _classify(start, stop, geometry, near, least, jump, TRIANGLE_COUNT, cases),
+        bands(num_meshed, BAND),
+    )
+    owned = run_bands(lambda start, stop: _find_vertices(start, stop, geometry, near, behind, cases, flags), ranges)
+    first_face = _offsets([*triangles, np.zeros(n - num_meshed)])
+    first_vertex = _offsets(owned)
+    vertices = np.empty((first_vertex[-1], 3), dtype=np.float32)
+    vertex_colors = np.empty((first_vertex[-1], 3), dtype=np.uint8)
+    normals = np.empty((first_vertex[-1], 3), dtype=np.float32)
+    faces = np.empty((first_face[-1], 3), dtype=np.int32)
+    first = np.empty((n, 512), dtype=np.uint16)
+    run_bands(
+        lambda start, stop: _write_vertices(
+            start, stop, geometry, colors, slots, coords, near, behind, row_of, flags, first_vertex,
+            float(parameters.voxel_size), first, vertices, vertex_colors, normals,
+        ),
+        ranges,
+    )  # fmt: skip
+    run_bands(
+        lambda start, stop: _write_faces(
+            start, stop, near, row_of, cases, flags, first_vertex, first, first_face, TRIANGLE_COUNT, TRIANGLES, faces
+        ),
+        bands(num_meshed, BAND),
+    )
+    return vertices, faces, vertex_colors, normals, first_face
+
+
+def _offsets(counts: list[NDArray]) -> NDArray[np.int64]:
+    """Offset of the first item of each block, and the number of all items at the end."""
+    return np.concatenate([[0], *counts]).astype(np.int64).cumsum()

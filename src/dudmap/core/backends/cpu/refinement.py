@@ -1,0 +1,246 @@
+"""Loops over blocks of one level of the map: where it is too coarse for the surface, and with what a finer one begins.
+
+A block is read with two voxels around it, from its 27 neighbours (``core/map/fine_blocks.py``).
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
+from dudmap.core.formulas.voxel import intensity_of, pack_color, pack_voxel, sdf_steps
+
+PAD = 2
+"""Voxels around a block that are read."""
+SIZE = 8 + 2 * PAD
+"""Edge of a block with these."""
+NEAR = np.float32(1)
+"""Distance from the surface, voxels, up to which the field is examined: beyond, it bends at edges far away."""
+SATURATED = np.float32(0.85)
+"""Share of the truncation band beyond which a distance may be cut off, and says nothing of the shape."""
+PRIOR = 8
+"""Largest weight that a voxel inherits: two frontal readings at one metre. What is inherited is the coarse surface,
+which the next readings should replace."""
+BAND = 64
+"""Blocks of one band."""
+
+
+@scalar
+def distance_bend(word, a, b, by_voxel, saturated):
+    """Second derivative of the distance at a voxel, per voxel, by those two voxels before and behind it, and whether it
+    is known; arguments as of ``examine_range``."""
+    f, fa, fb = sdf_steps(word) * by_voxel, sdf_steps(a) * by_voxel, sdf_steps(b) * by_voxel
+    known = ((a & 0xFF00) != 0) & ((b & 0xFF00) != 0) & (fa < saturated) & (fb < saturated)
+    return (fa - f - f + fb) * np.float32(0.25), known
+
+
+@scalar
+def intensity_bend(word, a, b):
+    """Second derivative of the intensity (0..1) at a voxel by its neighbours, and whether it is known."""
+    known = ((a & 0xFF) != 0) & ((b & 0xFF) != 0) & ((word & 0xFF) != 0)
+    return (intensity_of(a) + intensity_of(b) - np.float32(2) * intensity_of(word)) / np.float32(255), known
+
+
+@scalar
+def root_mean(total, count):
+    """Root mean square of ``count`` numbers by the sum of their squares."""
+    return np.sqrt(total / np.float32(max(count, 1)))
+
+
+@scalar
+def mean_voxel(steps, count, weight, shade, shades):
+    """Word of the mean of ``count`` voxels by the sums of their distances and of ``shades`` intensities; 0 = unknown,
+    where the least of their weights is 0."""
+    by = np.float32(1) / np.float32(max(shades, 1))
+    word = pack_voxel(steps / np.float32(count), np.float32(weight), shade * by)
+    return np.int32(word) if weight > 0 else np.int32(0)
+
+
+@scalar
+def mean_color(red, green, blue, count):
+    """Word of the mean of ``count`` colours by their sums; 0 = none."""
+    by = np.float32(1) / np.float32(max(count, 1))
+    word = pack_color(red * by, green * by, blue * by)
+    return np.int32(word) if count > 0 else np.int32(0)
+
+
+@kernel
+def padded(voxels, near, words):
+    """Words (SIZE, SIZE, SIZE) of a block and of the two voxels around it; 0 where there is no block.
+
+    Args:
+        voxels: (slots, 512) int32.
+        near: (27,) int32 slots of the block and its neighbours.
+        words: Out.
+    """
+    for n in range(27):
+        slot = near[n]
+        low = (n // 9 - 1, (n // 3) % 3 - 1, n % 3 - 1)
+        x0, y0, z0 = 8 * low[0] + PAD, 8 * low[1] + PAD, 8 * low[2] + PAD
+        for i in range(max(0, -x0), min(8, SIZE - x0)):
+            for j in range(max(0, -y0), min(8, SIZE - y0)):
+                for k in range(max(0, -z0), min(8, SIZE - z0)):
+                    words[x0 + i, y0 + j, z0 + k] = voxels[slot, (i * 8 + j) * 8 + k] if slot >= 0 else 0
+
+
+@kernel
+def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, texture, surface):
+    """How much the distance and the intensity bend near the surface in each octant of blocks.
+
+    With f the distance in voxels, D_a = (f(x + 2 e_a) - 2 f(x) + f(x - 2 e_a)) / 4 is its second derivative along axis
+    a; on a surface of curvature k the sum over the axes is about k times the voxel size, and linear interpolation
+    between voxels errs by an eighth of it. Steps of two voxels halve the share of the noise twice.
+
+    Args:
+        start, stop: Range of blocks.
+        geometry: (slots, 512) int32.
+        near: (n, 27) int32.
+        by_voxel: Voxels per step of the stored distance.
+        saturated: Distance from which on it may be cut off, voxels.
+        bend: (n, 8) float32 out: root mean square over the voxels near the surface of |D|, per voxel.
+        texture: (n, 8) float32 out: the same of the intensity (0..1) with steps of one voxel.
+        surface: (n, 8) uint8 out: whether the surface passes through the octant or touches it.
+    """
+    words = np.empty((SIZE, SIZE, SIZE), np.int32)
+    flat = words.reshape(-1)
+    zero = np.float32(0)
+    for row in range(start, stop):
+        padded(geometry, near[row], words)
+        for octant in range(8):
+            x0 = PAD + 4 * (octant >> 2)
+            y0 = PAD + 4 * ((octant >> 1) & 1)
+            z0 = PAD + 4 * (octant & 1)
+            total, shades, count, shaded = zero, zero, 0, 0
+            inside, outside = False, False
+            for i in range(5):
+                for j in range(5):
+                    for k in range(5):
+                        n = ((x0 + i) * SIZE + y0 + j) * SIZE + z0 + k
+                        word = flat[n]
+                        if word & 0xFF00 == 0:
+                            continue
+                        f = sdf_steps(word) * by_voxel
+                        inside |= f < np.float32(0.25)
+                        outside |= f > np.float32(-0.25)
+                        if abs(f) > NEAR or i == 4 or j == 4 or k == 4:
+                            continue
+                        square, axes = zero, 0
+                        shade, seen = zero, False
+                        for axis in range(3):
+                            step = SIZE * SIZE if axis == 0 else (SIZE if axis == 1 else 1)
+                            d, known = distance_bend(word, flat[n + 2 * step], flat[n - 2 * step], by_voxel, saturated)
+                            if known:
+                                square += d * d
+                                axes += 1
+                            d, known = intensity_bend(word, flat[n + step], flat[n - step])
+                            if known:
+                                shade += d * d
+                                seen = True
+                        if axes > 0:  # beside the end of a finer level not all axes are known
+                            total += square * np.float32(3) / np.float32(axes)
+                            count += 1
+                        if seen:
+                            shades += shade
+                            shaded += 1
+            bend[row, octant] = root_mean(total, count)
+            texture[row, octant] = root_mean(shades, shaded)
+            surface[row, octant] = inside and outside
+
+
+@kernel
+def _channel(value):
+    return np.float32(value & 1023)
+
+
+@kernel
+def prolong_range(start, stop, geometry, colors, near, octants, slots, fine_geometry, fine_colors):
+    """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
+
+    A voxel is known where all the coarse voxels around it are, and has the least of their weights, at most PRIOR.
+
+    Args:
+        start, stop: Range of blocks.
+        geometry, colors: (coarse slots, 512) int32.
+        near: (n, 27) int32 coarse slots around the parent of each block.
+        octants: (n,) octant of the parent.
+        slots: (n,) int32 slots of the blocks.
+        fine_geometry, fine_colors: (fine slots, 512) int32, changed here.
+    """
+    words = np.empty((SIZE, SIZE, SIZE), np.int32)
+    paint = np.empty((SIZE, SIZE, SIZE), np.int32)
+    for row in range(start, stop):
+        padded(geometry, near[row], words)
+        padded(colors, near[row], paint)
+        octant, slot = octants[row], slots[row]
+        for n in range(512):
+            i, j, k = n >> 6, (n >> 3) & 7, n & 7
+            x, y, z = (
+                PAD + 4 * (octant >> 2) + (i >> 1),
+                PAD + 4 * ((octant >> 1) & 1) + (j >> 1),
+                PAD + 4 * (octant & 1) + (k >> 1),
+            )
+            steps, shade, shades = np.float32(0), np.float32(0), 0
+            red, green, blue, painted = np.float32(0), np.float32(0), np.float32(0), 0
+            weight, count = PRIOR, 0
+            for a in range(1 + (i & 1)):
+                for b in range(1 + (j & 1)):
+                    for c in range(1 + (k & 1)):
+                        word, color = words[x + a, y + b, z + c], paint[x + a, y + b, z + c]
+                        weight = min(weight, (word >> 8) & 0xFF)
+                        steps += np.float32(word >> 16)
+                        count += 1
+                        if word & 0xFF != 0:
+                            shade += np.float32(word & 0xFF)
+                            shades += 1
+                        if color != 0:
+                            red += _channel(color >> 20)
+                            green += _channel(color >> 10)
+                            blue += _channel(color)
+                            painted += 1
+            fine_geometry[slot, n] = mean_voxel(steps, count, weight, shade, shades)
+            fine_colors[slot, n] = mean_color(red, green, blue, painted)
+
+
+def examine(
+    geometry: NDArray[np.int32], near: NDArray[np.int32], by_voxel: float, saturated: float
+) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.uint8]]:
+    """How much the distance and the intensity bend near the surface in each octant of blocks.
+
+    Args:
+        geometry: (slots, 512) int32 voxels of one level.
+        near: (n, 27) int32 slots of the blocks and their neighbours (``core/map/fine_blocks.py``), -1 = none.
+        by_voxel: Voxels per step of the stored distance.
+        saturated: Distance from which on it may be cut off, voxels.
+
+    Returns:
+        (n, 8) each: bend of the distance, per voxel, and of the intensity (0..1), float32, and whether the surface
+        touches the octant, uint8; see ``examine_range``.
+    """
+    bend, texture = np.empty((2, len(near), 8), dtype=np.float32)
+    surface = np.empty((len(near), 8), dtype=np.uint8)
+    by, limit = np.float32(by_voxel), np.float32(saturated)
+    run_bands(
+        lambda start, stop: examine_range(start, stop, geometry, near, by, limit, bend, texture, surface),
+        bands(len(near), BAND),
+    )
+    return bend, texture, surface
+
+
+def prolong(
+    geometry: NDArray[np.int32],
+    colors: NDArray[np.int32],
+    near: NDArray[np.int32],
+    octants: NDArray[np.int64],
+    slots: NDArray[np.int32],
+    fine_geometry: NDArray[np.int32],
+    fine_colors: NDArray[np.int32],
+) -> None:
+    """Fill blocks of half the voxel size with the trilinear interpolation of the coarser level.
+
+    Args:
+        geometry, colors: (coarse slots, 512) int32.
+        near: (n, 27) int32 coarse slots around the parent of each block, -1 = none.
+        octants: (n,) octant of the parent.
+        slots: (n,) int32 slots of the blocks.
+        fine_geometry, fine_colors: (fine slots, 512) int32, changed here.
+    """
+    prolong_range(0, len(slots), geometry, colors, near, octants, slots, fine_geometry, fine_colors)

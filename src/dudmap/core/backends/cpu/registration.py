@@ -1,0 +1,196 @@
+"""One linearisation of the direct SDF and intensity registration (thesis eq. 4.27-4.47).
+
+A row of pixels is worked through in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
+vector arithmetic for residuals and sums. No stage mixes loads with branches, so LLVM vectorises the first and the last
+on every CPU.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.gathers import LANES
+from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.vectors import wide_vectors
+from dudmap.core.backends.parameters import ImageStack, NormalEquations
+from dudmap.core.backends.threads import kernel
+from dudmap.core.formulas.pixel import elements, rotate
+from dudmap.core.formulas.residual import normal_terms, trilinear, weigh
+from dudmap.core.formulas.voxel import intensity_of, sdf_steps
+
+NUM_SUMS = 32
+"""Sums of one linearisation: 21 of H, 6 of b, cost, readings on the map, weight of all readings, weight of those on
+the map, weighted squared distances."""
+
+SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
+"""Index of each element of H among the sums, which hold its upper triangle row by row."""
+SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
+
+
+@kernel
+def linearize_rows(
+    row_start, row_stop, depth, intensity, weights, intrinsics, T, window, shape, geometry, voxel_size, sdf_unit,
+    parameters, residuals, sums,
+):  # fmt: skip
+    """Add the normal equations of pixel rows ``row_start`` to ``row_stop`` to ``sums`` and write their residuals.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (h, w) float32, metres, 0 = none.
+        intensity: (h, w) float32 in [0, 1].
+        weights: (h, w) float32 static weights in [0, 1].
+        intrinsics: (4,) float32 fx, fy, cx, cy of this level.
+        T: (3, 4) float32, camera to the window's lattice: voxels, origin at the window's first voxel.
+        window: (Wx * Wy * Wz,) int32 voxel slots, negative = no voxels.
+        shape: (3,) int64 blocks of the window.
+        geometry: (slots * 512,) int32 packed voxels.
+        voxel_size, sdf_unit: Metres, and metres per step of the stored distance.
+        parameters: RegistrationParameters.
+        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
+        sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
+    """
+    wide_vectors()
+    w = depth.shape[1]
+    padded = -(-w // LANES) * LANES
+    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    fx = np.empty(w, np.float32)
+    fy = np.empty(w, np.float32)
+    fz = np.empty(w, np.float32)
+    px = np.empty(w, np.float32)
+    py = np.empty(w, np.float32)
+    pz = np.empty(w, np.float32)
+    inside = np.empty(w, np.float32)
+
+    zero, one = np.float32(0), np.float32(1)
+    by_unit = sdf_unit / voxel_size
+    by_voxel = one / voxel_size
+    by_255 = np.float32(1 / 255)
+    by_fx, by_fy = one / intrinsics[0], one / intrinsics[1]
+    cx, cy = intrinsics[2], intrinsics[3]
+    last, size_y, size_z = last_corner(shape), shape[1], shape[2]
+    t = elements(T)
+
+    for v in range(row_start, row_stop):
+        row_y = (np.float32(v) - cy) * by_fy
+        for u in range(w):
+            z = depth[v, u]
+            x = (np.float32(u) - cx) * by_fx * z
+            y = row_y * z
+            rx, ry, rz = rotate(t, x, y, z)
+            gx, gy, gz = rx + t[3], ry + t[7], rz + t[11]
+            cells[u], voxels[u], crosses, within, fx[u], fy[u], fz[u] = locate(gx, gy, gz, last, size_y, size_z)
+            ok = within & (z > zero)
+            crossing[u] = crosses if ok else np.int32(0)
+            px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
+            inside[u] = one if ok else zero
+
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+
+        h00 = h01 = h02 = h11 = h12 = h22 = zero
+        m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
+        n00 = n01 = n02 = n11 = n12 = n22 = zero
+        b0 = b1 = b2 = b3 = b4 = b5 = zero
+        cost = on_map = readings = total_weight = chi = zero
+        for u in range(w):
+            c0, c1, c2, c3 = words[0, u], words[1, u], words[2, u], words[3, u]
+            c4, c5, c6, c7 = words[4, u], words[5, u], words[6, u], words[7, u]
+            ax, ay, az = fx[u], fy[u], fz[u]
+            z = depth[v, u]
+            low = min(
+                min(min(c0 & 0xFF00, c1 & 0xFF00), min(c2 & 0xFF00, c3 & 0xFF00)),
+                min(min(c4 & 0xFF00, c5 & 0xFF00), min(c6 & 0xFF00, c7 & 0xFF00)),
+            )
+            distance, gx, gy, gz = trilinear(
+                sdf_steps(c0), sdf_steps(c1), sdf_steps(c2), sdf_steps(c3),
+                sdf_steps(c4), sdf_steps(c5), sdf_steps(c6), sdf_steps(c7), ax, ay, az,
+            )  # fmt: skip
+            r = distance * sdf_unit
+            gx, gy, gz = gx * by_unit, gy * by_unit, gz * by_unit
+            # intensity in 0..1 and its gradient per metre
+            i0, i1, i2, i3 = intensity_of(c0), intensity_of(c1), intensity_of(c2), intensity_of(c3)
+            i4, i5, i6, i7 = intensity_of(c4), intensity_of(c5), intensity_of(c6), intensity_of(c7)
+            darkest = min(min(min(i0, i1), min(i2, i3)), min(min(i4, i5), min(i6, i7)))
+            shade, kx_, ky_, kz_ = trilinear(i0, i1, i2, i3, i4, i5, i6, i7, ax, ay, az)
+            rc = shade * by_255 - intensity[v, u]
+            scale_c = by_255 * by_voxel
+            kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
+
+            known = (low > 0) & (inside[u] > zero) & (darkest > zero)  # a corner in the air is not part of a surface
+            valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, weights[v, u], known, parameters)
+            residuals[0, v, u] = r if known else np.float32(np.nan)
+            residuals[1, v, u] = rc if valid else np.float32(np.nan)
+            cost += paid
+            cost += forfeit
+            on_map += one if valid else zero
+            readings += weights[v, u] if z > zero else zero
+            total_weight += used
+            chi += square
+            terms = normal_terms(wg, wc, gx, gy, gz, kx_, ky_, kz_, r, rc, px[u], py[u], pz[u])
+            h00 += terms[0]
+            h01 += terms[1]
+            h02 += terms[2]
+            h11 += terms[3]
+            h12 += terms[4]
+            h22 += terms[5]
+            m00 += terms[6]
+            m01 += terms[7]
+            m02 += terms[8]
+            m10 += terms[9]
+            m11 += terms[10]
+            m12 += terms[11]
+            m20 += terms[12]
+            m21 += terms[13]
+            m22 += terms[14]
+            n00 += terms[15]
+            n01 += terms[16]
+            n02 += terms[17]
+            n11 += terms[18]
+            n12 += terms[19]
+            n22 += terms[20]
+            b0 += terms[21]
+            b1 += terms[22]
+            b2 += terms[23]
+            b3 += terms[24]
+            b4 += terms[25]
+            b5 += terms[26]
+
+        sums[0] += h00
+        sums[1] += h01
+        sums[2] += h02
+        sums[3] += m00
+        sums[4] += m01
+        sums[5] += m02
+        sums[6] += h11
+        sums[7] += h12
+        sums[8] += m10
+        sums[9] += m11
+        sums[10] += m12
+        sums[11] += h22
+        sums[12] += m20
+        sums[13] += m21
+        sums[14] += m22
+        sums[15] += n00
+        sums[16] += n01
+        sums[17] += n02
+        sums[18] += n11
+        sums[19] += n12
+        sums[20] += n22
+        sums[21] += b0
+        sums[22] += b1
+        sums[23] += b2
+        sums[24] += b3
+        sums[25] += b4
+        sums[26] += b5
+        sums[27] += cost
+        sums[28] += on_map
+        sums[29] += readings
+        sums[30] += total_weight
+        sums[31] += chi
+
+
+def normal_equations(sums: NDArray[np.float64], residuals: ImageStack) -> NormalEquations:
+    """The normal equations of the sums (NUM_SUMS,) of all pixels."""
+    cost, num_inliers, readings, weight, chi_square = sums[27:].tolist()
+    return NormalEquations(
+        sums[SYMMETRIC], sums[21:27], cost, int(num_inliers), readings, weight, chi_square, residuals
+    )

@@ -1,0 +1,90 @@
+"""Loop over the points of a depth image: signed distance, intensity difference and occupancy of the map there."""
+
+import numpy as np
+
+from dudmap.core.backends.cpu.gathers import LANES
+from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.vectors import wide_vectors
+from dudmap.core.backends.parameters import FREE, SURFACE, UNKNOWN
+from dudmap.core.backends.threads import kernel, scalar
+from dudmap.core.formulas.pixel import elements, ray, transform
+from dudmap.core.formulas.voxel import intensity_of, sdf_steps
+
+f32, f64 = np.float32, np.float64
+
+
+@scalar
+def corner_weight(k, ax, ay, az):
+    """Trilinear weight, float64, of corner k = 4 dx + 2 dy + dz at (ax, ay, az) in [0, 1]^3."""
+    one = f64(1)
+    x, y, z = f64(ax), f64(ay), f64(az)
+    return (x if k >> 2 != 0 else one - x) * (y if (k >> 1) & 1 != 0 else one - y) * (z if k & 1 != 0 else one - z)
+
+
+@kernel
+def sample_rows(
+    row_start, row_stop, depth, intensity, intrinsics, T, window, shape, geometry, sdf_unit, free_count, free_after,
+    distance, difference, occupancy,
+):  # fmt: skip
+    """Sample the map at the points of pixel rows ``row_start`` to ``row_stop``.
+
+    Corners without an observation are left out of the interpolation; a point needs half of the weight. A row is worked
+    through in stages, see ``registration.py``.
+
+    Args:
+        row_start, row_stop: Rows of the band.
+        depth: (h, w) float32, metres, 0 = none.
+        intensity: (h, w) float32 in [0, 1].
+        intrinsics: (4,) float32.
+        T: (3, 4) float32, camera to the window's lattice, voxels.
+        window: (cells,) int32.
+        shape: (3,) int64 blocks of the window.
+        geometry: (slots * 512,) int32.
+        sdf_unit: Metres per step of the stored distance.
+        free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
+        free_after: Observations that make free space.
+        distance: (h, w) float32 out, metres, NaN where the map has no distance.
+        difference: (h, w) float32 out, map minus image intensity, NaN where the map has none.
+        occupancy: (h, w) uint8 out: UNKNOWN (also without a reading), SURFACE or FREE.
+    """
+    wide_vectors()
+    w = depth.shape[1]
+    nan, half, zero = f32(np.nan), f64(0.5), f64(0)
+    padded = -(-w // LANES) * LANES
+    cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
+    outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
+    slots = np.empty(w, np.int32)
+    fractions, inside = np.empty((3, w), np.float32), np.empty(w, np.bool_)
+    last, size_y, size_z = last_corner(shape), shape[1], shape[2]
+    t = elements(T)
+    for v in range(row_start, row_stop):
+        row_y = ray(v, intrinsics[3], intrinsics[1])
+        for u in range(w):
+            z = depth[v, u]
+            gx, gy, gz = transform(t, ray(u, intrinsics[2], intrinsics[0]) * z, row_y * z, z)
+            cells[u], voxels[u], crosses, within, ax, ay, az = locate(gx, gy, gz, last, size_y, size_z)
+            crossing[u] = crosses if within else np.int32(0)
+            fractions[0, u], fractions[1, u], fractions[2, u] = ax, ay, az
+            inside[u] = within & (z > f32(0))
+        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+        for u in range(w):
+            slots[u] = window[np.uintp(cells[u])] if inside[u] else np.int32(-1)
+        for u in range(w):
+            sdf, total, shade, shaded = zero, zero, zero, zero
+            for k in range(8):
+                word = words[k, u]
+                part = corner_weight(k, fractions[0, u], fractions[1, u], fractions[2, u])
+                part = part if (word & 0xFF00) != 0 else zero
+                sdf += part * sdf_steps(word)
+                total += part
+                intensity_part = part if intensity_of(word) > f32(0) else zero
+                shade += intensity_part * intensity_of(word)
+                shaded += intensity_part
+            near = (slots[u] >= 0) & (total >= half)
+            distance[v, u] = f32(sdf / total * sdf_unit) if near else nan
+            lit = near & (shaded > zero)
+            difference[v, u] = f32(shade / shaded / f64(255) - intensity[v, u]) if lit else nan
+            occupancy[v, u] = SURFACE if near else UNKNOWN
+        for u in range(w):
+            if slots[u] <= -2 and free_count[np.uintp(-2 - slots[u])] >= free_after:
+                occupancy[v, u] = FREE

@@ -1,0 +1,236 @@
+"""Choice of the compute device: the CPU, or an NVIDIA GPU by Warp (extra ``gpu``).
+
+Warp is imported only where a GPU is asked for or may be there; the driver is asked first, by its own library.
+"""
+
+import ctypes
+import importlib.util
+import os
+import sys
+import warnings
+from contextlib import contextmanager
+from functools import cache
+from typing import TYPE_CHECKING
+
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.spec import Backend
+from dudmap.core.backends.warp import faults
+from dudmap.errors import ConfigError
+from dudmap.extras import need
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+OLDEST_DRIVER = (13, 0)
+"""Version of CUDA that the driver must support for the wheels of Warp from 1.19 on."""
+OLDEST_RELEASE = 580
+"""First driver that supports it."""
+OLDEST_GPU = 75
+"""Oldest compute capability, times ten, that CUDA 13 compiles for."""
+NO_DEVICE = 100
+"""Error of the driver where it finds no GPU."""
+MISMATCH = 803
+"""Error of the driver where its parts are of different versions."""
+
+
+class DeviceWarning(RuntimeWarning):
+    """The CPU computes what a GPU was to compute."""
+
+
+def make_backend(device: str) -> Backend:
+    """A new back end on a device, or on the CPU if the device has failed in this process.
+
+    Args:
+        device: As of ``resolve``.
+
+    Raises:
+        ConfigError: There is no such device, or it does not work.
+    """
+    name = resolve(device)
+    if name == "cpu":
+        return CpuBackend()
+    if failure := start_failure(name):
+        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
+    from dudmap.core.backends.warp.backend import WarpBackend
+
+    return WarpBackend(name)
+
+
+def resolve(device: str, *, adaptive: bool = False) -> str:
+    """Name of the device that is meant, "cpu", "warp-cpu" or "cuda:N"; "cpu" for one that has failed in this process.
+
+    Args:
+        device: "cpu"; "cuda" for the first GPU, "cuda:1" for the second; "auto" for the first GPU where one works, else
+            the CPU; "warp-cpu" for the kernels of the GPU on the CPU, for tests.
+        adaptive: Whether it is for a map with several voxel sizes, which the CPU alone computes.
+
+    Raises:
+        ConfigError: There is no such device, or it does not work, or not with such a map.
+    """
+    if adaptive and device not in ("cpu", "auto"):
+        raise ConfigError(
+            f"found device {device} and volume.adaptive=true; smaller voxels are computed on the CPU only: take "
+            "--device cpu, or volume.adaptive=false"
+        )
+    name = "cpu" if adaptive else _resolved(device)
+    return "cpu" if faults.is_lost(name) else name
+
+
+@cache
+def _resolved(device: str) -> str:
+    """Name of the device that is meant."""
+    if device == "cpu":
+        return device
+    if device == "warp-cpu":
+        _need_warp(device)
+        return device
+    found = obstacle()
+    if device == "auto":
+        return "cpu" if found else _first_that_starts()
+    if device.partition(":")[0] != "cuda":
+        raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
+    _need_warp(device)
+    if found:
+        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or mend this")
+    number = int(device.partition(":")[2] or supported_gpus()[0])
+    if number not in supported_gpus():
+        known = ", ".join(f"cuda:{n}" for n in supported_gpus())
+        lack = f"there is no device {device}" if number >= num_gpus() else f"device {device} is too old for Warp"
+        raise ConfigError(f"{lack}; this machine has {known}")
+    return f"cuda:{number}"
+
+
+def _first_that_starts() -> str:
+    """The first GPU, or the CPU where that does nothing, with a warning."""
+    name = f"cuda:{supported_gpus()[0]}"
+    if failure := start_failure(name):
+        warnings.warn(f"{name} cannot be used ({failure}); the CPU is", DeviceWarning, stacklevel=5)
+        return "cpu"
+    return name
+
+
+def obstacle() -> str:
+    """Why no GPU can be used, as part of a sentence; empty where one can."""
+    version = driver_version()
+    if version is None:
+        return "no NVIDIA driver was found"
+    if version < OLDEST_DRIVER:
+        return (
+            f"the NVIDIA driver supports CUDA {version[0]}.{version[1]}, but Warp needs {OLDEST_DRIVER[0]}."
+            f"{OLDEST_DRIVER[1]}, that is driver {OLDEST_RELEASE} or later"
+        )
+    if failure := driver_failure():
+        return failure
+    if num_gpus() == 0:
+        return "the NVIDIA driver finds no GPU"
+    if not _has_warp():
+        return 'Warp is not installed (pip install "dudmap[gpu]")'
+    if failure := warp_failure():
+        return failure
+    if not supported_gpus():
+        return f"Warp supports none of the GPUs, which need compute capability {OLDEST_GPU / 10} or later"
+    return ""
+
+
+@cache
+def start_failure(device: str) -> str:
+    """Why a device does nothing, such as one whose memory other programs fill; empty where it works."""
+    _load_warp()
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    try:
+        wp.zeros(1, dtype=wp.int32, device="cpu" if device == "warp-cpu" else device).numpy()
+    except (RuntimeError, OSError) as error:
+        return " ".join(str(error).split())
+    return ""
+
+
+def _driver() -> ctypes.CDLL | None:
+    """Library of the NVIDIA driver; None where there is none."""
+    try:
+        return ctypes.CDLL("nvcuda.dll" if sys.platform == "win32" else "libcuda.so.1")
+    except OSError:
+        return None
+
+
+@cache
+def driver_version() -> tuple[int, int] | None:
+    """Newest version of CUDA that the driver supports; None without a driver."""
+    library, version = _driver(), ctypes.c_int(0)
+    if library is None or library.cuDriverGetVersion(ctypes.byref(version)) != 0:
+        return None
+    return version.value // 1000, version.value % 1000 // 10
+
+
+@cache
+def driver_failure() -> str:
+    """Why the driver does not start, as part of a sentence; empty where it does or is missing."""
+    library = _driver()
+    code = 0 if library is None else library.cuInit(0)
+    if code in (0, NO_DEVICE):
+        return ""
+    hint = "restart the machine after an update of the driver" if code == MISMATCH else "see nvidia-smi"
+    return f"the NVIDIA driver does not start (error {code}: {hint})"
+
+
+@cache
+def num_gpus() -> int:
+    """GPUs that the driver finds."""
+    library, count = _driver(), ctypes.c_int(0)
+    if library is None or library.cuInit(0) != 0 or library.cuDeviceGetCount(ctypes.byref(count)) != 0:
+        return 0
+    return count.value
+
+
+@cache
+def warp_failure() -> str:
+    """Why Warp, which is installed, does not start, as part of a sentence; empty where it does."""
+    try:
+        _load_warp()
+    except (ImportError, OSError, RuntimeError) as error:
+        return f"Warp does not start ({' '.join(str(error).split())})"
+    return ""
+
+
+@cache
+def supported_gpus() -> list[int]:
+    """Numbers of the GPUs that Warp finds and supports."""
+    _load_warp()
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    return [gpu.ordinal for gpu in wp.get_cuda_devices() if gpu.arch >= OLDEST_GPU]
+
+
+def _has_warp() -> bool:
+    return importlib.util.find_spec("warp") is not None
+
+
+def _need_warp(device: str) -> None:
+    need("gpu", f"device {device}", ("warp",))
+
+
+@cache
+def _load_warp() -> None:
+    """Start Warp without its greeting, and without its warning where there is no driver."""
+    import warp as wp  # pyright: ignore[reportMissingImports]
+
+    wp.config.log_level = wp.LOG_WARNING
+    with _silent_stderr(driver_version() is None):
+        wp.init()
+
+
+@contextmanager
+def _silent_stderr(silent: bool) -> "Iterator[None]":
+    """Discard what a library writes to the standard error, if ``silent``."""
+    if not silent:
+        yield
+        return
+    sys.stderr.flush()
+    kept = os.dup(2)
+    with open(os.devnull, "wb") as nowhere:
+        os.dup2(nowhere.fileno(), 2)
+    try:
+        yield
+    finally:
+        os.dup2(kept, 2)
+        os.close(kept)

@@ -1,0 +1,341 @@
+"""Named inputs, parameters and results of the operations of a back end (``core/backends/spec.py``).
+
+Numba compiles named tuples as they are. Tuples of parameters hold floats only: ``single`` makes them the float32 values
+that the loops calculate with.
+"""
+
+from functools import lru_cache
+from typing import NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.mirror import Mirror, on_host
+
+BLOCK = 8
+"""Voxels along the edge of a block."""
+UNKNOWN, SURFACE, FREE = 0, 1, 2
+"""Occupancy of a point: unknown, near a surface, in confirmed free space."""
+
+Parameters = TypeVar("Parameters", bound=tuple)
+
+
+@lru_cache(maxsize=64, typed=True)
+def single(parameters: Parameters) -> Parameters:
+    """The same tuple, also of nested ones, with every number as float32; made once for equal ones of one type."""
+    values = [single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters]
+    return type(parameters)(*values)
+
+
+class SensorNoise(NamedTuple):
+    """Standard deviation of a depth reading: sigma(z) = base + scale z^2 (thesis eq. 3.91).
+
+    Attributes:
+        base: Metres.
+        scale: 1/m.
+    """
+
+    base: float
+    scale: float
+
+
+class TruncationBand(NamedTuple):
+    """Band around a reading in which distances are stored; ``core/formulas/pixel.py`` has its width at a depth.
+
+    Attributes:
+        front, behind: Smallest width on either side of the surface, metres.
+        sigmas: The band is at least this many standard deviations of the reading wide.
+        limit: Largest distance that a voxel can store, metres.
+        noise: Of the sensor.
+    """
+
+    front: float
+    behind: float
+    sigmas: float
+    limit: float
+    noise: SensorNoise
+
+
+class FusionParameters(NamedTuple):
+    """Parameters of the fusion of a depth image (thesis eq. 4.18-4.23).
+
+    Attributes:
+        band: Truncation band.
+        voxel_size: Edge of a voxel, metres.
+        sdf_unit: Metres per step of the stored distance.
+        depth_unit: Metres per step of a reading in its 16-bit form.
+        max_weight: Cap of a voxel's weight.
+        max_readings: A reading raises a voxel's weight to at most this many times its own.
+        carve_rate: Weight of an observation of emptiness in a voxel that holds a surface.
+        depth_min, depth_max: Range of the readings, metres.
+    """
+
+    band: TruncationBand
+    voxel_size: float
+    sdf_unit: float
+    depth_unit: float
+    max_weight: float
+    max_readings: float
+    carve_rate: float
+    depth_min: float
+    depth_max: float
+
+
+class RegistrationParameters(NamedTuple):
+    """Parameters of the robust cost of a registration (thesis eq. 4.32-4.46).
+
+    Attributes:
+        band: Truncation band; readings farther from the surface are outliers.
+        huber, tukey: Constants of the distance residual, metres at one metre depth; tukey = 0 selects Huber.
+        color_weight: Weight of the squared intensity residual (0..1) against the squared distance residual (m).
+        color_huber: Constant of the intensity residual.
+        sigma_at_one_metre: Of a reading, metres.
+        noise_weighting: 1 scales each distance residual by sigma(1 m) / sigma(z), 0 does not.
+    """
+
+    band: TruncationBand
+    huber: float
+    tukey: float
+    color_weight: float
+    color_huber: float
+    sigma_at_one_metre: float
+    noise_weighting: float
+
+
+class ColorProjection(NamedTuple):
+    """How points of the depth camera reach the image of the colour camera (``cpu/color_registration.py``).
+
+    Attributes:
+        place, speed, bend: (3, 4) float32; a point X lies at place X - tau speed X + tau^2 / 2 bend X at the time tau.
+        intrinsics: (4,) float32 of the colour camera.
+        distortion: (5,) float32 k1, k2, p1, p2, k3 of the colour camera.
+        offset: Time of the middle row of the colour image minus that of the depth image, s.
+        readout: Time from the first to the last row of the colour image, s.
+        height: Rows of the colour image.
+    """
+
+    place: NDArray[np.float32]
+    speed: NDArray[np.float32]
+    bend: NDArray[np.float32]
+    intrinsics: NDArray[np.float32]
+    distortion: NDArray[np.float32]
+    offset: float
+    readout: float
+    height: int
+
+
+class RaycastParameters(NamedTuple):
+    """Limits of a view of the map: depths in metres, and the smallest weight of a trusted voxel (at least 1)."""
+
+    depth_min: float
+    depth_max: float
+    min_weight: int
+
+
+class MeshParameters(NamedTuple):
+    """Parameters of the surface extraction.
+
+    Attributes:
+        voxel_size: Edge of a voxel, metres.
+        sdf_unit: Metres per step of the stored distance.
+        min_weight: Cells with a corner of less weight are left out (at least 1).
+        max_jump: Cells across which the distance changes by more than this hold no surface, metres.
+    """
+
+    voxel_size: float
+    sdf_unit: float
+    min_weight: int
+    max_jump: float = np.inf
+
+
+class FilterParameters(NamedTuple):
+    """Parameters of the preprocessing of a depth image (thesis section 4.3).
+
+    Attributes:
+        depth_min, depth_max: Range of the readings that are kept, metres.
+        drop_mixed: Whether readings between foreground and background are dropped.
+        steepest: Depth step per pixel of the steepest surface that is kept, as a share of the depth.
+        fill_holes: Whether small holes are filled.
+        hole_noise: Readings around a small hole may always differ by this much, metres.
+        smooth: Whether the bilateral filter is applied.
+        alpha: sigma_c = alpha z^2 of the bilateral filter, and the spread allowed around a hole likewise, 1/m.
+        sigma_px: Spatial standard deviation, pixels.
+        radius: Half width of the window, pixels.
+    """
+
+    depth_min: float
+    depth_max: float
+    drop_mixed: bool
+    steepest: float
+    fill_holes: bool
+    hole_noise: float
+    smooth: bool
+    alpha: float
+    sigma_px: float
+    radius: int
+
+    @property
+    def spatial_weights(self) -> NDArray[np.float32]:
+        """Weights (radius + 1,) of the bilateral filter by the distance from its centre, pixels."""
+        return np.exp(-(np.arange(self.radius + 1) ** 2) / (2 * self.sigma_px**2)).astype(np.float32)
+
+
+class VoxelGrid(NamedTuple):
+    """The blocks of the map around the view.
+
+    Voxels and window are arrays, or mirrors of arrays of which a back end may keep a copy on a device.
+
+    Attributes:
+        window: (Wx * Wy * Wz,) int32: slot of the voxels of a block; -1 = unknown; -2 - entry = without voxels.
+        shape: (3,) int64 blocks along each axis.
+        origin: (3,) int64 coordinates of the first block.
+        geometry: (slots, 512) int32 packed voxels.
+        colors: (slots, 512) int32 packed colours.
+        slot_coords: (slots, 3) int32 block coordinates by slot.
+        free_count: (entries,) uint8 observations of emptiness of blocks without voxels.
+        voxel_size: Edge of a voxel, metres.
+        sdf_unit: Metres per step of the stored distance.
+    """
+
+    window: Mirror | NDArray[np.int32]
+    shape: NDArray[np.int64]
+    origin: NDArray[np.int64]
+    geometry: Mirror | NDArray[np.int32]
+    colors: Mirror | NDArray[np.int32]
+    slot_coords: NDArray[np.int32]
+    free_count: NDArray[np.uint8]
+    voxel_size: float
+    sdf_unit: float
+
+    def on_host(self) -> "VoxelGrid":
+        """The grid with plain arrays, up to date."""
+        window, geometry, colors = on_host(self.window), on_host(self.geometry), on_host(self.colors)
+        return self._replace(window=window, geometry=geometry, colors=colors)
+
+
+def to_lattice(
+    T_world_camera: NDArray[np.float64], voxel_size: float, origin: NDArray[np.int64]
+) -> NDArray[np.float32]:
+    """Camera to the lattice of a window (3, 4) float32: voxels, origin at the first voxel of its first block (3,)."""
+    T = T_world_camera[:3] / voxel_size
+    T[:, 3] -= origin * BLOCK
+    return T.astype(np.float32)
+
+
+class DepthTiles(NamedTuple):
+    """Nearest and farthest reading and share of pixels with one, per tile of 8x8 pixels.
+
+    Attributes:
+        nearest, farthest: (h, w) float32, metres; inf and 0 without a reading.
+        valid: (h, w) float32 in [0, 1].
+    """
+
+    nearest: NDArray[np.float32]
+    farthest: NDArray[np.float32]
+    valid: NDArray[np.float32]
+
+
+class DepthView(NamedTuple):
+    """A depth image at a known pose.
+
+    Attributes:
+        depth: (H, W) float32, metres, 0 = none.
+        tiles: Depth ranges of its tiles.
+        intrinsics: (4,) float32 fx, fy, cx, cy.
+        T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
+        T_camera_world: (3, 4) float32, world to camera, metres.
+    """
+
+    depth: NDArray[np.float32]
+    tiles: DepthTiles
+    intrinsics: NDArray[np.float32]
+    T_grid_camera: NDArray[np.float32]
+    T_camera_world: NDArray[np.float32]
+
+
+class FusedBlocks(NamedTuple):
+    """Blocks that a frame was fused into.
+
+    Attributes:
+        slots: (n,) int32.
+        occupied: (n,) int32 voxels of each that hold a surface or were never seen.
+    """
+
+    slots: NDArray[np.int32]
+    occupied: NDArray[np.int32]
+
+
+class ImageStack(Protocol):
+    """Images of one size by number: an array (n, h, w), or images on a device, each brought over when it is read."""
+
+    def __getitem__(self, number: int, /) -> NDArray[np.float32]:
+        """Image (h, w)."""
+        ...
+
+
+class NormalEquations(NamedTuple):
+    """One linearisation of the registration: ``H step = -b``.
+
+    Attributes:
+        H: (6, 6) float64, twist (v, omega) about the camera's centre in world axes.
+        b: (6,) float64, gradient of the cost.
+        cost: Robust cost; readings off the map pay a constant, so that poses can be compared.
+        num_inliers: Readings on the map.
+        readings: Sum of the static weights of all readings.
+        weight: Sum of the static weights of the readings on the map.
+        chi_square: Robustly weighted sum of squared distances, m^2 at one metre.
+        residuals: (2, h, w) float32, distance (m) and intensity difference, NaN off the map.
+    """
+
+    H: NDArray[np.float64]
+    b: NDArray[np.float64]
+    cost: float
+    num_inliers: int
+    readings: float
+    weight: float
+    chi_square: float
+    residuals: ImageStack
+
+
+class MapSample(NamedTuple):
+    """The map at the points of a depth image.
+
+    Attributes:
+        distance: (h, w) float32 signed distance in metres, NaN where the map has none.
+        difference: (h, w) float32 map minus image intensity (0..1), NaN where the map has none.
+        occupancy: (h, w) uint8: UNKNOWN (also without a reading), SURFACE or FREE.
+    """
+
+    distance: NDArray[np.float32]
+    difference: NDArray[np.float32]
+    occupancy: NDArray[np.uint8]
+
+
+class RaycastResult(NamedTuple):
+    """The map seen from a pose: the thesis' artificial camera view.
+
+    Attributes:
+        depth: (H, W) float32, metres, 0 where no surface is hit.
+        color: (H, W, 3) uint8.
+        normals: (H, W, 3) float32, world frame, unit length, 0 where no surface is hit.
+    """
+
+    depth: NDArray[np.float32]
+    color: NDArray[np.uint8]
+    normals: NDArray[np.float32]
+
+
+class MeshArrays(NamedTuple):
+    """Triangles over shared vertices.
+
+    Attributes:
+        vertices: (V, 3) float32, metres, world frame.
+        faces: (F, 3) int32, counter-clockwise seen from free space.
+        colors: (V, 3) uint8, red green blue.
+        normals: (V, 3) float32, unit length, pointing to free space.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    colors: NDArray[np.uint8]
+    normals: NDArray[np.float32]

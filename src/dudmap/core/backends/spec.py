@@ -1,0 +1,241 @@
+"""The operations that the system asks of a compute device: arrays and one tuple of parameters in, arrays out."""
+
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.descent import Descent, DescentRules
+from dudmap.core.backends.parameters import (
+    ColorProjection,
+    DepthView,
+    FilterParameters,
+    FusedBlocks,
+    FusionParameters,
+    MapSample,
+    NormalEquations,
+    RaycastParameters,
+    RaycastResult,
+    RegistrationParameters,
+    SensorNoise,
+    VoxelGrid,
+)
+
+
+class Backend(Protocol):
+    """Operations of a compute device.
+
+    A back end may reuse buffers between calls, so each preprocessor and each map has one of its own, and calls on one
+    must not run at the same time. Results do not depend on the number of threads.
+    """
+
+    # -- filter ------------------------------------------------------------------------------------------------------
+
+    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
+        """Depth (H, W) in metres, limited, with small holes filled and smoothed.
+
+        Args:
+            depth: (H, W) float32, metres; NaN and anything outside the limits is no reading.
+            parameters: Limits and filter (thesis section 4.3).
+        """
+        ...
+
+    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Intensities (H, W) in [0, 1] of colours (H, W, 3)."""
+        ...
+
+    def color_pixels(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        projection: ColorProjection,
+        fallback: float,
+        start: int,
+        stop: int,
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Coordinates u, v (stop - start, W) in the colour image of each pixel of rows of a depth image.
+
+        Calls may run at the same time.
+
+        Args:
+            depth: (H, W) float32, metres, 0 = none; such pixels take the depth of a neighbour in their row.
+            intrinsics: (4,) float32 fx, fy, cx, cy of the depth image.
+            projection: Of the colour camera.
+            fallback: Depth of rows without a reading, metres.
+            start, stop: First row, and that after the last.
+        """
+        ...
+
+    def halve(
+        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """Depth and intensity (H // 2, W // 2): means over 2x2 blocks, of depth only over the readings within
+        ``max(tolerance, tolerance z)`` behind the nearest one z."""
+        ...
+
+    # -- integrate ---------------------------------------------------------------------------------------------------
+
+    def view(
+        self,
+        depth: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        T_camera_world: NDArray[np.float32],
+    ) -> DepthView:
+        """A depth image (H, W) at a pose, ready for the other steps of the integration."""
+        ...
+
+    def reading_weights(
+        self, depth: NDArray[np.float32], intrinsics: NDArray[np.float32], noise: SensorNoise, best: float
+    ) -> NDArray[np.uint8]:
+        """Weight (H, W) of each reading: cos(theta) / sigma(z) (eq. 4.20), ``best`` for a frontal one at 1 m."""
+        ...
+
+    def touched_cells(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        stamps: NDArray[np.int32],
+        stride: int,
+        free_after: int,
+        frame_number: int,
+        parameters: FusionParameters,
+    ) -> NDArray[np.int32]:
+        """Window cells (n,), ascending, of the blocks without voxels that the truncation bands of an image touch.
+
+        Args:
+            grid, view: The map and the image.
+            stamps: (cells,) int32, number of the frame that last found a cell; changed here.
+            stride: Step between the pixels that are looked at.
+            free_after: Observations that make a block known free space.
+            frame_number: Number of this frame, larger than all before.
+            parameters: Of the fusion.
+        """
+        ...
+
+    def footprint_colors(
+        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
+    ) -> NDArray[np.uint8]:
+        """Mean colour (H, W, 3) uint8 of the surface within a voxel of each reading.
+
+        Args:
+            color: (H, W, 3) uint8.
+            depth: (H, W) float32, metres, 0 = none; pixels without a reading keep their colour.
+            focal: Focal length, pixels.
+            voxel_size: Metres.
+        """
+        ...
+
+    def fuse(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        candidates: NDArray[np.int32],
+        fused: NDArray[np.uint8],
+        turn: int,
+        count: int,
+        parameters: FusionParameters,
+    ) -> FusedBlocks:
+        """Average an image into the voxels in view (eq. 4.18-4.23); changes ``grid.geometry`` and ``grid.colors``.
+
+        Args:
+            grid, view: The map and the image.
+            color: (H, W, 3) uint8.
+            weights: (H, W) uint8 weight of each reading.
+            candidates: (n,) int32 slots that may be in view.
+            fused: (slots,) uint8 frames that were fused into each slot.
+            turn: Number of the frame, by which far blocks alternate; negative = all blocks are updated.
+            count: Number of equal frames that this one stands for.
+            parameters: Of the fusion.
+        """
+        ...
+
+    def observe_free(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        parity: int,
+        count: int,
+        free_after: int,
+        parameters: FusionParameters,
+    ) -> NDArray[np.int32]:
+        """Add ``count`` observations of emptiness to blocks without voxels in front of all readings.
+
+        Visits every second plane of the window, beginning at ``parity``. Changes ``grid.free_count``; a block with
+        ``free_after`` observations is not visited again.
+
+        Returns:
+            (n,) int32 window cells of empty blocks without an entry, whose observations the caller has to store.
+        """
+        ...
+
+    # -- read the map ------------------------------------------------------------------------------------------------
+
+    def linearize(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        parameters: RegistrationParameters,
+    ) -> NormalEquations:
+        """Normal equations of the robust cost (eq. 4.43 with the weights of 4.46) of an image at a pose.
+
+        Args:
+            grid: The map.
+            depth: (h, w) float32, metres, 0 = none.
+            intensity: (h, w) float32 in [0, 1].
+            weights: (h, w) float32 static weights in [0, 1].
+            intrinsics: (4,) float32 fx, fy, cx, cy.
+            T_grid_camera: (3, 4) float32, camera to the window's lattice, voxels.
+            parameters: Of the cost.
+        """
+        ...
+
+    def register(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_world_camera: NDArray[np.float64],
+        first: NormalEquations,
+        rules: DescentRules,
+        parameters: RegistrationParameters,
+    ) -> Descent:
+        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations; see
+        ``core/backends/descent.py``. Images and parameters as of ``linearize``."""
+        ...
+
+    def sample(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        free_after: int,
+    ) -> MapSample:
+        """Signed distance, intensity difference and occupancy of the map at the points of an image; arguments as of
+        ``linearize``; ``free_after`` observations make free space."""
+        ...
+
+    def raycast(
+        self,
+        grid: VoxelGrid,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: NDArray[np.float32],
+        size: tuple[int, int],
+        parameters: RaycastParameters,
+    ) -> RaycastResult:
+        """Depth, colour and normals of the first surface that each pixel of an image (H, W) sees.
+
+        A surface is a change of the signed distance from positive to negative between trusted voxels; where a ray goes
+        from unknown space straight to the inside, there is none.
+        """
+        ...

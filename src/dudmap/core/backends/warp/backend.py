@@ -1,0 +1,246 @@
+"""The back end for GPUs: Warp kernels for the loops over pixels and voxels of a frame.
+
+The voxels stay on the device; which blocks there are, meshes, labels and maps with several voxel sizes are the CPU's.
+"""
+
+# Warp's annotations name float where any type of number is meant
+# pyright: reportArgumentType=false, reportReturnType=false
+
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from typing import Any
+
+import numpy as np
+import warp as wp  # pyright: ignore[reportMissingImports]
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu import raycasting
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.registration import NUM_SUMS, normal_equations
+from dudmap.core.backends.parameters import (
+    BLOCK,
+    DepthView,
+    FilterParameters,
+    FusedBlocks,
+    FusionParameters,
+    MapSample,
+    NormalEquations,
+    RaycastParameters,
+    RaycastResult,
+    RegistrationParameters,
+    VoxelGrid,
+    single,
+)
+from dudmap.core.backends.warp import faults
+from dudmap.core.backends.warp.kernels import fusion, images, surface
+from dudmap.core.backends.warp.kernels import raycasting as tracing
+from dudmap.core.backends.warp.kernels.formulas import motion_of
+from dudmap.core.backends.warp.kernels.structs import Lattice, camera_of, struct
+from dudmap.core.backends.warp.memory import down, in_warp, resident, up, wrote
+
+SHARES = 0.299 / 255, 0.587 / 255, 0.114 / 255
+"""Shares of red, green and blue in the intensity."""
+GROUPS = 64
+"""Partial sums that are left after the first level of a sum."""
+PER_THREAD = 8
+"""Pixels that one thread adds up in a linearisation."""
+
+
+class WarpBackend(CpuBackend):
+    """``Backend`` on a device of Warp; operations that are not defined here are the CPU's.
+
+    Args:
+        device: Name of the device: "cuda:0", or "warp-cpu" for tests, where the same kernels run on the CPU.
+    """
+
+    def __init__(self, device: str) -> None:
+        super().__init__()
+        self.device = device
+
+    # -- filter ------------------------------------------------------------------------------------------------------
+
+    def filter(self, depth: NDArray[np.float32], parameters: FilterParameters) -> NDArray[np.float32]:
+        """See ``Backend.filter``."""
+        p = parameters
+        steps: list[tuple[Any, tuple[Any, ...]]] = [(images.limit_depth, (p.depth_min, p.depth_max))]
+        with self._using():
+            if p.drop_mixed:
+                steps.append((images.drop_mixed, (p.alpha, p.hole_noise, p.steepest)))
+            if p.fill_holes:
+                steps.append((images.fill_holes, (p.alpha, p.hole_noise)))
+            if p.smooth:
+                weights = self._up(p.spatial_weights)
+                steps += [(images.bilateral_line, (p.alpha, weights, *along)) for along in ((1, 0), (0, 1))]
+            image = self._up(depth)
+            for kernel, arguments in steps:
+                out = self._empty(depth.shape)
+                self._launch(kernel, depth.shape, image, *arguments, out)
+                image = out
+            return down(image)
+
+    def intensity(self, rgb: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """See ``Backend.intensity``."""
+        with self._using():
+            out = self._empty(rgb.shape[:2])
+            self._launch(images.intensities, rgb.shape[:2], self._up(rgb), *SHARES, out)
+            return down(out)
+
+    def halve(
+        self, depth: NDArray[np.float32], intensity: NDArray[np.float32], tolerance: float
+    ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """See ``Backend.halve``."""
+        shape = depth.shape[0] // 2, depth.shape[1] // 2
+        with self._using():
+            out = self._empty(shape), self._empty(shape)
+            self._launch(images.halve, shape, self._up(depth), self._up(intensity), tolerance, *out)
+            return down(out[0]), down(out[1])
+
+    # -- integrate ---------------------------------------------------------------------------------------------------
+
+    def fuse(
+        self,
+        grid: VoxelGrid,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        candidates: NDArray[np.int32],
+        fused: NDArray[np.uint8],
+        turn: int,
+        count: int,
+        parameters: FusionParameters,
+    ) -> FusedBlocks:
+        """See ``Backend.fuse``; the CPU finds the blocks in view."""
+        slots, repeats = self._visible(grid, view, candidates, fused, turn, count, single(parameters))
+        p, (height, width) = struct(parameters), view.depth.shape
+        with self._using():
+            geometry, colors = resident(grid.geometry, self.device), resident(grid.colors, self.device)
+            pixels = self._empty((height * width, 2), wp.int32)
+            readings = self._up(view.depth), self._up(color), self._up(weights)
+            self._launch(fusion.pack_pixels, view.depth.shape, *readings, p, pixels)
+            occupied = wp.zeros(len(slots), dtype=wp.int32, device=in_warp(self.device))
+            self._launch(
+                fusion.integrate, (len(slots), BLOCK**3), self._up(slots), self._up(repeats),
+                self._up(grid.slot_coords[slots]), motion_of(view.T_camera_world), camera_of(view.intrinsics), height,
+                width, pixels, geometry, colors, p, occupied,
+            )  # fmt: skip
+            for array in (grid.geometry, grid.colors):
+                wrote(array, slots)
+            return FusedBlocks(slots, down(occupied))
+
+    # -- read the map ------------------------------------------------------------------------------------------------
+
+    def _linearization(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        parameters: RegistrationParameters,
+    ) -> Callable[[NDArray[np.float32]], NormalEquations]:
+        """See ``CpuBackend``; the images go up once, for all poses."""
+        shape, p, camera = depth.shape, struct(parameters), camera_of(intrinsics)
+        threads = -(-depth.size // (PER_THREAD * surface.LANES)) * surface.LANES
+        with self._using():
+            image, lattice = (self._up(depth), self._up(intensity), self._up(weights)), self._lattice(grid)
+            partial = self._empty((NUM_SUMS, threads))
+            parts, sums = self._empty((NUM_SUMS, GROUPS), wp.float64), self._empty(NUM_SUMS, wp.float64)
+
+        def at(T_grid_camera: NDArray[np.float32]) -> NormalEquations:
+            with self._using():
+                residuals = self._empty((2, *shape))
+                self._launch(
+                    surface.linearize, threads, *image, camera, motion_of(T_grid_camera), lattice,
+                    float(grid.voxel_size), float(grid.sdf_unit), p, PER_THREAD, residuals, partial,
+                )  # fmt: skip
+                self._launch(surface.add_up, parts.shape, partial, GROUPS, parts)
+                self._launch(surface.finish, NUM_SUMS, parts, sums)
+                return normal_equations(down(sums), _Residuals(residuals, self._using))
+
+        return at
+
+    def sample(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_grid_camera: NDArray[np.float32],
+        free_after: int,
+    ) -> MapSample:
+        """See ``Backend.sample``."""
+        with self._using():
+            out = self._empty(depth.shape), self._empty(depth.shape), self._empty(depth.shape, wp.uint8)
+            self._launch(
+                surface.sample, depth.shape, self._up(depth), self._up(intensity), camera_of(intrinsics),
+                motion_of(T_grid_camera), self._lattice(grid), float(grid.sdf_unit), self._up(grid.free_count),
+                free_after, *out,
+            )  # fmt: skip
+            return MapSample(*(down(image) for image in out))
+
+    def raycast(
+        self,
+        grid: VoxelGrid,
+        T_world_camera: NDArray[np.float64],
+        intrinsics: NDArray[np.float32],
+        size: tuple[int, int],
+        parameters: RaycastParameters,
+    ) -> RaycastResult:
+        """See ``Backend.raycast``."""
+        camera, (height, width) = camera_of(intrinsics), size
+        to_camera, to_lattice, radius = raycasting.motions(grid, T_world_camera)
+        tiles = -(-height // raycasting.TILE), -(-width // raycasting.TILE)
+        limits = float(parameters.depth_min), float(parameters.depth_max)
+        with self._using():
+            lattice, colors = self._lattice(grid), resident(grid.colors, self.device)
+            near, far = self._empty(tiles), self._empty(tiles)
+            near.fill_(float(raycasting.INFINITE))
+            far.zero_()
+            self._launch(
+                tracing.splat_blocks, tuple(int(n) for n in grid.shape), lattice, motion_of(to_camera), camera, height,
+                width, radius, *limits, near, far,
+            )  # fmt: skip
+            out = self._empty(size), self._empty((*size, 3), wp.uint8), self._empty(size, wp.vec3)
+            unit, least = grid.sdf_unit / grid.voxel_size, max(int(parameters.min_weight), 1)
+            self._launch(
+                tracing.trace, size, lattice, colors, camera, motion_of(to_lattice), near, far, *limits, unit, least,
+                *out,
+            )  # fmt: skip
+            return RaycastResult(*(down(image) for image in out))
+
+    # -- the device --------------------------------------------------------------------------------------------------
+
+    def _using(self) -> AbstractContextManager[None]:
+        return faults.using(self.device)
+
+    def _launch(self, kernel: Any, dim: Any, *arguments: Any) -> None:  # noqa: ANN401
+        """Run a kernel; without threads nothing happens."""
+        if np.prod(dim) > 0:
+            wp.launch(kernel, dim=dim, inputs=list(arguments), device=in_warp(self.device))
+
+    def _empty(self, shape: Any, dtype: Any = wp.float32) -> Any:  # noqa: ANN401
+        return wp.empty(shape, dtype=dtype, device=in_warp(self.device))
+
+    def _up(self, array: NDArray) -> Any:  # noqa: ANN401
+        return up(array, self.device)
+
+    def _lattice(self, grid: VoxelGrid) -> Any:  # noqa: ANN401
+        """The window and its voxels as kernels take them."""
+        lattice = Lattice()
+        lattice.cells, lattice.geometry = resident(grid.window, self.device), resident(grid.geometry, self.device)
+        lattice.nx, lattice.ny, lattice.nz = (int(n) for n in grid.shape)
+        return lattice
+
+
+class _Residuals:
+    """Images (2, h, w) on a device, of which each is downloaded when it is asked for."""
+
+    def __init__(self, images: Any, using: Callable[[], AbstractContextManager[None]]) -> None:  # noqa: ANN401
+        self._images, self._using = images, using
+        self._read: dict[int, NDArray[np.float32]] = {}
+
+    def __getitem__(self, number: int) -> NDArray[np.float32]:
+        if number not in self._read:
+            with self._using():
+                self._read[number] = down(self._images[number])
+        return self._read[number]

@@ -1,0 +1,86 @@
+"""Fusion of a depth image into the blocks in view (thesis section 4.5, algorithm 1).
+
+The arithmetic before the shared formulas is that of ``core/backends/cpu/integration.py``.
+"""
+
+import warp as wp
+
+from dudmap.core.backends.warp.kernels.formulas import (
+    Motion,
+    free_depth,
+    fuse_color,
+    fuse_voxel,
+    is_occupied,
+    pack_pixel_color,
+    pack_reading,
+    project,
+    transform,
+)
+from dudmap.core.backends.warp.kernels.images import Image
+from dudmap.core.backends.warp.kernels.structs import Camera, FusionParameters
+
+wp.set_module_options({"enable_backward": False})
+
+FAR = wp.constant(wp.float32(1.0e9))
+Bytes = wp.array2d(dtype=wp.uint8)
+Indices = wp.array(dtype=wp.int32)
+
+
+@wp.kernel
+def pack_pixels(
+    depth: Image, rgb: wp.array3d(dtype=wp.uint8), weights: Bytes, p: FusionParameters,
+    pixels: wp.array2d(dtype=wp.int32),
+):  # fmt: skip
+    """Two words per pixel: see ``integration.pack_pixels``."""
+    v, u = wp.tid()
+    h, w = depth.shape[0], depth.shape[1]
+    near = float(FAR)
+    for y in range(max(v - 1, 0), min(v + 2, h)):
+        for x in range(max(u - 1, 0), min(u + 2, w)):
+            q = depth[y, x]
+            if q > wp.float32(0.0):
+                near = min(near, q)
+    z = depth[v, u]
+    n = v * w + u
+    pixels[n, 0] = pack_reading(z, free_depth(z, near, p.band), wp.float32(1.0) / p.depth_unit)
+    pixels[n, 1] = pack_pixel_color(rgb[v, u, 0], rgb[v, u, 1], rgb[v, u, 2], weights[v, u])
+
+
+@wp.kernel
+def integrate(
+    slots: Indices, repeats: wp.array(dtype=wp.float32), coords: wp.array2d(dtype=wp.int32), t: Motion, camera: Camera,
+    height: int, width: int, pixels: wp.array2d(dtype=wp.int32), geometry: wp.array2d(dtype=wp.int32),
+    colors: wp.array2d(dtype=wp.int32), p: FusionParameters, occupied: Indices,
+):  # fmt: skip
+    """Fuse the image into one voxel per thread: see ``integration.integrate_blocks``.
+
+    ``coords`` (n, 3) are those of ``slots`` (n,). The count of occupied voxels is an integer, whose sum has no order.
+    """
+    block, n = wp.tid()
+    slot = slots[block]
+    half, one = wp.float32(0.5), wp.float32(1.0)
+    ox = wp.float32(coords[block, 0] * 8) * p.voxel_size
+    oy = wp.float32(coords[block, 1] * 8) * p.voxel_size
+    oz = wp.float32(coords[block, 2] * 8) * p.voxel_size
+    x = wp.float32(n / 64) * p.voxel_size
+    y = wp.float32((n / 8) % 8) * p.voxel_size
+    z = wp.float32(n % 8) * p.voxel_size
+    bx, by, bz = transform(t, ox, oy, oz)
+    lx = t[0] * x + t[1] * y + t[2] * z
+    ly = t[4] * x + t[5] * y + t[6] * z
+    lz = t[8] * x + t[9] * y + t[10] * z
+    depth = bz + lz
+    by_z = one / max(depth, wp.float32(1.0e-3))
+    u = wp.floor(project(bx + lx, by_z, camera.fx, camera.cx + half))
+    v = wp.floor(project(by + ly, by_z, camera.fy, camera.cy + half))
+    reading, color = int(0), int(0)
+    if depth > 0.05 and u >= 0.0 and v >= 0.0 and u < wp.float32(width) and v < wp.float32(height):
+        pixel = wp.int32(v) * width + wp.int32(u)
+        reading = pixels[pixel, 0]
+        color = pixels[pixel, 1]
+    word, share = fuse_voxel(geometry[slot, n], reading, color, depth, repeats[block], one / p.sdf_unit, p)
+    geometry[slot, n] = word
+    if share != wp.float32(0.0):
+        colors[slot, n] = fuse_color(colors[slot, n], color, share)
+    if is_occupied(word, p):
+        wp.atomic_add(occupied, block, 1)

@@ -1,0 +1,196 @@
+"""Estimation of the calibration from pairs of frames."""
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig
+from dudmap.core.calibration.adjustment import Adjustment
+from dudmap.core.calibration.keyframes import ColorKeyframe
+from dudmap.core.calibration.pairs import Pair, select_across, select_pairs
+from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
+
+GROUPS: dict[str, tuple[str, ...]] = {
+    "timing": ("delay", "readout"),
+    "lens": ("k1", "k2"),
+    "geometry": ("rotation_x", "rotation_y", "rotation_z", "log_focal", "center_x", "center_y"),
+}
+"""Parameters that leave their given values together. The translation follows the rest of the geometry: most of it looks
+like a rotation, which alone proves that the cameras are not where they are said to be."""
+TRANSLATION = ("translation_x", "translation_y", "translation_z")
+MIN_PAIRS = 14
+"""Pairs of either half of the time without which nothing is estimated: one more than parameters."""
+PAIRS = 80
+"""Pairs that decide what is estimated; half as many more, across the halves, enter the result."""
+MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.05}
+"""Share by which it must decrease: less is not worth leaving the given values, however certain it is. A depth image
+bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
+recording with such a depth (TUM fr1_xyz) the geometry gained 2 to 4 % and its use made the poses worse; 25 mm gain
+30 %."""
+EVIDENCE = 2.0
+"""Standard errors by which a group of parameters, estimated from either half of the time, must decrease the cost of the
+pairs of the other half. Chance does so in both halves once in 2000 times."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    """Result of an estimation.
+
+    Attributes:
+        calibration: What was found, with its standard deviations; as given where there is no evidence.
+        evidence: Per group of ``GROUPS``, the decrease of the cost of pairs that were not used, in standard errors, the
+            smaller one of both halves; NaN where there were too few pairs.
+        gain: Share by which the cost of pairs that were not used decreased.
+        pairs: Number of pairs.
+    """
+
+    calibration: Calibration
+    evidence: dict[str, float]
+    gain: float
+    pairs: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Trial:
+    """Calibrations from both halves of the time with some free parameters, and the costs of the other halves' pairs."""
+
+    free: NDArray[np.bool_]
+    known: list[Calibration]
+    costs: list[NDArray[np.float64]]
+
+    def improvement(self, other: "_Trial") -> tuple[float, float]:
+        """Decrease of the cost from another trial on, in standard errors and as a share; the smaller one of both
+        halves."""
+        gains = [before - after for before, after in zip(other.costs, self.costs, strict=True)]
+        errors = [float(gain.mean() / max(gain.std() / np.sqrt(len(gain)), 1e-12)) for gain in gains]
+        shares = [float(gain.mean() / before.mean()) for gain, before in zip(gains, other.costs, strict=True)]
+        return min(errors), min(shares)
+
+    def proves(self, other: "_Trial", group: str) -> bool:
+        """Whether it explains so much more than another trial that a group may leave its given values."""
+        evidence, share = self.improvement(other)
+        return evidence >= EVIDENCE and share >= MATERIAL[group]
+
+
+def mask_of(names: Sequence[str]) -> NDArray[np.bool_]:
+    """Mask (13,) of parameters."""
+    return np.array([name in names for name in PARAMETERS])
+
+
+class CalibrationEstimator:
+    """Calibration from pairs of frames of a static scene, by differences of intensity and depth.
+
+    A point X of the depth image of frame i is seen by both colour cameras; with the calibration theta, the projection
+    pi(theta, xi, X) of ``Calibration`` with the camera's velocity xi, and the relative pose T of the depth cameras,
+
+        r_I = I_j(pi(theta, xi_j, T X)) - g I_i(pi(theta, xi_i, X)) - o,      r_D = Z_j(T X) - (T X)_z.
+
+    An error of theta moves the colours of both frames, but not alike: by a turn of the camera it is turned along, with
+    the velocities it changes. theta is common to all pairs, T follows from the poses of both frames, which are unknowns
+    too, and g and o belong to the pair (``Adjustment``). Robust Gauss-Newton, coarse to fine, with priors at the given
+    values. The covariance is a sandwich with one score per frame, the sum of those of its pairs: it admits that the
+    pixels of a pair, and the pairs of a frame, err together (Aronow, Samii and Assenova 2015, without the correction
+    for pairs counted twice).
+
+    Args:
+        given: The calibration as given.
+        sensor: Noise of the depth readings.
+        workers: Threads; 2 do both halves of the time at once.
+    """
+
+    def __init__(self, given: Calibration, sensor: SensorConfig, workers: int = 1) -> None:
+        self.given = given
+        self.workers = workers
+        self.adjustment = Adjustment(given, sensor)
+
+    def estimate(self, keyframes: Sequence[ColorKeyframe], count: int = PAIRS) -> Estimate:
+        """Calibration that explains pairs of frames, as far as they prove it.
+
+        Groups of parameters leave the given values one after the other, that with the most evidence first, as long as
+        their estimate from either half of the time predicts the pairs of the other half better. What merely absorbs
+        errors of another kind, such as a bent depth image, does so differently from place to place and fails.
+
+        Args:
+            keyframes: In the order of time.
+            count: Number of pairs, half of them in each half of the time.
+        """
+        middle = len(keyframes) // 2
+        halves = [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
+        everything = np.ones(NUM_PARAMETERS, dtype=bool)
+        if min(len(pairs) for pairs in halves) < MIN_PAIRS:
+            return Estimate(self.given, dict.fromkeys(GROUPS, float("nan")), 0.0, sum(map(len, halves)))
+        known = [self.given, self.given]  # from the first and from the second half
+        start = _Trial(~everything, known, [self.adjustment.costs(halves[1 - n], known[n]) for n in (0, 1)])
+        proven, evidence = self._proven(halves, start)
+        pairs = [*halves[0], *halves[1], *select_across(keyframes[:middle], keyframes[middle:], count // 2)]
+        free = proven.free
+        found, covariance = self.adjustment.solve(pairs, proven.known[1], free) if free.any() else (self.given, None)
+        _, uncertain = self.adjustment.solve(pairs, found, everything, self.adjustment.levels[-1:])
+        sigma = np.sqrt(np.diag(uncertain))
+        if covariance is not None:
+            sigma[free] = np.sqrt(np.diag(covariance)[free])
+        estimated = tuple(name for name, moved in zip(PARAMETERS, free, strict=True) if moved)
+        gain = 1 - float(np.concatenate(proven.costs).mean() / np.concatenate(start.costs).mean())
+        return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
+
+    def _proven(self, halves: list[list[Pair]], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
+        """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
+        trial, evidence, rest = start, dict[str, float](), list(GROUPS)
+        while rest:
+            trials = {name: self._trial(halves, trial, [name]) for name in rest}
+            evidence |= {name: other.improvement(trial)[0] for name, other in trials.items()}
+            best = max(rest, key=lambda name: evidence[name])
+            if not trials[best].proves(trial, best):
+                break
+            trial = self._with_translation(halves, trial, trials[best])
+            rest.remove(best)
+        if len(rest) > 1:
+            together, names = self._together(halves, trial, rest)
+            evidence |= names
+            trial = self._with_translation(halves, trial, together)
+        return trial, evidence
+
+    def _together(
+        self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]
+    ) -> tuple["_Trial", dict[str, float]]:
+        """Groups none of which explains anything without the others, and the evidence of each beside the others.
+
+        While the focal length is wrong, no delay explains what a delay does, and the other way round. All groups are
+        freed; those without which the others do as well are given up one by one.
+        """
+        trial, names = self._trial(halves, before, names), list(names)
+        while len(names) > 1 and all(trial.proves(before, name) for name in names):
+            fewer = {name: self._trial(halves, before, [n for n in names if n != name]) for name in names}
+            evidence = {name: trial.improvement(other)[0] for name, other in fewer.items()}
+            weakest = min(names, key=lambda name: evidence[name])
+            needless = [name for name in (weakest, *names) if not trial.proves(fewer[name], name)]
+            if not needless:
+                return trial, evidence
+            names.remove(needless[0])
+            trial = fewer[needless[0]]
+        return before, {}
+
+    def _trial(self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]) -> "_Trial":
+        """What groups of parameters would explain in addition to those that are free."""
+        return self._freed(halves, before, before.free | mask_of([member for name in names for member in GROUPS[name]]))
+
+    def _with_translation(self, halves: list[list[Pair]], before: "_Trial", trial: "_Trial") -> "_Trial":
+        """The same with the translation, if the rest of the geometry has just left its given values."""
+        if not (trial.free & ~before.free)[mask_of(GROUPS["geometry"])].any():
+            return trial
+        return self._freed(halves, trial, trial.free | mask_of(TRANSLATION))
+
+    def _freed(self, halves: list[list[Pair]], before: "_Trial", free: NDArray[np.bool_]) -> "_Trial":
+        # only the geometry can displace the colours by so much that the smallest images have to begin
+        levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
+
+        def fitted(n: int) -> tuple[Calibration, NDArray[np.float64]]:
+            known, _ = self.adjustment.solve(halves[n], before.known[n], free, levels)
+            return known, self.adjustment.costs(halves[1 - n], known)
+
+        with ThreadPoolExecutor(self.workers) as pool:
+            (one, other), (cost, other_cost) = zip(*pool.map(fitted, (0, 1)), strict=True)
+        return _Trial(free, [one, other], [cost, other_cost])

@@ -1,0 +1,123 @@
+"""Frames from which the calibration is estimated."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.color_registration import recorded_intensity
+from dudmap.core.frames.observation import Observation
+from dudmap.core.frames.pyramid import halved
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+
+GEOMETRY_WIDTH = 160
+"""Width of the depth images that are compared, pixels."""
+COLOR_WIDTHS = (80, 160, 320)
+"""Widths of the colour images that are compared, coarse to fine, pixels."""
+POINT_STRIDE = 3
+"""Every so many pixels, across and down, are points that are compared."""
+SAME_SURFACE = 0.03
+"""Depth differences below this share of the depth belong to one surface."""
+
+
+BAND = 1.0, 4.0
+"""Standard deviations of the Gaussians whose difference filters the intensities, pixels. Vignetting, shading and
+exposure change slowly over the image and stay with the camera, which would look like a displacement of the colours;
+noise and detail of single pixels differ from view to view and spoil the derivatives."""
+
+
+@dataclass(frozen=True, eq=False)
+class ColorKeyframe:
+    """A frame for the calibration.
+
+    Attributes:
+        timestamp: Of the depth image, s.
+        color_offset: Time stamp of the colour image minus that of the depth image, s.
+        camera: Of ``depth``.
+        depth: (h, w) float32, metres, 0 where there is no reading or something moves.
+        points: (n, 3) float32 in the camera frame, away from depth edges.
+        tangents: (n, 6) float32, two directions of the surface at each point.
+        intensities: (h, w) float32 of the colour image as recorded, filtered with ``BAND``, coarse to fine.
+        T_world_camera: (4, 4).
+        velocity: (6,) twist per second, camera axes.
+    """
+
+    timestamp: float
+    color_offset: float
+    camera: Camera
+    depth: NDArray[np.float32]
+    points: NDArray[np.float32]
+    tangents: NDArray[np.float32]
+    intensities: list[NDArray[np.float32]]
+    T_world_camera: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+
+
+def halvings_to(width: int, camera: Camera) -> int:
+    """Number of halvings after which an image is about so wide."""
+    return max(0, round(np.log2(camera.width / width)))
+
+
+def color_levels(camera: Camera) -> list[int]:
+    """Halvings of the colour images that are compared, coarse to fine; fewer for small images."""
+    return sorted({halvings_to(width, camera) for width in COLOR_WIDTHS}, reverse=True)
+
+
+def keyframe(
+    observation: Observation,
+    color_camera: Camera,
+    T_world_camera: NDArray[np.float64],
+    velocity: NDArray[np.float64],
+    dynamic_mask: NDArray[np.bool_] | None,
+) -> ColorKeyframe:
+    """Keyframe of a preprocessed frame.
+
+    Args:
+        observation: The frame.
+        color_camera: Camera of the colour images as recorded.
+        T_world_camera: (4, 4) pose.
+        velocity: (6,) twist of the camera per second, its own axes.
+        dynamic_mask: (H, W) bool, pixels that move; None for none.
+    """
+    import cv2
+
+    level = halvings_to(GEOMETRY_WIDTH, observation.camera)
+    camera = observation.camera.scaled(level)
+    depth, _ = halved(observation, level)
+    if dynamic_mask is not None and dynamic_mask.any():
+        moving = cv2.resize(dynamic_mask.astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA) > 0
+        depth = np.where(moving, np.float32(0), depth)
+    intensities = []
+    for number in color_levels(color_camera):
+        image = recorded_intensity(observation, number)
+        fine, coarse = (np.asarray(cv2.GaussianBlur(image, (0, 0), sigma), np.float32) for sigma in BAND)
+        intensities.append(fine - coarse)
+    smooth = _off_edges(depth)[::POINT_STRIDE, ::POINT_STRIDE]
+    points = camera.backproject(depth)
+    tangents = np.zeros((*depth.shape, 6), np.float32)
+    tangents[:, 1:-1, :3] = points[:, 2:] - points[:, :-2]
+    tangents[1:-1, :, 3:] = points[2:] - points[:-2]
+    points, tangents = (image[::POINT_STRIDE, ::POINT_STRIDE][smooth] for image in (points, tangents))
+    return ColorKeyframe(
+        observation.timestamp, observation.color_offset, camera, depth, points, tangents, intensities, T_world_camera,
+        velocity,
+    )  # fmt: skip
+
+
+def _off_edges(depth: NDArray[np.float32]) -> NDArray[np.bool_]:
+    """Pixels (h, w) whose eight neighbours are readings of the same surface."""
+    import cv2
+
+    window = np.ones((3, 3), np.uint8)
+    near, far = cv2.erode(depth, window), cv2.dilate(depth, window)
+    out = np.asarray((near > 0) & (far - near < SAME_SURFACE * depth))
+    out[[0, -1]] = out[:, [0, -1]] = False
+    return out
+
+
+def central_velocity(
+    before: tuple[float, NDArray[np.float64]], after: tuple[float, NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Twist per second (6,), camera axes, between two (time, pose) around a frame."""
+    return se3.log(se3.inverse(before[1]) @ after[1]) / max(after[0] - before[0], 1e-3)

@@ -1,0 +1,218 @@
+"""Motion segmentation from images, for as long as the map cannot tell static from moving.
+
+A new map knows no free space, and whoever is in view is part of it. Each image is compared with the last one
+(``dominant_motion``), and with older ones for motion that is too slow to be seen from one image to the next.
+"""
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.dynamics.dominant_motion import (
+    DominantMotion,
+    dominant_motion,
+    exceeds_noise_share,
+    propagate_to_segments,
+)
+from dudmap.core.dynamics.segments import Segmentation
+from dudmap.core.frames.pyramid import Pyramid, is_majority_dynamic
+from dudmap.core.geometry import se3
+
+SHORTEST_BASELINE, LONGEST_BASELINE = 0.1, 0.4
+"""Motion too slow to be seen from one image to the next is measured against an image this much older, seconds. While
+the map is young, images are kept at intervals of the shorter one."""
+
+
+@dataclass(eq=False)
+class OlderImage:
+    """A tracked image that later ones are compared with.
+
+    Attributes:
+        timestamp: Seconds.
+        T_world_camera: (4, 4).
+        pyramid: Its images.
+        segmentation: Its segments, at the resolution of the labels.
+        moving: (h, w) bool, its pixels that are known to move; None for none.
+    """
+
+    timestamp: float
+    T_world_camera: NDArray[np.float64]
+    pyramid: Pyramid
+    segmentation: Segmentation
+    moving: NDArray[np.bool_] | None = None
+
+    def motion_to(
+        self, pyramid: Pyramid, segmentation: Segmentation, T_world_camera: NDArray[np.float64], intervals: float
+    ) -> DominantMotion | None:
+        """Motion of the static world to a later image, and what moves too slowly to be seen from image to image.
+
+        What is seen to move in this image is left out of the estimates of the next comparisons.
+
+        Args:
+            pyramid: The later image.
+            segmentation: Its segments.
+            T_world_camera: (4, 4) prediction of its pose.
+            intervals: Number of intervals between consecutive images that lie between the two.
+
+        Returns:
+            None if it cannot be determined.
+        """
+        T_expected = se3.inverse(T_world_camera) @ self.T_world_camera
+        segmentations = self.segmentation, segmentation
+        motion = dominant_motion(self.pyramid, pyramid, segmentations, self.moving, T_expected, intervals)
+        if motion is not None:
+            moving = propagate_to_segments(motion.before, whole_only=True)
+            self.moving = moving if self.moving is None else self.moving | moving
+        return motion
+
+
+@dataclass(frozen=True, eq=False)
+class SlowMotion:
+    """What an image and an older one tell.
+
+    Attributes:
+        T_world_camera: (4, 4) pose of the new image, from that of the older one.
+        moving: (h, w) bool, pixels of the new image in segments that moved as a whole in between.
+        moving_first: (h, w) bool, the same of the older image if that is the first one of the map; else None.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    moving: NDArray[np.bool_]
+    moving_first: NDArray[np.bool_] | None
+
+
+class EgoMotionSegmenter:
+    """Segments moving objects by comparing images, while the map is young or most of the view moves.
+
+    Args:
+        seconds: Duration of the comparison from the first frame of a map on; extended, up to twice that, while moving
+            objects are found. 0 turns the comparison off for good.
+
+    Attributes:
+        active: Whether the next frame is to be compared with the last one.
+    """
+
+    def __init__(self, seconds: float) -> None:
+        self.seconds = seconds
+        self.active = False
+        self._young_until, self._latest_end = -np.inf, -np.inf
+        self._started = self._last_timestamp = -np.inf
+        self._last: tuple[Pyramid, Segmentation, NDArray[np.bool_] | None] | None = None
+        self._older: deque[OlderImage] = deque()
+        self._compared: tuple[float, DominantMotion | None] | None = None  # time and result of the last comparison
+
+    def start(self, timestamp: float) -> None:
+        """Begin with the first frame of a map."""
+        self._young_until, self._latest_end = timestamp + self.seconds, timestamp + 2 * self.seconds
+        self._started = timestamp
+        self._older.clear()
+
+    @property
+    def started(self) -> bool:
+        """Whether ``start`` was called."""
+        return bool(np.isfinite(self._started))
+
+    def map_is_young(self, timestamp: float) -> bool:
+        """Whether the map cannot tell static from moving yet."""
+        return timestamp < self._young_until
+
+    def slow_motion_is_hidden(self, timestamp: float) -> bool:
+        """Whether the map is younger than the longest baseline over which slow motion is looked for."""
+        return timestamp < self._started + min(LONGEST_BASELINE, self.seconds)
+
+    def update(
+        self,
+        timestamp: float,
+        T_world_camera: NDArray[np.float64],
+        pyramid: Pyramid,
+        segmentation: Segmentation,
+        moving: NDArray[np.bool_] | None = None,
+    ) -> None:
+        """Take over a tracked frame as the one that the next is compared with.
+
+        Args:
+            timestamp: Seconds.
+            T_world_camera: (4, 4) its pose.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+            moving: (h, w) bool, its moving pixels, if known.
+        """
+        self._last, self._last_timestamp, self._compared = (pyramid, segmentation, moving), timestamp, None
+        young = self.map_is_young(timestamp)
+        hidden = moving is not None and is_majority_dynamic(moving, pyramid.labelled)
+        self.active = young or (hidden and self.seconds > 0 and self.started)
+        if not young:
+            self._older.clear()
+        elif not self._older or timestamp - self._older[-1].timestamp >= SHORTEST_BASELINE:
+            self._older.append(OlderImage(timestamp, T_world_camera, pyramid, segmentation, moving))
+
+    def reset(self) -> None:
+        """Drop the last frame: nothing is compared before the next ``update``."""
+        self._last, self._compared, self.active = None, None, False
+
+    def compare(
+        self,
+        timestamp: float,
+        pyramid: Pyramid,
+        segmentation: Segmentation,
+        T_expected: NDArray[np.float64] | None = None,
+    ) -> DominantMotion | None:
+        """Motion of the static world since the last frame; None if it cannot be determined.
+
+        The result is kept: a second call with the same timestamp returns the same object.
+
+        Args:
+            timestamp: Seconds, of the new frame.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+            T_expected: (4, 4) predicted motion of the static world; None: none.
+        """
+        if self._last is None:
+            return None
+        if self._compared is None or self._compared[0] != timestamp:
+            last, segmentation_last, moving = self._last
+            motion = dominant_motion(last, pyramid, (segmentation_last, segmentation), moving, T_expected)
+            self._compared = timestamp, motion
+            if (
+                motion is not None
+                and self.map_is_young(timestamp)
+                and exceeds_noise_share(motion.moving_after, pyramid.labelled)
+            ):
+                self._young_until = min(timestamp + self.seconds, self._latest_end)
+        return self._compared[1]
+
+    def slow_motion(
+        self, timestamp: float, T_world_camera: NDArray[np.float64], pyramid: Pyramid, segmentation: Segmentation
+    ) -> SlowMotion | None:
+        """Comparison with an older image; None once the map is not young, or where they follow no common motion.
+
+        Where that shows something to move, the newest of the older images is compared, too: what came into view since
+        the oldest one was taken moves in neither comparison otherwise.
+
+        Args:
+            timestamp: Seconds, of the new frame.
+            T_world_camera: (4, 4) prediction of its pose.
+            pyramid: Its images.
+            segmentation: Its segments, at the resolution of the labels.
+        """
+        while self._older and timestamp - self._older[0].timestamp > LONGEST_BASELINE:
+            self._older.popleft()
+        older = [image for image in self._older if timestamp - image.timestamp >= SHORTEST_BASELINE]
+        if not older or not self.map_is_young(timestamp):
+            return None
+        oldest, newest = older[0], older[-1]
+        interval = timestamp - self._last_timestamp
+        ages = [(timestamp - image.timestamp) / interval for image in (oldest, newest)]
+        motion = oldest.motion_to(pyramid, segmentation, T_world_camera, ages[0])
+        if motion is None:
+            return None
+        T_world_camera = oldest.T_world_camera @ se3.inverse(motion.T_after_before)
+        moving = propagate_to_segments(motion.after, whole_only=True)
+        first = oldest.moving if oldest.timestamp == self._started else None
+        if newest is not oldest and exceeds_noise_share(moving, pyramid.labelled):
+            motion = newest.motion_to(pyramid, segmentation, T_world_camera, ages[1])
+            if motion is not None:
+                moving = moving | propagate_to_segments(motion.after, whole_only=True)
+        return SlowMotion(T_world_camera, moving, first)

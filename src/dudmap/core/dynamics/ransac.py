@@ -1,0 +1,127 @@
+"""Robust estimation of the rigid motion that most of the visible surface follows (RANSAC, Fischler and Bolles 1981)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu import consensus
+from dudmap.core.backends.cpu.consensus import ConsensusParams
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+
+REFERENCE_WIDTH = 320
+"""Image width that distances in pixels are given for; they grow in proportion to the width of an image."""
+NOISE_PX = 0.7
+"""Inlier threshold t of the reprojection error, pixels: t^2 = 5.99 sigma^2 holds 95 % of the errors (chi-square, two
+degrees of freedom) of corners measured with sigma = 0.29 px per coordinate."""
+REFINED = 5
+"""Hypotheses of each noise level that are refined: three noisy corners seldom give the best one outright."""
+NOISE_LEVELS = 1.0, 0.5, 0.25
+"""Noise of the corners that is considered, as multiples of the largest one, the sigma of NOISE_PX: in sharp images
+corners of a right motion are measured with 0.07 px per coordinate."""
+OUTLIER_GAIN = 2.996
+"""Log-likelihood ratio of a corner without error to an outlier at the largest noise level, 5.99 / 2: a corner is an
+inlier up to the error at which both are equally likely."""
+NEAR_PX = 5.0
+"""Scale of the prior on the distance of a motion from the expected one, pixels: a turn by 1.1 degrees at a focal length
+of 262 pixels, by which a prediction at constant velocity errs where a turn of 33 degrees/s begins within 1/30 s."""
+HYPOTHESES = 150
+"""Hypotheses from uniform samples, and as many from samples weighted by area. With a share of inliers of 1/3, samples
+of three miss all of the inliers with probability (1 - 1/27)^150 = 0.3 %."""
+
+
+def rigid_motion(
+    points: NDArray[np.float64],
+    targets: NDArray[np.float64],
+    camera: Camera,
+    T_expected: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """Motion T_after_before (4, 4) with the highest score among hypotheses from samples of three correspondences.
+
+    Three correspondences determine the twist of a small motion linearly (Longuet-Higgins and Prazdny 1980). The score
+    of a motion is that of MSAC (Torr and Zisserman 2000), each correspondence weighted by its depth squared, to
+    which the surface that it stands for is proportional, times a prior:
+
+        score(T, sigma) = gain sum_n z_n^2 (1 - min(e_n^2 / (2 gain sigma^2), 1)) * (0.5 + 0.5 / (1 + (d / NEAR_PX)^2))
+        gain = log(A / (2 pi sigma^2))
+
+    where e_n is the reprojection error and d the mean distance, in pixels, of the reprojected points from where the
+    expected motion puts them. The sum is the log-likelihood of normally distributed errors against that of outliers
+    spread over an area A. The noise sigma is unknown like the motion, and the pair of the highest score is searched: at
+    a noise fixed too large, a motion between that of the static world and that of slow people explains both.
+
+    The prior decides between two motions that explain nearly as much surface: a crowd that
+    walks abreast may cover more of it than the static world, and two images alone cannot tell which of the two moves.
+    The prior ranges from 1 to 1/2 only, because the expected motion is a prediction and may be wrong.
+
+    The REFINED best hypotheses of each noise level and the expected motion are refined on their inliers with the exact
+    projection, and the one of the highest score is returned.
+
+    Args:
+        points: (n, 3) metres, first camera's frame.
+        targets: (n, 2) their pixels in the second image.
+        camera: Camera of both images.
+        T_expected: (4, 4) predicted motion.
+    """
+    areas = points[:, 2] ** 2
+    params = _params(camera)
+    start, expected = (reproject(T, points, camera) for T in (np.eye(4), T_expected))
+    flow, J = targets - start, flow_jacobian(points, camera)
+    rng = np.random.default_rng(0)
+    n = len(points)
+    draws = np.concatenate([
+        rng.integers(0, n, (HYPOTHESES, 3)),
+        rng.choice(n, (HYPOTHESES, 3), p=areas / areas.sum()),
+    ])  # fmt: skip
+    A = J[draws].reshape(-1, 6, 6)
+    A = A + 1e-9 * np.eye(6)  # samples with a repeated point are degenerate; their hypotheses have no support
+    motions = se3.exp_all(np.asarray(np.linalg.solve(A, flow[draws].reshape(-1, 6, 1))[..., 0], np.float64))
+    points, targets, expected = (np.ascontiguousarray(values.T) for values in (points, targets, expected))
+    found = consensus.Correspondences(points, targets, expected, areas, camera.intrinsics)
+    scores = consensus.msac_scores(motions, found, params)
+    best = np.argpartition(scores, -REFINED, axis=0)[-REFINED:]
+    levels = [np.concatenate([T_expected[None], motions[highest]]) for highest in best.T]
+    refined = _refined(np.concatenate(levels), np.repeat(params.inlier_px, REFINED + 1), found)
+    return refined[consensus.msac_scores(refined, found, params).max(axis=1).argmax()]
+
+
+def _refined(
+    motions: NDArray[np.float64], inlier_px: NDArray[np.float64], found: consensus.Correspondences
+) -> NDArray[np.float64]:
+    """Least-squares motions (g, 4, 4) of the inliers of motions near them, by Gauss-Newton; ``inlier_px`` (g,) is the
+    reprojection error from which on a correspondence is an outlier of each."""
+    for scale in (2.0, 1.0, 1.0):  # a hypothesis comes from three noisy corners: begin with a wider inlier threshold
+        H, gradient, inliers = consensus.linearized(motions, found, scale * inlier_px)
+        determined = inliers >= 6
+        H = H[determined]
+        damped = H + 1e-9 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(6)
+        steps = np.linalg.solve(damped, gradient[determined][..., None])[..., 0]
+        motions[determined] = se3.exp_all(steps) @ motions[determined]
+    return motions
+
+
+def pixels_at_width(distance: float, camera: Camera) -> float:
+    """Distance in pixels of an image, given that in an image of REFERENCE_WIDTH with the same view."""
+    return distance * camera.width / REFERENCE_WIDTH
+
+
+def _params(camera: Camera) -> ConsensusParams:
+    levels = np.array(NOISE_LEVELS)
+    gain = OUTLIER_GAIN - 2 * np.log(levels)  # the density of errors without noise grows with 1 / sigma^2
+    limits = pixels_at_width(NOISE_PX, camera) * levels * np.sqrt(gain / OUTLIER_GAIN)
+    return ConsensusParams(tuple(limits), tuple(gain), pixels_at_width(NEAR_PX, camera))
+
+
+def flow_jacobian(points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Derivative (n, 2, 6) of the pixels of points (n, 3) by a twist (v, omega) applied to the points, at zero."""
+    z = np.maximum(points[:, 2], 1e-6)
+    x, y, one, zero = points[:, 0] / z, points[:, 1] / z, np.ones_like(z), np.zeros_like(z)
+    du = camera.fx * np.stack([one / z, zero, -x / z, -x * y, 1 + x * x, -y], axis=1)
+    dv = camera.fy * np.stack([zero, one / z, -y / z, -1 - y * y, x * y, x], axis=1)
+    return np.stack([du, dv], axis=1)
+
+
+def reproject(T: NDArray[np.float64], points: NDArray[np.float64], camera: Camera) -> NDArray[np.float64]:
+    """Pixels (n, 2) of points (n, 3) after a motion T (4, 4); points behind the camera land far outside the image."""
+    moved = points @ T[:3, :3].T + T[:3, 3]
+    z = np.maximum(moved[:, 2], 1e-6)
+    return np.stack([camera.fx * moved[:, 0] / z + camera.cx, camera.fy * moved[:, 1] / z + camera.cy], axis=1)

@@ -1,0 +1,230 @@
+"""Recent frames: what moved in the last one, what they have seen through, and what has stood still since."""
+
+from collections import deque
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import DynamicsConfig
+from dudmap.core.backends.cpu.evidence import compare_with_frame, free_space, seen_marked
+from dudmap.core.backends.cpu.reprojection import ReprojectionTarget
+from dudmap.core.dynamics.label_scale import scaled_side
+from dudmap.core.dynamics.segments import COMMON_MISMATCH, Segmentation, evidence_of, upper_quartile
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+
+SETTLE_FRAMES = 4
+"""Frames kept of ``settle_time``, in which a segment must stand still to be released."""
+START_FRAMES = 6
+"""Frames kept of ``start_seconds``, whose lines of sight are free space."""
+YOUNG_PERIODS = 3.0
+"""Age of the map, in units of ``start_seconds``, up to which single frames give free space; later the map does."""
+YOUNG_UNKNOWN_SHARE = 0.1
+"""Share of the readings in space unknown to the map from which on single frames give free space at any age."""
+SEAM = 1
+"""Half width of the free regions, pixels at REFERENCE_WIDTH, that a slightly wrong pose makes along a depth edge."""
+DYNAMIC_SHARE = 0.2
+"""Share of a segment's pixels that must be dynamic for the segment to be remembered as dynamic."""
+
+
+@dataclass(frozen=True, eq=False)
+class RememberedFrame:
+    """A tracked frame with its labels.
+
+    Attributes:
+        timestamp: Seconds.
+        level: The image.
+        T_world_camera: (4, 4).
+        dynamic: (h, w) uint8, 1 for pixels of dynamic segments, else 0.
+    """
+
+    timestamp: float
+    level: Level
+    T_world_camera: NDArray[np.float64]
+    dynamic: NDArray[np.uint8]
+
+
+class TemporalMemory:
+    """Remembered frames that new ones are compared with.
+
+    Args:
+        config: ``settle_time`` and ``start_seconds``.
+    """
+
+    def __init__(self, config: DynamicsConfig) -> None:
+        self.config = config
+        self._last: RememberedFrame | None = None
+        self._settle_frames: deque[RememberedFrame] = deque()
+        self._recent_frames: deque[RememberedFrame] = deque()
+        self._start_frames: list[RememberedFrame] = []
+        self._imported = False  # the frames of the first seconds come from another pass
+        self._young_until = -np.inf
+
+    def start(self, timestamp: float) -> None:
+        """Begin with the first frame of a map, of this time in seconds."""
+        self._young_until = timestamp + YOUNG_PERIODS * self.config.start_seconds
+        self._start_frames = []
+        self._recent_frames.clear()
+
+    def import_from(self, other: "TemporalMemory", Ts_world_camera: dict[float, NDArray[np.float64]]) -> None:
+        """Import the frames of the first seconds from another pass over the same recording.
+
+        Args:
+            other: The memory of that pass.
+            Ts_world_camera: (4, 4) poses of its frames by timestamp; frames without one are left out.
+        """
+        self._young_until, self._imported = other._young_until, True
+        self._start_frames = [
+            replace(frame, T_world_camera=Ts_world_camera[frame.timestamp])
+            for frame in other._start_frames
+            if frame.timestamp in Ts_world_camera
+        ]
+
+    def update(
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        dynamic: NDArray[np.bool_],
+        segmentation: Segmentation | None,
+    ) -> None:
+        """Remember a tracked frame.
+
+        Args:
+            timestamp: Seconds.
+            level: The image.
+            T_world_camera: (4, 4).
+            dynamic: (h, w) bool.
+            segmentation: Segments of the image; None where motion is not decided by segment.
+        """
+        marks = np.zeros(dynamic.shape, dtype=np.uint8)
+        if segmentation is not None:
+            dynamic_segments = segmentation.share(dynamic) >= DYNAMIC_SHARE
+            dynamic_segments[0] = False
+            marks[dynamic_segments[segmentation.labels]] = 1
+        settle_time, start_seconds = self.config.settle_time, self.config.start_seconds
+        self._last = frame = RememberedFrame(timestamp, level, T_world_camera, marks)
+        settle_frames, recent_frames = self._settle_frames, self._recent_frames
+        if not settle_frames or timestamp - settle_frames[-1].timestamp >= settle_time / SETTLE_FRAMES:
+            settle_frames.append(frame)
+        if not recent_frames or timestamp - recent_frames[-1].timestamp >= start_seconds / START_FRAMES:
+            recent_frames.append(frame)
+            if timestamp < self._young_until and not self._imported:
+                self._start_frames.append(frame)
+        while timestamp - recent_frames[0].timestamp > start_seconds:
+            recent_frames.popleft()
+        while len(settle_frames) > 1 and timestamp - settle_frames[1].timestamp >= settle_time:
+            settle_frames.popleft()
+
+    def reset(self) -> None:
+        """Forget all frames after a loss of tracking; those imported from another pass stay."""
+        self._last = None
+        self._settle_frames.clear()
+        self._recent_frames.clear()
+        self._start_frames = self._start_frames if self._imported else []
+
+    def last_dynamic(self, level: Level, T_world_camera: NDArray[np.float64], max_gap: float) -> NDArray[np.bool_]:
+        """Pixels (h, w) whose points belonged to a dynamic segment in the last frame.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            max_gap: Largest depth difference between a point and the last frame's reading of it, metres.
+        """
+        if self._last is None or not self._last.dynamic.any():
+            return np.zeros(level.depth.shape, dtype=bool)
+        (target,) = _targets(T_world_camera, [self._last])
+        return seen_marked(level.depth, level.intensity, level.camera.intrinsics, target, max_gap)
+
+    def free_space_frames(self, timestamp: float, unknown: float = 0.0) -> list[RememberedFrame]:
+        """Remembered frames whose lines of sight are free space for a frame at this time, in seconds.
+
+        Single frames are compared while the map is young, and where it does not know much of what is in view;
+        otherwise there are none. In the first seconds of a second pass later frames are compared, too.
+
+        Args:
+            timestamp: Seconds.
+            unknown: Share of the readings that lie in space unknown to the map.
+        """
+        if timestamp < self._young_until:
+            candidates = self._start_frames if self._imported else self._recent_frames
+        else:
+            candidates = self._recent_frames if unknown >= YOUNG_UNKNOWN_SHARE else ()
+        return [frame for frame in candidates if 0 < abs(timestamp - frame.timestamp) <= self.config.start_seconds]
+
+    @staticmethod
+    def seen_free(
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        noise: NDArray[np.float32],
+        frames: Sequence[RememberedFrame],
+    ) -> NDArray[np.bool_]:
+        """Pixels (h, w) in space that single frames have seen to be free.
+
+        A point is in free space if a frame has seen farther by more than ``noise`` along the line of sight to it, and
+        at least half as many frames have as have seen a surface at it.
+
+        Args:
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            noise: (h, w) float32, largest depth difference between two readings of one point, metres.
+            frames: As of ``free_space_frames``.
+        """
+        targets, side = _targets(T_world_camera, frames), scaled_side(SEAM, level)
+        return free_space(level.depth, level.intensity, level.camera.intrinsics, noise, targets, side)
+
+    def settled(
+        self,
+        timestamp: float,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        segmentation: Segmentation,
+        sigma: NDArray[np.float32],
+        dynamic: NDArray[np.bool_],
+    ) -> NDArray[np.bool_]:
+        """Dynamic pixels (h, w) whose segment has stood where it is for ``settle_time``.
+
+        The dynamic part of a segment has settled if, compared with every frame kept of ``settle_time``, more than 0.7
+        of its pixels are visible, less than 0.1 of them lie off by more than 4 sigma, the mean distance is below one
+        sigma, and the intensity mismatch below 1.2 times the frame's upper quartile (or COMMON_MISMATCH).
+
+        Args:
+            timestamp: Seconds.
+            level: The image.
+            T_world_camera: (4, 4) its pose.
+            segmentation: Its segments.
+            sigma: (h, w) float32, standard deviation of a distance, metres.
+            dynamic: (h, w) bool.
+        """
+        none = np.zeros_like(dynamic)
+        frames = self._settle_frames
+        if not frames or timestamp - frames[0].timestamp < self.config.settle_time or not dynamic.any():
+            return none
+        count = segmentation.count
+        labels = segmentation.labels + np.where(dynamic, np.int32(count), np.int32(0))
+        parts = replace(segmentation, labels=labels, count=2 * count)  # the dynamic part of segment n is n + count
+        settled = np.bincount(parts.labels.reshape(-1), minlength=2 * count + 1) >= parts.min_pixels
+        settled[: count + 1] = False
+        for target in _targets(T_world_camera, frames):
+            image = level.depth, level.intensity, level.camera.intrinsics
+            sums = compare_with_frame(*image, target, parts.with_noise(sigma), 4)
+            evidence = evidence_of(sums, parts.min_pixels)
+            visible = evidence.compared > 0.7
+            common = upper_quartile(evidence.mismatch[visible & (evidence.size >= parts.min_pixels)])
+            settled &= visible & (evidence.dynamic < 0.1) & (np.abs(evidence.distance) < 1)
+            settled &= evidence.mismatch < 1.2 * max(COMMON_MISMATCH, common)
+            if not settled.any():
+                return none
+        return settled[parts.labels]
+
+
+def _targets(T_world_camera: NDArray[np.float64], frames: Sequence[RememberedFrame]) -> list[ReprojectionTarget]:
+    """Remembered frames that an image at a pose (4, 4) is compared with."""
+    return [
+        ReprojectionTarget(
+            se3.inverse(frame.T_world_camera) @ T_world_camera, frame.level.depth, frame.level.intensity, frame.dynamic
+        )
+        for frame in frames
+    ]

@@ -1,0 +1,1 @@
+"""Scalar mathematics of pixels, voxels and residuals, which every back end compiles."""

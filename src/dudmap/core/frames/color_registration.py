@@ -1,0 +1,94 @@
+"""Colour image registered to the depth image of the same frame: seen from the depth camera, at the depth's time."""
+
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.median import median
+from dudmap.core.backends.parameters import ColorProjection
+from dudmap.core.backends.spec import Backend
+from dudmap.core.backends.threads import bands, run_bands
+from dudmap.core.frames.observation import Observation
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.se3 import hat
+
+Pixel = TypeVar("Pixel", np.uint8, np.float32)
+MEDIAN_STRIDE = 8
+"""Every so many pixels, across and down, enter the median depth."""
+BAND_ROWS = 60
+"""Rows that are registered at a time: few enough for their coordinates to stay in a core's cache."""
+
+
+def color_projection(calibration: Calibration, twist: NDArray[np.float64], offset: float) -> ColorProjection:
+    """How points of the depth camera reach the colour image.
+
+    The motion T exp(-tau xi) X is expanded to the second order in tau: with a = v + omega x X it is
+    T X - tau R a + tau^2 / 2 R (omega x a). At 3 rad/s and 30 ms the third order is below 0.1 pixels.
+
+    Args:
+        calibration: Geometry and timing.
+        twist: (6,) motion of the depth camera per second, its own axes.
+        offset: Time stamp of the colour image minus that of the depth image, s.
+    """
+    T, R, W = calibration.T_color_depth, calibration.T_color_depth[:3, :3], hat(twist[3:])
+    speed = np.column_stack([W, twist[:3]])
+    return ColorProjection(
+        T[:3].astype(np.float32),
+        (R @ speed).astype(np.float32),
+        (R @ W @ speed).astype(np.float32),
+        calibration.camera.intrinsics,
+        calibration.lens.astype(np.float32),
+        offset + calibration.delay,
+        calibration.readout,
+        calibration.camera.height,
+    )
+
+
+def recorded_intensity(observation: Observation, halvings: int) -> NDArray[np.float32]:
+    """Intensity (h, w) in 0..1 of the colour image as it was recorded, after so many halvings by 2x2 blocks."""
+    import cv2
+
+    known = observation._recorded_halvings
+    if not known:
+        recorded = observation.rgb if observation.recorded_rgb is None else observation.recorded_rgb
+        known.append(observation.backend.intensity(recorded))
+    while len(known) <= halvings:
+        h, w = (size // 2 for size in known[-1].shape)
+        whole = known[-1][: 2 * h, : 2 * w]
+        known.append(np.asarray(cv2.resize(whole, (w, h), interpolation=cv2.INTER_AREA), np.float32))
+    return known[halvings]
+
+
+def register_color(
+    color: NDArray[Pixel],
+    depth: NDArray[np.float32],
+    camera: Camera,
+    projection: ColorProjection,
+    backend: Backend,
+) -> NDArray[Pixel]:
+    """Colour (H, W[, 3]) of each depth pixel, interpolated; outside the colour image that of its nearest pixel.
+
+    Occlusion is not resolved: a surface that only the depth camera sees has the colour of what hides it.
+
+    Args:
+        color: (h, w[, 3]) uint8 or float32 as the colour camera recorded it.
+        depth: (H, W) float32, metres, 0 = none.
+        camera: Of the depth image, without distortion.
+        projection: Of ``color_projection``.
+        backend: Compute device.
+    """
+    import cv2
+
+    readings = depth[::MEDIAN_STRIDE, ::MEDIAN_STRIDE]
+    readings = readings[readings > 0]
+    fallback = float(median(readings)) if len(readings) else 1.0
+    out = np.empty(depth.shape + color.shape[2:], color.dtype)
+
+    def fill(start: int, stop: int) -> None:
+        us, vs = backend.color_pixels(depth, camera.intrinsics, projection, fallback, start, stop)
+        cv2.remap(color, us, vs, cv2.INTER_LINEAR, dst=out[start:stop], borderMode=cv2.BORDER_REPLICATE)
+
+    run_bands(fill, bands(len(depth), BAND_ROWS))
+    return out

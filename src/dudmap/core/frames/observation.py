@@ -1,0 +1,53 @@
+"""A preprocessed frame and the levels of its image pyramid."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.spec import Backend
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+
+
+@dataclass(frozen=True, eq=False)
+class Observation:
+    """A preprocessed frame.
+
+    Attributes:
+        timestamp: Seconds, of the depth image.
+        camera: Camera of all images here; without lens distortion.
+        depth: (H, W) float32, metres, holes filled and smoothed, 0 = none.
+        intensity: (H, W) float32, 0..1.
+        rgb: (H, W, 3) uint8, registered to the depth; ``intensity`` likewise. Those of a colour camera that is not
+            synchronous are so only once the camera's motion is known (``core/tracking/color_motion.py``).
+        backend: Compute device of the preprocessor, which also makes the image pyramid.
+        recorded_rgb: (h, w, 3) uint8 of another colour camera, not registered; None where that is ``rgb``.
+        color_offset: Time stamp of the colour image minus that of the depth image, seconds; 0 if not known.
+    """
+
+    timestamp: float
+    camera: Camera
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    rgb: NDArray[np.uint8]
+    backend: Backend = field(repr=False)
+    recorded_rgb: NDArray[np.uint8] | None = None
+    color_offset: float = 0.0
+    _recorded_halvings: list[NDArray[np.float32]] = field(default_factory=list, repr=False)
+    _halvings: list[tuple[NDArray[np.float32], NDArray[np.float32]]] = field(default_factory=list, repr=False)
+
+    @property
+    def as_recorded(self) -> Frame:
+        """Depth of the observation and colour as it was recorded."""
+        color = self.rgb if self.recorded_rgb is None else self.recorded_rgb
+        return Frame(self.timestamp, self.depth, color, self.timestamp + self.color_offset)
+
+
+@dataclass(frozen=True, eq=False)
+class Level:
+    """One level of the image pyramid: camera, depth (h, w) m, intensity (h, w) 0..1."""
+
+    camera: Camera
+    depth: NDArray[np.float32]
+    intensity: NDArray[np.float32]

@@ -1,0 +1,141 @@
+"""Corners and their sparse optical flow between two images (Lucas and Kanade 1981)."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.observation import Level
+
+CELLS = 40
+"""Corners across the image: the strongest of each cell."""
+SIMILAR = 1.5
+"""A match is as good as another if the mean grey difference of its windows is at most this multiple of the other's."""
+WINDOW = 11
+"""Edge of the window that a corner is matched by, pixels of an image 320 wide."""
+RETURN_PX = 0.5
+"""Largest error of a corner that is tracked forward and back, pixels of an image 320 wide."""
+REFERENCE_WIDTH = 320
+"""Image width that these distances are given for; they grow in proportion to the width of an image."""
+
+
+def grey(level: Level) -> NDArray[np.uint8]:
+    """Intensities (h, w) in grey values from 0 to 255."""
+    return np.clip(255 * level.intensity, 0, 255).astype(np.uint8)
+
+
+def scaled_window(edge: int, width: int, reference_width: int = REFERENCE_WIDTH) -> int:
+    """Odd edge of a window in an image of some width that shows as much as one of an odd edge at a reference width."""
+    return 2 * round((edge - 1) / 2 * width / reference_width) + 1
+
+
+def corners(level: Level, image: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Strongest corners (n, 2) int, pixels u, v, one per cell of an image (Shi and Tomasi 1994).
+
+    A corner has a depth reading and lies on the nearest surface in its window: a window across a depth edge follows the
+    foreground, not the surface behind it.
+    """
+    import cv2
+
+    strength = cv2.cornerMinEigenVal(image, 5)
+    cell = max(1, image.shape[1] // CELLS)
+    height, width = image.shape[0] // cell, image.shape[1] // cell
+    tiles = strength[: height * cell, : width * cell].reshape(height, cell, width, cell).swapaxes(1, 2)
+    tiles = tiles.reshape(height * width, cell * cell)
+    strongest = tiles.argmax(axis=1)
+    rows = np.arange(height * width) // width * cell + strongest // cell
+    columns = np.arange(height * width) % width * cell + strongest % cell
+    z = level.depth[rows, columns]
+    window = scaled_window(WINDOW, image.shape[1])
+    nearest = cv2.erode(np.where(level.depth > 0, level.depth, np.float32(np.inf)), np.ones((window, window), np.uint8))
+    useful = (tiles.max(axis=1) > 1e-4) & (z > 0) & (np.asarray(nearest)[rows, columns] > np.float32(0.93) * z)
+    return np.stack([columns, rows], axis=1)[useful]
+
+
+def lucas_kanade(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.number],
+    guess: NDArray[np.number],
+    window: int,
+    halvings: int,
+) -> tuple[NDArray[np.float32], NDArray[np.bool_], NDArray[np.float32]]:
+    """Pyramidal Lucas-Kanade flow.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) positions u, v in the first image.
+        guess: (n, 2) positions in the second image that the search starts from.
+        window: Edge of the matched window, pixels.
+        halvings: Halved copies of the images that are searched before the images themselves; 0 searches these alone.
+
+    Returns:
+        Positions (n, 2) in the second image, arbitrary where not found; whether each was found (n,); mean absolute
+        difference (n,) of the grey values of the two windows.
+    """
+    import cv2
+
+    if len(pixels) == 0:
+        return np.empty((0, 2), np.float32), np.zeros(0, dtype=bool), np.empty(0, np.float32)
+    positions, found, difference = cv2.calcOpticalFlowPyrLK(
+        first,
+        second,
+        np.ascontiguousarray(pixels, np.float32).reshape(-1, 1, 2),
+        np.array(guess, np.float32, order="C").reshape(-1, 1, 2),  # a copy: it is overwritten with the result
+        winSize=(window, window),
+        maxLevel=halvings,
+        flags=cv2.OPTFLOW_USE_INITIAL_FLOW,
+    )
+    return np.asarray(positions, np.float32)[:, 0], found[:, 0] > 0, np.asarray(difference, np.float32)[:, 0]
+
+
+def track_forward_backward(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    expected: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Corners that pass the forward-backward check: tracked back from where they were found, they return.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) int, corners in the first.
+        expected: (n, 2) predicted positions in the second, from which the search starts.
+
+    Returns:
+        These corners (m, 2) int, their positions (m, 2) in the second image, and the mean differences (m,) of the grey
+        values of their windows.
+    """
+    width = first.shape[1]
+    window = scaled_window(WINDOW, width)
+    positions, found, difference = lucas_kanade(first, second, pixels, expected, window, 3)
+    back, found_back, _ = lucas_kanade(second, first, positions, pixels, window, 0)
+    good = found & found_back
+    error = np.linalg.norm(back[good] - pixels[good].astype(np.float32), axis=1)
+    good[good] = error < RETURN_PX * width / REFERENCE_WIDTH
+    return pixels[good], positions[good].astype(np.float64), difference[good].astype(np.float64)
+
+
+def consistent_with_static(
+    first: NDArray[np.uint8],
+    second: NDArray[np.uint8],
+    pixels: NDArray[np.int64],
+    expected: NDArray[np.float64],
+    allowed: NDArray[np.float64],
+    difference: NDArray[np.float64],
+) -> NDArray[np.bool_]:
+    """Whether corners (n,) that were found elsewhere match as well at the position of a static point.
+
+    The coarse levels of the search see more than the window and may follow a nearer surface, and textures repeat.
+    Therefore the search is repeated from the position of a static point, at full resolution alone.
+
+    Args:
+        first, second: (h, w) uint8 images.
+        pixels: (n, 2) int, corners in the first.
+        expected: (n, 2) positions in the second if the points are static.
+        allowed: (n,) largest distance of a match from there, pixels.
+        difference: (n,) mean differences of the grey values of the windows of the matches found elsewhere.
+    """
+    guess = expected.astype(np.float32)
+    positions, static, other = lucas_kanade(first, second, pixels, guess, scaled_window(WINDOW, first.shape[1]), 0)
+    near = np.linalg.norm((positions - guess)[static], axis=1) < allowed[static]
+    static[static] = near & (other[static] <= SIMILAR * difference[static])
+    return static

@@ -1,0 +1,206 @@
+"""Preprocessing of a frame: undistortion, depth limits, hole filling, smoothing (thesis section 4.3)."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import PreprocessConfig
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.parameters import FilterParameters
+from dudmap.core.backends.spec import Backend
+from dudmap.core.frames.color_registration import color_projection, register_color
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Observation
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError, FrameError
+
+HOLE_NOISE = 0.01
+"""Readings around a small hole may always differ by this much, metres."""
+STEEPEST = 9.5
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+DEPTH_MIN = 1e-3
+"""Smallest lower limit of the depth, metres: 0 means no reading."""
+
+
+class Preprocessor:
+    """Lens undistortion, depth limits, small-hole filling and depth-adaptive smoothing. Not for concurrent calls.
+
+    The bilateral filter is separable (columns, then rows), which the exact one is not. Measured on 640x480 readings of
+    two Kinect-type recordings, radius 6, one thread: 1.2 ms against 7 ms for all 169 taps; rms difference 0.7-1.2 mm
+    on a desk at 1 m; error against the temporal mean of a fixed camera's static pixels, over squared depth: median
+    1.52 against 1.50 mm, 95 % 7.07 against 7.05 mm (unfiltered 1.65 and 7.32).
+
+    Args:
+        camera: Camera of the depth images, and of the colour images without ``calibration``.
+        config: Limits and filter parameters.
+        backend: Compute device, of this preprocessor alone; None takes the CPU.
+        calibration: Of the colour camera; None for colour that is registered to depth. Colours that were not taken
+            together with the depth are left as they were recorded, scaled to the size of the depth image, to those who
+            know the motion.
+        voxel_size: Of the map, if its voxels hold mean colours (``volume.antialias``): the intensities are then
+            averaged in the same way, since an image with more detail than the map does not fit it. 0 leaves them.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: PreprocessConfig | None = None,
+        backend: Backend | None = None,
+        calibration: Calibration | None = None,
+        voxel_size: float = 0.0,
+    ) -> None:
+        self.voxel_size = voxel_size
+        self.config = config or PreprocessConfig()
+        self.calibration = calibration
+        self.camera = replace(camera, distortion=())
+        self._maps = _undistortion(camera) if any(camera.distortion) else None
+        self._inverse_map = _distortion(camera) if any(camera.distortion) else None
+        self._backend: Backend = backend or CpuBackend()
+        self._parameters = FilterParameters(
+            depth_min=max(self.config.depth_min, DEPTH_MIN),
+            depth_max=self.config.depth_max,
+            drop_mixed=self.config.drop_mixed,
+            steepest=STEEPEST / camera.fx,
+            fill_holes=self.config.fill_holes,
+            hole_noise=HOLE_NOISE,
+            smooth=self.config.filter == "bilateral",
+            alpha=self.config.filter_alpha,
+            sigma_px=self.config.filter_sigma_px,
+            radius=self.config.filter_radius,
+        )
+
+    def __call__(self, frame: Frame) -> Observation:
+        """The preprocessed frame.
+
+        Raises:
+            FrameError: Depth or colour do not have the camera's size, or the wrong type.
+        """
+        self._check(frame)
+        depth = np.ascontiguousarray(frame.depth, dtype=np.float32)
+        rgb = np.ascontiguousarray(frame.color)
+        if self._maps is not None:
+            depth, rgb = self._undistorted(depth, rgb)
+        depth = self._backend.filter(depth, self._parameters)
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        recorded = None
+        if self.calibration is not None:
+            recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
+        smooth = rgb
+        if self.voxel_size > 0:
+            smooth = self._backend.footprint_colors(rgb, depth, self.camera.fx, self.voxel_size)
+        intensity = self._backend.intensity(smooth)
+        return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
+
+    def _colors(
+        self, calibration: Calibration, recorded: NDArray[np.uint8], depth: NDArray[np.float32], offset: float
+    ) -> NDArray[np.uint8]:
+        """Colours (H, W, 3) registered to the depth as far as is possible without the camera's motion."""
+        if calibration.is_instant(offset):
+            projection = color_projection(calibration, np.zeros(6), offset)
+            return register_color(recorded, depth, self.camera, projection, self._backend)
+        if recorded.shape[:2] == depth.shape:
+            return recorded
+        import cv2
+
+        return np.asarray(cv2.resize(recorded, depth.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+
+    def mask(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Undistorted mask (H, W) bool of a frame.
+
+        Raises:
+            DatasetError: The mask does not have the camera's size, or is not boolean.
+        """
+        if mask.shape != self.camera.shape or mask.dtype != np.bool_:
+            h, w = self.camera.shape
+            raise DatasetError(
+                f"the mask has the shape {mask.shape} and the type {mask.dtype}; expected ({h}, {w}) bool, "
+                "the size of the camera's image"
+            )
+        if self._maps is None:
+            return mask
+        import cv2
+
+        return np.asarray(cv2.remap(mask.astype(np.uint8), *self._maps[0], cv2.INTER_NEAREST)) > 0
+
+    def distorted(self, mask: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Mask (H, W) bool of an observation in the geometry of the recorded image: the inverse of ``mask``.
+
+        Pixels of the recorded image outside the observation are False.
+        """
+        if self._inverse_map is None:
+            return mask
+        import cv2
+
+        recorded = cv2.remap(
+            mask.astype(np.uint8), *self._inverse_map, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0
+        )
+        return np.asarray(recorded) > 0
+
+    def _check(self, frame: Frame) -> None:
+        h, w = self.camera.shape
+        if self.calibration is not None and frame.color.shape != (*self.calibration.camera.shape, 3):
+            color_h, color_w = self.calibration.camera.shape
+            raise FrameError(
+                f"the colour camera is {color_w}x{color_h}, but the colour image has the shape {frame.color.shape}",
+                "resolution",
+            )
+        unregistered = self.calibration is not None
+        if frame.depth.shape != (h, w) or not (unregistered or frame.color.shape == (h, w, 3)):
+            raise FrameError(
+                f"the camera is {w}x{h}, but the depth image has the shape {frame.depth.shape} and the colour image "
+                f"{frame.color.shape}; both must have the camera's size, so register and resize them beforehand",
+                "resolution",
+            )
+        if frame.depth.dtype.kind != "f" or frame.color.dtype != np.uint8:
+            raise FrameError(
+                f"depth is {frame.depth.dtype} and colour {frame.color.dtype}; expected depth in metres as float32 "
+                "and colour as uint8",
+                "type",
+            )
+
+    def _undistorted(
+        self, depth: NDArray[np.float32], rgb: NDArray[np.uint8]
+    ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Both images without lens distortion (eq. 3.88): colour interpolated, depth of the nearest pixel.
+
+        Colour of a camera with a calibration stays as it is: its registration includes the distortion.
+        """
+        import cv2
+
+        assert self._maps is not None
+        nearest, between = self._maps
+        straight = cv2.remap(depth, *nearest, cv2.INTER_NEAREST, borderMode=cv2.BORDER_CONSTANT, borderValue=0)
+        if self.calibration is not None:
+            return np.asarray(straight, dtype=np.float32), rgb
+        color = cv2.remap(rgb, *between, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        return np.asarray(straight, dtype=np.float32), np.asarray(color, dtype=np.uint8)
+
+
+def _undistortion(camera: Camera) -> tuple[tuple[NDArray, NDArray], tuple[NDArray, NDArray]]:
+    """Map pairs of cv2.remap from the undistorted image into the distorted one: nearest pixel, and interpolated.
+
+    The fixed-point map of the interpolation cannot serve both: without its fractions it rounds down, half a pixel off.
+    """
+    import cv2
+
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    size = (camera.width, camera.height)
+    u, v = cv2.initUndistortRectifyMap(camera.K, coefficients, None, camera.K, size, cv2.CV_32FC1)
+    nearest, _ = cv2.convertMaps(u, v, cv2.CV_16SC2, nninterpolation=True)
+    whole, fraction = cv2.convertMaps(u, v, cv2.CV_16SC2)
+    return (np.asarray(nearest), np.empty(0, np.uint16)), (np.asarray(whole), np.asarray(fraction))
+
+
+def _distortion(camera: Camera) -> tuple[NDArray, NDArray]:
+    """Map pair of cv2.remap from the distorted image into the undistorted one, to the nearest pixel."""
+    import cv2
+
+    v, u = np.mgrid[0 : camera.height, 0 : camera.width].astype(np.float64)
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    coefficients = np.array(camera.distortion, dtype=np.float64)
+    straight = cv2.undistortPoints(pixels, camera.K, coefficients, P=camera.K).reshape(*camera.shape, 2)
+    within = np.clip(straight, -2, max(camera.shape) + 2).astype(np.float32)  # the fixed-point map holds 16 bits
+    nearest, _ = cv2.convertMaps(within[..., 0], within[..., 1], cv2.CV_16SC2, nninterpolation=True)
+    return np.asarray(nearest), np.empty(0, np.uint16)

@@ -1,0 +1,197 @@
+"""Recognition of frames that a sensor or a driver has spoilt or repeated: wrong stamps, old images, a changed unit."""
+
+import statistics
+from collections import deque
+from dataclasses import replace
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.observation import Observation
+
+INTERVALS = 30
+"""Intervals between stamps that the usual one, their median, is taken from."""
+BURST_SHARE = 0.1
+"""Share of the usual interval below which two stamps cannot be those of two exposures: frames that waited somewhere and
+arrived at once. Late frames of real sensors leave more than a third."""
+FURTHEST_STEP = 60.0
+"""Step of the stamps that is believed at once, seconds; a longer one may be a single wrong stamp."""
+AGREEING = 5
+"""Frames in a row whose stamps agree, and contradict the last one used, from which on the clock counts as set."""
+STRIDE = 4
+"""Every so many pixels, across and down, are compared for a change of the unit."""
+MIN_PIXELS = 100
+"""Readings that both images must have at the same pixels for their ratio to be judged."""
+SMALLEST_FACTOR = 1.5
+"""Smallest change of the unit: units differ by more (0.2 mm, 1/4 mm, 1 mm, 1 m)."""
+SAME_FACTOR, AGREEING_SHARE = 0.1, 0.8
+"""A change of the unit multiplies the depth by one factor, with this relative tolerance, at this share of pixels."""
+LONGEST_MEMORY = 1.0
+"""Longest time between two images whose depths are compared, seconds; the camera may look elsewhere then."""
+
+Repeats = Literal["", "frame", "depth", "color"]
+"""What a frame repeats of the one before, bit for bit."""
+
+
+class Rejection(NamedTuple):
+    """Why a frame is not used.
+
+    Attributes:
+        kind: Key under which it is counted: ``duplicate``, ``order``, ``burst``, ``clock`` or ``unit``.
+        reason: Sentence.
+    """
+
+    kind: str
+    reason: str
+
+
+class StreamCheck:
+    """Judges every frame before it is registered, by its stamp and by the frame before.
+
+    Stamps must increase. If AGREEING frames in a row increase among themselves but not after the last one used, the
+    clock has been set: the stamps from there on are continued from the last one used, by the usual interval.
+
+    An image that is bit for bit that of the frame before is the same one, since the noise of a sensor never repeats: a
+    stream is slower than the other, or a driver hands out the last image again where it has lost one. A
+    unit that changes multiplies all depths by one factor from one image to the next, faster than the fastest camera
+    explains; frames are then rejected until the factor is taken back.
+
+    Args:
+        max_speed: Largest speed of the camera, m/s.
+
+    Attributes:
+        clock_offset: What is added to the stamps of the stream since its clock was set back, seconds.
+        repeats: What the last frame judged repeats of the frame before: the whole ``frame``, its ``depth`` or its
+            ``color`` alone; empty for nothing.
+    """
+
+    def __init__(self, max_speed: float) -> None:
+        self.max_speed = max_speed
+        self.clock_offset = 0.0
+        self.repeats: Repeats = ""
+        self._last_stamp: float | None = None  # of the last frame with a valid stamp
+        self._contradicting: list[float] = []  # stamps of the frames since then
+        self._intervals: deque[float] = deque(maxlen=INTERVALS)
+        self._arrived: float | None = None  # stamp of the last frame, valid or not
+        self._before: tuple[NDArray[np.float32], NDArray[np.uint8]] | None = None  # depth, colour of the last frame
+        self._compared: tuple[float, NDArray[np.float32]] | None = None  # stamp and depth of the last with readings
+        self._unit = 0.0  # logarithm of the factor by which the unit has changed
+
+    def restamped(self, observation: Observation) -> Observation:
+        """The frame with its stamp on the clock of the first frames."""
+        if self.clock_offset == 0:
+            return observation
+        return replace(observation, timestamp=observation.timestamp + self.clock_offset)
+
+    def rejection(self, observation: Observation) -> Rejection | None:
+        """Why a frame cannot be used, None if it can; each frame is to be judged once, in order of arrival.
+
+        A frame that is used because the clock was found to be set changes ``clock_offset``: it is to be restamped.
+        """
+        self.repeats = self._compare_with_last(observation)
+        return self._wrong_stamp(observation.timestamp) or self._changed_unit(observation)
+
+    # -- stamps --------------------------------------------------------------------------------------------------------
+
+    def _wrong_stamp(self, raw: float) -> Rejection | None:
+        if not np.isfinite(raw):
+            return Rejection("clock", f"the frame has the stamp {raw}; expected seconds")
+        arrived, self._arrived = self._arrived, raw
+        interval = None if arrived is None else raw - arrived
+        stamp = raw + self.clock_offset
+        rejection = self._contradiction(stamp)
+        if rejection is not None:
+            agree = not self._contradicting or 0 <= raw - self._contradicting[-1] <= FURTHEST_STEP
+            self._contradicting = [*self._contradicting, raw] if agree else [raw]
+            if len(self._contradicting) < AGREEING or rejection.kind in ("duplicate", "burst"):
+                return rejection
+            if rejection.kind == "order":
+                assert self._last_stamp is not None
+                self.clock_offset += self._last_stamp + self._usual_interval - stamp
+                stamp = raw + self.clock_offset
+        self._contradicting = []
+        if interval is not None and 0 < interval <= FURTHEST_STEP:
+            self._intervals.append(interval)
+        self._last_stamp = stamp
+        return None
+
+    def _contradiction(self, stamp: float) -> Rejection | None:
+        """Why a stamp cannot follow the last one that was used."""
+        if self._last_stamp is None:
+            return None
+        step = stamp - self._last_stamp
+        if step == 0:
+            return Rejection("duplicate", f"a frame with the stamp {stamp:.6f} s has arrived before")
+        if step < 0:
+            return Rejection("order", f"the frame was taken {-step:.3f} s before the last one that was used")
+        if len(self._intervals) >= AGREEING and step < BURST_SHARE * self._usual_interval:
+            usual = 1000 * self._usual_interval
+            return Rejection("burst", f"the frame is {1000 * step:.1f} ms after the last, {usual:.0f} are usual")
+        if step > FURTHEST_STEP:
+            return Rejection("clock", f"the frame is {step:.0f} s after the last, which others must confirm")
+        return None
+
+    @property
+    def _usual_interval(self) -> float:
+        return statistics.median(self._intervals) if self._intervals else 0.0
+
+    # -- images --------------------------------------------------------------------------------------------------------
+
+    def _compare_with_last(self, observation: Observation) -> Repeats:
+        """What a frame repeats of the last one that arrived."""
+        before, self._before = self._before, (observation.depth, observation.as_recorded.color)
+        return "" if before is None else repeated(before, self._before)
+
+    def _changed_unit(self, observation: Observation) -> Rejection | None:
+        depth, stamp = observation.depth[::STRIDE, ::STRIDE].copy(), observation.timestamp
+        compared = self._compared
+        if np.count_nonzero(depth) >= MIN_PIXELS:
+            self._compared = stamp, depth
+        if compared is not None and 0 < stamp - compared[0] <= LONGEST_MEMORY:
+            factor = sudden_factor(compared[1], depth, self.max_speed * (stamp - compared[0]))
+            self._unit += np.log(factor)
+        elif compared is not None and np.count_nonzero(depth) >= MIN_PIXELS:
+            self._unit = 0.0  # after a pause nothing is known of the unit
+        if abs(self._unit) < np.log(SMALLEST_FACTOR):
+            self._unit = 0.0
+            return None
+        return Rejection("unit", f"all depths changed by the factor {np.exp(self._unit):.3g} at once: another unit")
+
+
+def repeated(
+    before: tuple[NDArray[np.float32], NDArray[np.uint8]], after: tuple[NDArray[np.float32], NDArray[np.uint8]]
+) -> Repeats:
+    """What the images (depth, colour) of a frame repeat of the one before; a depth image without readings does not."""
+    depth = _equal(before[0], after[0]) and bool(after[0].any())
+    color = _equal(before[1], after[1])
+    return "frame" if depth and color else "depth" if depth else "color" if color else ""
+
+
+def sudden_factor(before: NDArray[np.float32], after: NDArray[np.float32], reach: float) -> float:
+    """Factor by which all depths have changed, 1 where it may have been the camera or something in view.
+
+    Args:
+        before, after: (h, w) metres, 0 = no reading.
+        reach: How far the camera may have moved in between, metres.
+    """
+    both = np.flatnonzero((before > 0) & (after > 0))
+    if len(both) < MIN_PIXELS:
+        return 1.0
+    before, after = before.reshape(-1)[both], after.reshape(-1)[both]
+    ratios = after / before
+    usual = np.count_nonzero((ratios < SMALLEST_FACTOR) & (ratios > 1 / SMALLEST_FACTOR))
+    if 2 * usual > len(ratios):  # so is the median, which takes longer
+        return 1.0
+    factor = float(np.median(ratios))
+    if max(factor, 1 / factor) < SMALLEST_FACTOR:
+        return 1.0
+    change = float(np.median(np.abs(after - before)))
+    agrees = np.abs(ratios / factor - 1) < SAME_FACTOR
+    return factor if change > reach and agrees.mean() > AGREEING_SHARE else 1.0
+
+
+def _equal(a: NDArray, b: NDArray) -> bool:
+    """Whether two images are equal; of most that are not, the middle row tells."""
+    middle = len(a) // 2
+    return a.shape == b.shape and np.array_equal(a[middle], b[middle]) and np.array_equal(a, b)

@@ -1,0 +1,167 @@
+"""Calibration of a colour camera against the depth camera: geometry and timing."""
+
+import tomllib
+from dataclasses import asdict, dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tomli_w
+from numpy.typing import NDArray
+
+from dudmap.atomic_file import write_text
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError
+from dudmap.input_files import DAMAGE, read_toml
+
+PARAMETERS = (
+    "translation_x", "translation_y", "translation_z", "rotation_x", "rotation_y", "rotation_z", "log_focal",
+    "center_x", "center_y", "k1", "k2", "delay", "readout",
+)  # fmt: skip
+"""Parameters that can be estimated, in the order of a step (13,): metres, radians, logarithm of the focal lengths,
+pixels of the colour image, the first two coefficients of radial lens distortion (thesis eq. 3.88), seconds."""
+NUM_PARAMETERS = len(PARAMETERS)
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """Where and when the colour image was taken, relative to the depth image of the same frame.
+
+    A point X of the depth camera at the time of the depth image is seen by the colour camera at
+    ``T_color_depth exp(-tau xi) X``, with the twist xi of the depth camera's motion (its own axes, per second) and
+    tau = difference of the two time stamps + ``delay`` + ``readout`` (row / height - 1/2), seconds.
+
+    Attributes:
+        camera: Intrinsics of the colour camera; its ``depth_scale`` has no meaning.
+        T_color_depth: (4, 4) points of the depth camera into the colour camera.
+        delay: Time of the middle row of the colour image minus that of the depth image, beyond the time stamps, s.
+        readout: Time from the first to the last row of the colour image (rolling shutter), s.
+        sigma: (13,) standard deviations of ``PARAMETERS``, NaN where unknown.
+        estimated: Names of the parameters that were estimated; the others are as given.
+    """
+
+    camera: Camera
+    T_color_depth: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+    delay: float = 0.0
+    readout: float = 0.0
+    sigma: NDArray[np.float64] = field(default_factory=lambda: np.full(NUM_PARAMETERS, np.nan))
+    estimated: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        T = np.asarray(self.T_color_depth, dtype=np.float64)
+        if T.shape != (4, 4) or not (
+            np.isfinite(T).all()
+            and np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3)
+            and np.linalg.det(T[:3, :3]) > 0
+            and np.allclose(T[3], (0, 0, 0, 1))
+        ):
+            raise DatasetError("the motion between depth and colour camera is not a 4x4 rigid motion")
+        if not np.all(np.isfinite([self.delay, self.readout])):
+            raise DatasetError(f"the delay is {self.delay} s and the readout {self.readout} s; expected finite numbers")
+
+    @classmethod
+    def registered(cls, camera: Camera) -> "Calibration":
+        """Colour that is registered to depth and taken at the same time: nothing has to be done."""
+        return cls(replace(camera, distortion=()))
+
+    def is_registered(self, depth_camera: Camera) -> bool:
+        """Whether the pixels of both images correspond as they are, time stamps aside."""
+        one, other = self.camera, depth_camera
+        same = (one.fx, one.fy, one.cx, one.cy, one.shape) == (other.fx, other.fy, other.cx, other.cy, other.shape)
+        still = self.delay == 0 and self.readout == 0
+        return same and still and not any(one.distortion) and bool(np.array_equal(self.T_color_depth, np.eye(4)))
+
+    def is_instant(self, offset: float) -> bool:
+        """Whether a colour image with this time stamp (s after the depth's) was taken together with the depth."""
+        return self.delay + offset == 0 and self.readout == 0
+
+    @property
+    def lens(self) -> NDArray[np.float64]:
+        """Coefficients (5,) k1, k2, p1, p2, k3 of the lens distortion."""
+        out = np.zeros(5)
+        out[: len(self.camera.distortion)] = self.camera.distortion
+        return out
+
+    def retract(self, step: NDArray[np.float64]) -> "Calibration":
+        """Calibration after a step (13,) of ``PARAMETERS``; rotation and translation are updated in colour axes."""
+        camera, factor = self.camera, float(np.exp(step[6]))
+        lens = self.lens + np.array([*step[9:11], 0.0, 0.0, 0.0])
+        return replace(
+            self,
+            camera=replace(
+                camera,
+                fx=camera.fx * factor,
+                fy=camera.fy * factor,
+                cx=camera.cx + float(step[7]),
+                cy=camera.cy + float(step[8]),
+                distortion=tuple(lens.tolist()) if lens.any() else (),
+            ),
+            T_color_depth=se3.retract(self.T_color_depth, step[:6]),
+            delay=self.delay + float(step[11]),
+            readout=self.readout + float(step[12]),
+        )
+
+    def step_to(self, other: "Calibration") -> NDArray[np.float64]:
+        """Step (13,) with ``self.retract(step)`` equal to ``other``, for cameras of equal aspect ratio."""
+        R = other.T_color_depth[:3, :3] @ self.T_color_depth[:3, :3].T
+        return np.array(
+            [
+                *(other.T_color_depth[:3, 3] - self.T_color_depth[:3, 3]),
+                *se3.log_rotation(R),
+                np.log(other.camera.fx / self.camera.fx),
+                other.camera.cx - self.camera.cx,
+                other.camera.cy - self.camera.cy,
+                *(other.lens - self.lens)[:2],
+                other.delay - self.delay,
+                other.readout - self.readout,
+            ]
+        )
+
+    def tree(self) -> dict[str, Any]:
+        """Nested dictionary of numbers, lists and words, as in the file and in metrics.json; NaN is left out."""
+        sigma = {name: float(value) for name, value in zip(PARAMETERS, self.sigma, strict=True) if np.isfinite(value)}
+        camera = asdict(self.camera) | {"distortion": list(self.camera.distortion)}
+        del camera["depth_scale"]
+        return {
+            "T_color_depth": self.T_color_depth.tolist(),
+            "delay": self.delay,
+            "readout": self.readout,
+            "estimated": list(self.estimated),
+            "camera": camera,
+            "sigma": sigma,
+        }
+
+    def save(self, path: str | Path) -> None:
+        """Write a TOML file."""
+        text = "# Colour camera relative to the depth camera: metres, radians, pixels, seconds\n"
+        write_text(path, text + tomli_w.dumps(self.tree()))
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Calibration":
+        """Calibration of a TOML file as ``save`` writes it.
+
+        Raises:
+            DatasetError: The file is missing, not TOML, or lacks a value or holds an invalid one.
+        """
+        try:
+            tree = read_toml(path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise DatasetError(f"cannot read the calibration {path}: {error}") from error
+        except tomllib.TOMLDecodeError as error:
+            raise DatasetError(f"the calibration {path} is not valid TOML: {error}") from error
+        try:
+            camera = tree["camera"] | {"distortion": tuple(tree["camera"].get("distortion", ()))}
+            known = tree.get("sigma", {})
+            return cls(
+                Camera(**camera),
+                np.array(tree["T_color_depth"], dtype=np.float64),
+                float(tree["delay"]),
+                float(tree["readout"]),
+                np.array([float(known.get(name, np.nan)) for name in PARAMETERS]),
+                tuple(tree.get("estimated", ())),
+            )
+        except KeyError as error:
+            raise DatasetError(f"the calibration {path} lacks {error.args[0]}") from error
+        except DAMAGE as error:
+            raise DatasetError(f"cannot understand the calibration {path}: {error}") from error

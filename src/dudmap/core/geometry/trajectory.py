@@ -1,0 +1,104 @@
+"""Timed camera poses and their text format."""
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.atomic_file import write_text
+from dudmap.core.geometry import se3
+from dudmap.errors import DatasetError
+from dudmap.input_files import read_text
+
+
+@dataclass(frozen=True, eq=False)
+class Trajectory:
+    """Camera poses over time.
+
+    Attributes:
+        timestamps: (N,) float64, seconds, strictly increasing.
+        Ts_world_camera: (N, 4, 4) float64.
+    """
+
+    timestamps: NDArray[np.float64]
+    Ts_world_camera: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        if self.Ts_world_camera.shape != (len(self.timestamps), 4, 4):
+            raise DatasetError(
+                f"trajectory has {len(self.timestamps)} timestamps but poses of shape {self.Ts_world_camera.shape}; "
+                "expected one 4x4 pose per timestamp"
+            )
+        if not np.all(np.isfinite(self.timestamps)) or not np.all(np.isfinite(self.Ts_world_camera)):
+            raise DatasetError("trajectory holds NaN or infinite numbers; remove those rows")
+        if np.any(np.diff(self.timestamps) <= 0):
+            raise DatasetError("trajectory timestamps are not strictly increasing; sort the rows and remove doubles")
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    @classmethod
+    def from_poses(cls, poses: Iterable[tuple[float, NDArray[np.float64]]]) -> "Trajectory":
+        """Trajectory of (timestamp, T_world_camera) pairs."""
+        pairs = list(poses)
+        stamps = np.array([stamp for stamp, _ in pairs], dtype=np.float64)
+        Ts = np.array([T for _, T in pairs], dtype=np.float64).reshape(-1, 4, 4)
+        return cls(stamps, Ts)
+
+    def interpolate(self, timestamp: float) -> NDArray[np.float64]:
+        """Pose (4, 4) at a time within the trajectory, on the screw between its two neighbours.
+
+        Raises:
+            DatasetError: The time lies outside the trajectory.
+        """
+        if len(self) == 0 or not self.timestamps[0] <= timestamp <= self.timestamps[-1]:
+            raise DatasetError(f"no pose at time {timestamp:.6f}: it lies outside the trajectory")
+        return se3.interpolate_in_time(self.timestamps, self.Ts_world_camera, timestamp).copy()
+
+    def save(self, path: str | Path) -> None:
+        """Write TUM text: ``timestamp tx ty tz qx qy qz qw``, camera to world, one pose a line."""
+        lines = ["# timestamp tx ty tz qx qy qz qw"]
+        for stamp, T in zip(self.timestamps, self.Ts_world_camera, strict=True):
+            numbers = (*T[:3, 3], *se3.rotation_to_quat_xyzw(T[:3, :3]))
+            lines.append(f"{stamp:.6f} " + " ".join(f"{number:.9f}" for number in numbers))
+        write_text(path, "\n".join(lines) + "\n")
+
+    @classmethod
+    def load(cls, path: str | Path) -> "Trajectory":
+        """Read TUM text; lines starting with ``#`` and empty lines are comments.
+
+        Raises:
+            DatasetError: The file is missing, a row is not eight finite numbers, or the times do not increase.
+        """
+        path = Path(path)
+        try:
+            text = read_text(path)
+        except (OSError, UnicodeDecodeError) as error:
+            raise DatasetError(f"cannot read the trajectory {path}: {error}") from error
+        rows: list[list[float]] = []
+        for number, line in enumerate(text.splitlines(), start=1):
+            fields = line.replace(",", " ").split()
+            if not fields or fields[0].startswith("#"):
+                continue
+            try:
+                row = [float(field) for field in fields[:8]]
+            except ValueError:
+                row = []
+            if len(row) != 8 or not np.all(np.isfinite(row)) or not any(row[4:]):
+                raise DatasetError(
+                    f"{path}, line {number}: expected eight finite numbers 'timestamp tx ty tz qx qy qz qw' "
+                    f"with a non-zero quaternion, found {line.strip()!r}"
+                )
+            rows.append(row)
+        if not rows:
+            raise DatasetError(f"{path} holds no pose; expected lines 'timestamp tx ty tz qx qy qz qw'")
+        table = np.array(rows)
+        Ts = np.tile(np.eye(4), (len(table), 1, 1))
+        Ts[:, :3, 3] = table[:, 1:4]
+        Ts[:, :3, :3] = [se3.quat_xyzw_to_rotation(quat) for quat in table[:, 4:8]]
+        try:
+            return cls(table[:, 0], Ts)
+        except DatasetError as error:
+            raise DatasetError(f"{path}: {error}") from None

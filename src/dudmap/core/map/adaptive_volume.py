@@ -1,0 +1,293 @@
+"""The map with smaller voxels where they matter (thesis section 7.1).
+
+The blocks of ``TsdfVolume`` cover everything that is seen, as without refinement: free space, carving and the band far
+from the surface are theirs. Blocks of half, and within them of a quarter of the voxel size lie over them where the
+surface needs it (``refinement.py``), and are fused beside them. Where a finer voxel was observed, its value counts.
+"""
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.backends.cpu import adaptive_raycasting
+from dudmap.core.backends.parameters import DepthView, RaycastParameters, RaycastResult
+from dudmap.core.backends.spec import Backend
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh, joined
+from dudmap.core.map.adaptive_mesh import extract_groups
+from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.fine_blocks import FineBlocks, two_levels
+from dudmap.core.map.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.core.map.map_file import MapContent
+from dudmap.core.map.memory_limit import MemoryLimit
+from dudmap.core.map.paged_map import PagedMap
+from dudmap.core.map.refinement import Refinement, prolonged
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.voxel_blocks import VoxelBlocks
+from dudmap.errors import MapError
+
+
+def make_volume(
+    camera: Camera,
+    config: VolumeConfig,
+    sensor: SensorConfig,
+    depth_max: float,
+    backend: Backend | None = None,
+    max_blocks: int | MemoryLimit | None = None,
+) -> TsdfVolume:
+    """An empty map with one voxel size or, with ``volume.adaptive``, several; arguments as of ``TsdfVolume``."""
+    kind = AdaptiveVolume if config.adaptive else TsdfVolume
+    return kind(camera, config, sensor, depth_max, backend, max_blocks)
+
+
+def volume_of(content: MapContent) -> TsdfVolume:
+    """The map of a map file.
+
+    Raises:
+        MapError: Its levels of smaller voxels do not fit its configuration or each other.
+    """
+    volume = make_volume(content.camera, content.config, content.sensor, content.depth_max)
+    volume.blocks = content.blocks
+    if isinstance(volume, AdaptiveVolume):
+        volume.restore_levels(content.levels)
+    elif content.levels:
+        raise MapError("the map is damaged: it has smaller voxels, but its configuration says volume.adaptive=false")
+    return volume
+
+
+class AdaptiveVolume(TsdfVolume):
+    """A map whose voxels are halved where the surface is curved or finely coloured and the sensor resolves it.
+
+    Registration and labels read the coarsest level, so that poses and masks are those of a map with one voxel size;
+    mesh and views read the finest. See ``docs/adaptive.md``.
+
+    Args:
+        camera, config, sensor, depth_max, backend, max_blocks, extent: As of ``TsdfVolume``.
+
+    Attributes:
+        levels: The finer levels, that with the larger voxels first.
+
+    Raises:
+        MapError: As of ``TsdfVolume``.
+    """
+
+    levels: Sequence[FineBlocks]
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: VolumeConfig | None = None,
+        sensor: SensorConfig | None = None,
+        depth_max: float = 6.0,
+        backend: Backend | None = None,
+        max_blocks: int | MemoryLimit | None = None,
+        extent: float | None = None,
+    ) -> None:
+        super().__init__(camera, config, sensor, depth_max, backend, max_blocks, extent)
+        self._integrators, self._refinements = [], []
+        for number in range(self.config.adaptive_levels):
+            coarse = self.voxel_size / 2**number
+            scale = StorageScale.of(self._halved(coarse / 2), self.sensor, depth_max)
+            band = scale.band._replace(limit=self.band.limit)
+            integrator = Integrator(self._halved(coarse / 2), scale, depth_max, self.backend)
+            integrator.parameters = integrator.parameters._replace(band=band, sdf_unit=self.sdf_unit)
+            self._integrators.append(integrator)
+            parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
+            self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
+
+    def _halved(self, voxel_size: float) -> VolumeConfig:
+        return self.config.model_copy(update={"voxel_size": voxel_size})
+
+    def _empty(self) -> None:
+        super()._empty()
+        levels: list[FineBlocks] = []
+        for n in reversed(range(self.config.adaptive_levels)):
+            levels.insert(0, FineBlocks(self.voxel_size / 2 ** (n + 1), self._new_blocks(), *levels[:1]))
+        self.levels = levels
+
+    @property
+    def all_blocks(self) -> BlockTree:
+        """See ``TsdfVolume.all_blocks``."""
+        return BlockTree(self.blocks, self.levels)
+
+    @property
+    def view_bytes(self) -> int:
+        """See ``TsdfVolume.view_bytes``."""
+        slots, count = self.window.near, len(self.window.near)
+        for level in self.levels:
+            slots = level.children_of(slots)
+            count += len(slots)
+        return count * self.blocks.slot_bytes
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the map: that of the coarsest level, as without refinement, and that of the others."""
+        finer = 0
+        for parents, level in zip(self._coarser, self.levels, strict=True):
+            links = parents.num_slots * 8 * 4 + level.blocks.num_slots * (4 + 1)  # children; parent and calm
+            finer += level.blocks.num_bytes + links
+        return super().num_bytes + finer
+
+    @property
+    def _coarser(self) -> list[VoxelBlocks]:
+        """The parents of each level."""
+        return self.all_blocks.parents
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def _fuse(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
+        count: int,
+    ) -> NDArray[np.int32]:
+        weights = self._integrator.reading_weights(depth, self.camera) if weights is None else weights
+        fused = super()._fuse(depth, color, weights, T_world_camera, count)
+        number = self._frame_number
+        view = self._integrator.view(self.window, self.camera, depth, T_world_camera)
+        slots, updated = self.window.near, fused
+        for n, (level, parents) in enumerate(zip(self.levels, self._coarser, strict=True)):
+            level.make_room(parents)
+            gone = parents.entry_of[updated] < 0
+            level.drop(level.children_of(updated[gone]))
+            children = level.children_of(slots)
+            updated_children = self._average(n, view, color, weights, children, count)
+            updated = updated[~gone]
+            depths = self._depths(parents, updated, self.voxel_size / 2**n, T_world_camera)
+            self._note_change(n, self._refinements[n].update(level, parents, updated, depths, number))
+            slots, updated = children[level.blocks.entry_of[children] >= 0], updated_children
+        return fused
+
+    def _average(
+        self,
+        n: int,
+        view: DepthView,
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8],
+        candidates: NDArray[np.int32],
+        count: int,
+    ) -> NDArray[np.int32]:
+        """Average an image into blocks of a finer level, and drop those that it shows to be empty; slots (m,) of all
+        these."""
+        if len(candidates) == 0:
+            return candidates
+        level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
+        blocks = level.blocks
+        if self.config.antialias:
+            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), level.voxel_size)
+        grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
+        turn = number if self.config.take_turns else -1
+        slots, occupied = self.backend.fuse(
+            grid, view, color, weights, candidates, blocks.fused, turn, count, integrator.parameters
+        )
+        self._note_change(n + 1, slots)
+        blocks.fused[slots] = np.minimum(blocks.fused[slots], 254) + 1
+        if self.config.carving:
+            level.drop(slots[occupied == 0])
+        return slots
+
+    def _note_change(self, n: int, slots: NDArray[np.int32]) -> None:
+        """Note that blocks of a level, 0 is the coarsest, and so those that they lie in, are not as they were."""
+        for level in self.levels[:n][::-1]:
+            level.blocks.written[slots] = self._frame_number
+            slots = level.parents[slots]
+        self.blocks.written[slots] = self._frame_number
+
+    def _depths(
+        self, blocks: VoxelBlocks, slots: NDArray[np.int32], voxel_size: float, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Depth (n,) of the centres of blocks in the camera frame, metres."""
+        centres = (blocks.slot_coords[slots] + 0.5) * (8 * voxel_size)
+        return (centres - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
+
+    def take_over(self, other: TsdfVolume) -> None:
+        """See ``TsdfVolume.take_over``."""
+        assert isinstance(other, AdaptiveVolume)
+        super().take_over(other)
+        self.levels = other.levels
+
+    def for_camera(
+        self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
+    ) -> "AdaptiveVolume":
+        """See ``TsdfVolume.for_camera``."""
+        other = AdaptiveVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
+        other.blocks, other._frame_number, other.levels = self.blocks, self._frame_number, self.levels
+        other.pager = self.pager or other.pager
+        return other
+
+    @property
+    def _num_levels(self) -> int:
+        return 1 + len(self.levels)
+
+    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
+        """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
+        assert isinstance(other, AdaptiveVolume)
+        if level == 0:
+            super()._take_level_colors(level, slots, other, number)
+            return
+        for finer in self.levels[:level]:
+            slots = finer.children_of(slots)
+        finer = self.levels[level - 1]
+        interpolated = prolonged(self._coarser[level - 1], finer.parents[slots], finer.octants_of(slots))
+        finer.take_colors(slots, other.levels[level - 1], interpolated)
+        finer.blocks.written[slots] = number
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
+        """See ``TsdfVolume.raycast``."""
+        camera = camera or self.camera
+        self.look_at(T_world_camera)
+        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        return adaptive_raycasting.raycast(
+            self.grid, two_levels(self.levels), T_world_camera, camera.intrinsics, camera.shape, parameters
+        )
+
+    def extract_mesh(self, min_weight: int | None = None) -> Mesh:
+        """Triangles of the zero level by dual contouring, where every cell corner has at least ``min_weight``
+        observations.
+
+        Raises:
+            MapError: The map is empty.
+        """
+        if self.is_empty:
+            raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        if self.pager is not None:
+            return joined(list(self.extract_pieces(min_weight)))
+        slots = self.active_slots
+        parameters = self._mesh_parameters(min_weight)
+        meshes = extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)
+        return meshes[0]
+
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
+        """See ``TsdfVolume.extract_chunks``; ``slots`` are those of the coarsest level."""
+        parameters = self._mesh_parameters(min_weight)
+        meshes = extract_groups(self.blocks, self.levels, slots, chunks, parameters)
+        return meshes + [joined([])] * (int(chunks.max(initial=-1)) + 1 - len(meshes))
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def restore_levels(self, levels: list[VoxelBlocks]) -> None:
+        """Take over the finer blocks of a map file, level by level.
+
+        Raises:
+            MapError: There are more levels than the configuration has, or a block has no parent.
+        """
+        if len(levels) > len(self.levels):
+            raise MapError(
+                f"the map is damaged: it has {len(levels)} levels of smaller voxels, its configuration allows "
+                f"{len(self.levels)}"
+            )
+        for number, blocks in enumerate(levels):
+            level, parents = self.levels[number], self._coarser[number]
+            level.blocks = blocks
+            if not np.all(level.link(parents)):
+                raise MapError(f"the map is damaged: blocks with voxels of {level.voxel_size} m lie in no larger block")
+        for level, parents in zip(self.levels, self._coarser, strict=True):
+            level.make_room(parents)

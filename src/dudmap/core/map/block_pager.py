@@ -1,0 +1,313 @@
+"""Blocks far from the view, which leave the memory for a store on disk and come back before the view reaches them.
+
+The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Niessner et al. 2013, section 5.
+"""
+
+import weakref
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.map import morton
+from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.memory_limit import MemoryLimit
+from dudmap.core.map.region_store import RegionStore
+from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+
+REGION_BITS = 4
+REGION = 1 << REGION_BITS
+"""Number of blocks along the edge of a region, and its logarithm to base 2."""
+MARGIN = 4
+"""Blocks beside the view that are in memory with it, so that all blocks that touch a changed piece of the mesh are."""
+ROOM = 0.85
+"""Share of the allowed blocks to which the memory is emptied, so that the index is not rebuilt with every region."""
+MAX_PENDING = 8
+"""Regions that may wait to be written, each a copy of up to 17 MB."""
+RETRY_AFTER = 100
+"""Moves of the window before a store that could not be written is tried again."""
+Region = tuple[int, int, int]
+
+
+@dataclass(frozen=True)
+class _Away:
+    """What is known of a region in the store: numbers of blocks, of those among them that own voxels, and of the finer
+    blocks inside these."""
+
+    blocks: int
+    voxel_blocks: int
+    finer: int = 0
+
+
+class BlockPager:
+    """Moves regions of a map between memory and a store.
+
+    A region is in memory or in the store, never in both, so that a map has the same content wherever its blocks are.
+    Regions are written and read ahead by one background thread, in the order in which that was asked for.
+
+    Args:
+        max_blocks: Largest number of blocks with voxels in memory, of all levels. Blocks within the view stay, even if
+            they are more. Either a number, or a limit that is asked each time.
+
+    Attributes:
+        failure: Why the store could not be written the last time it was tried; empty if it could. The regions are then
+            back in memory, and nothing is lost.
+    """
+
+    def __init__(self, max_blocks: int | MemoryLimit) -> None:
+        self.max_blocks = max_blocks
+        self.failure = ""
+        self._store: RegionStore | None = None
+        self._executor: ThreadPoolExecutor | None = None
+        self._next_serial = 0
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all regions."""
+        if self._store is not None:
+            self._store.close()
+        self._store = None
+        self._away: dict[Region, _Away] = {}
+        self._writing: dict[Region, tuple[BlockRecords, Future[None]]] = {}
+        self._reading: dict[Region, Future[BlockRecords]] = {}
+        self._unchanged_since: dict[Region, int] = {}
+        self._serial: dict[Region, int] = {}
+        self._archived: set[Region] = set()
+        self._archive: Callable[[Region], BlockRecords] | None = None
+        self._middle = np.zeros(3)
+        self._retry_in = 0
+
+    def new_blocks(self) -> VoxelBlocks:
+        """Empty blocks, with room for as many as will be in memory."""
+        if isinstance(self.max_blocks, int):
+            return VoxelBlocks()
+        return VoxelBlocks(self.max_blocks.capacity(VoxelBlocks()))
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks with voxels in the store."""
+        return sum(away.voxel_blocks for away in self._away.values())
+
+    @property
+    def num_free_blocks(self) -> int:
+        """Blocks without voxels in the store."""
+        return sum(away.blocks - away.voxel_blocks for away in self._away.values())
+
+    def is_away(self, coords: NDArray[np.integer]) -> NDArray[np.bool_]:
+        """Whether the region of each block (n, 3) is in the store."""
+        if not self._away:
+            return np.zeros(len(coords), dtype=bool)
+        regions, which = np.unique(np.asarray(coords) >> REGION_BITS, axis=0, return_inverse=True)
+        away = np.array([_key(region) in self._away for region in regions])
+        return away[which.reshape(-1)]
+
+    @property
+    def stored_regions(self) -> Iterable[Region]:
+        """The regions in the store."""
+        return self._away.keys()
+
+    def away(self) -> dict[Region, tuple[int, int, int, int]]:
+        """Of each region in the store: a number that is another for each content, and its numbers of blocks, of blocks
+        with voxels and of finer blocks."""
+        away = self._away.items()
+        return {region: (self._serial[region], one.blocks, one.voxel_blocks, one.finer) for region, one in away}
+
+    def records(self, region: Region) -> BlockRecords:
+        """Content of a region in the store.
+
+        Raises:
+            MapError: It cannot be read.
+        """
+        return self._writing[region][0] if region in self._writing else self._read(region)
+
+    def continue_from(
+        self, away: dict[Region, tuple[int, int, int, int]], archive: Callable[[Region], BlockRecords]
+    ) -> None:
+        """Take regions from an archive, which has them as long as they have not come back into memory."""
+        self.clear()
+        self._away = {region: _Away(*counts) for region, (_, *counts) in away.items()}
+        self._serial = {region: serial for region, (serial, *_) in away.items()}
+        self._archived, self._archive = set(away), archive
+
+    def changed(self, first: NDArray[np.integer]) -> None:
+        """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
+        self._unchanged_since.pop(_key(first >> REGION_BITS), None)
+
+    def focus(
+        self, blocks: VoxelBlocks | BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int
+    ) -> None:
+        """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
+
+        Regions farther away leave if there are too many blocks, and those in the direction of motion are read ahead.
+
+        Args:
+            blocks: Blocks of the map; changed here. Entries are numbered anew.
+            low, high: Block coordinates.
+            frame_number: Number of frames that were integrated.
+        """
+        first, last = (
+            (low.astype(np.int64) - MARGIN) >> REGION_BITS,
+            (high.astype(np.int64) + MARGIN - 1) >> REGION_BITS,
+        )
+        self._settle(blocks, frame_number)
+        wanted = self._stored_in(first, last) if self._away else []
+        self._make_room(blocks, first, last, frame_number, wanted)
+        for region in wanted:
+            self._bring_back(blocks, region, frame_number)
+        if self._away:
+            self._read_ahead(first, last)
+
+    def _stored_in(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> list[Region]:
+        """Regions of the box from ``first`` to ``last`` that are in the store."""
+        if np.prod(last - first + 1) > len(self._away):
+            (x0, y0, z0), (x1, y1, z1) = _key(first), _key(last)
+            return [(x, y, z) for x, y, z in self._away if x0 <= x <= x1 and y0 <= y <= y1 and z0 <= z <= z1]
+        ranges = (range(a, b + 1) for a, b in zip(_key(first), _key(last), strict=True))
+        return [(x, y, z) for x, y, z in product(*ranges) if (x, y, z) in self._away]
+
+    def _bring_back(self, blocks: VoxelBlocks | BlockTree, region: Region, frame_number: int) -> None:
+        if region in self._writing:
+            records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
+        else:
+            read = self._reading.pop(region, None)
+            # one that waits behind regions to be written is read at once
+            records = self._read(region) if read is None or read.cancel() else read.result()
+            if region not in self._archived:
+                self._unchanged_since[region] = frame_number
+        del self._away[region]
+        self._archived.discard(region)
+        blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
+
+    def _read_ahead(self, first: NDArray[np.integer], last: NDArray[np.integer]) -> None:
+        """Read the regions that come into the box if it goes on as it has moved since the last call."""
+        middle = (first + last) / 2
+        step = np.sign(middle - self._middle).astype(np.int64)
+        self._middle = middle
+        wanted = set(self._stored_in(first + np.minimum(step, 0), last + np.maximum(step, 0)))
+        for region in set(self._reading) - wanted:
+            self._reading.pop(region).cancel()
+        for region in wanted - set(self._reading) - set(self._writing):
+            self._reading[region] = self._submit(self._read, region)
+
+    def _read(self, region: Region) -> BlockRecords:
+        if self._archive is not None and region in self._archived:
+            return self._archive(region)
+        return self._stored.read(region)
+
+    def _make_room(
+        self,
+        blocks: VoxelBlocks | BlockTree,
+        first: NDArray[np.integer],
+        last: NDArray[np.integer],
+        frame_number: int,
+        coming: Sequence[Region],
+    ) -> None:
+        """Move the regions farthest from the box to the store while there are too many blocks with those that come.
+
+        Beyond what must leave only as many do as can wait to be written, so that no frame waits for the disk.
+        """
+        self._retry_in = max(self._retry_in - 1, 0)
+        allowed = self.max_blocks if isinstance(self.max_blocks, int) else self.max_blocks(blocks)
+        needed = blocks.num_voxel_blocks + sum(self._away[one].voxel_blocks + self._away[one].finer for one in coming)
+        if needed <= allowed or self._retry_in:
+            return
+        keys, region_of = _regions_of_entries(blocks)
+        owned = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys))
+        outside = np.maximum(np.maximum(first - keys, keys - last), 0)
+        distance = np.linalg.norm(outside, axis=1)
+        leaving = np.zeros(len(keys), dtype=bool)
+        at_once = MAX_PENDING - len(self._writing)
+        for n in np.lexsort((np.arange(len(keys)), -distance)):
+            enough = needed <= (allowed if np.count_nonzero(leaving) >= at_once else ROOM * allowed)
+            if enough or distance[n] == 0:
+                break
+            leaving[n] = True
+            needed -= owned[n]
+        if leaving.any():
+            self._send_all_away(blocks, keys, region_of, leaving, frame_number)
+            blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
+
+    def page_out(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
+        """Move all regions to the store; empty blocks must take the place of ``blocks``."""
+        keys, region_of = _regions_of_entries(blocks)
+        self._send_all_away(blocks, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
+
+    def _send_all_away(
+        self,
+        blocks: VoxelBlocks | BlockTree,
+        keys: NDArray[np.integer],
+        region_of: NDArray[np.integer],
+        leaving: NDArray[np.bool_],
+        frame_number: int,
+    ) -> None:
+        """Send the regions (r, 3) that leave; ``region_of`` (n,) numbers the region of each entry."""
+        order = np.argsort(region_of, kind="stable")
+        ends = np.cumsum(np.bincount(region_of, minlength=len(keys)))
+        voxel_blocks = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
+        finer = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys)) - voxel_blocks
+        for n in np.flatnonzero(leaving):
+            entries = order[ends[n - 1] if n else 0 : ends[n]]
+            self._away[_key(keys[n])] = _Away(len(entries), int(voxel_blocks[n]), int(finer[n]))
+            self._send_away(blocks, _key(keys[n]), entries, frame_number)
+
+    def _send_away(
+        self, blocks: VoxelBlocks | BlockTree, region: Region, entries: NDArray[np.integer], frame_number: int
+    ) -> None:
+        """Have a region written, unless the store holds it as it is; its entries (n,) are removed by the caller."""
+        if self._unchanged_since.pop(region, -1) == frame_number:
+            return
+        self._serial[region] = self._next_serial = self._next_serial + 1
+        for pending in list(self._writing)[: max(len(self._writing) - MAX_PENDING + 1, 0)]:
+            if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
+                del self._writing[pending]
+        records = blocks.records(entries)
+        self._writing[region] = records, self._submit(self._stored.write, region, records)
+
+    def _settle(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
+        """Forget what has been written; take back what could not be."""
+        for region, (records, written) in list(self._writing.items()):
+            if not written.done():
+                continue
+            del self._writing[region]
+            if error := written.exception():
+                self.failure, self._retry_in = str(error), RETRY_AFTER
+                del self._away[region]
+                blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
+            else:
+                self.failure = ""
+
+    @property
+    def _stored(self) -> RegionStore:
+        if self._store is None:
+            self._store = RegionStore()
+        return self._store
+
+    def _submit(self, work, *arguments) -> Future:  # noqa: ANN001, ANN002 - as of Executor.submit
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(1, thread_name_prefix="dudmap-pager")
+            weakref.finalize(self, self._executor.shutdown, wait=False)
+        return self._executor.submit(work, *arguments)
+
+
+def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
+    """All regions of a map, in Morton order, so that neighbours follow each other."""
+    near, _ = _regions_of_entries(blocks)
+    stored = np.array(list(() if pager is None else pager.stored_regions), np.int64).reshape(-1, 3)
+    regions = np.unique(np.concatenate([near, stored]), axis=0)
+    return [_key(region) for region in regions[np.argsort(morton.encode(regions))]]
+
+
+def _regions_of_entries(blocks: VoxelBlocks | BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+    """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
+    x, y, z = (blocks.coords[: blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
+    packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)
+    parts = [(packed >> shift) & 0xFFFF for shift in (32, 16, 0)]
+    return np.stack(parts, axis=1) - (1 << 15), region_of.reshape(-1)
+
+
+def _key(region: NDArray[np.integer]) -> Region:
+    x, y, z = region.tolist()
+    return x, y, z

@@ -1,0 +1,120 @@
+"""The blocks around the view as a dense array, in which inner loops find a voxel with one load."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.backends.mirror import Mirror
+from dudmap.core.backends.parameters import to_lattice
+from dudmap.core.map.voxel_blocks import BLOCK, MAX_COORDINATE, VoxelBlocks
+from dudmap.errors import MapError
+
+MARGIN = 3
+"""Blocks that the view may move before the window follows; the window is larger by as many on each side."""
+
+LOCAL_GRID = 4096
+"""Spacing of the local origins, blocks: with blocks of 8 cm a camera is at most 164 m from one of them along each axis,
+where 32-bit numbers are spaced by 15 micrometres. The first is that of the map."""
+
+
+class BlockWindow:
+    """Dense copy of the hash table, which stays the authoritative index, around the view.
+
+    Args:
+        block_size: Edge of a block, metres.
+        cells: Least number of blocks along each edge.
+
+    Attributes:
+        shape: (3,) int64, blocks along each axis.
+        cells: (Wx * Wy * Wz,) int32: slot of the voxels; -1 = unknown; -2 - entry of a block without voxels.
+        mirror: ``cells`` for back ends, which may hold a copy on a device.
+        stamps: Like ``cells``, number of the frame whose truncation band last touched a block.
+        near: (n,) int32, the slots inside.
+        origin: (3,) int64 coordinates of the first block; None before the first ``fill``.
+    """
+
+    def __init__(self, block_size: float, cells: int) -> None:
+        size = 16 * int(np.ceil(cells / 16))
+        self.block_size = block_size
+        self.shape = np.array([size, size, size], dtype=np.int64)
+        self.cells = np.empty(size**3, dtype=np.int32)  # takes no memory before the first ``fill``
+        self.mirror = Mirror(self.cells)
+        self.stamps = np.zeros(size**3, dtype=np.int32)
+        self.near = np.empty(0, dtype=np.int32)
+        self.origin: NDArray[np.int64] | None = None
+
+    def moved(self, middle: NDArray[np.float64], left: NDArray[np.int64] | None = None) -> NDArray[np.int64] | None:
+        """Origin (3,) of the window centred on a point (3,), metres; None if the centre is at most ``MARGIN`` blocks
+        away, so that the window can stay. An empty window that replaces one which was ``left`` (3,) goes back there
+        then."""
+        origin = np.floor(middle / self.block_size).astype(np.int64) - self.shape // 2
+        last = self.origin if left is None else left
+        stays = last is not None and np.abs(origin - last).max() <= MARGIN
+        return left if stays else origin
+
+    def fill(self, origin: NDArray[np.int64], blocks: VoxelBlocks) -> None:
+        """Place the window at an origin (3,)."""
+        self.origin = origin
+        self.cells.fill(-1)  # the stamps may stay: no frame has the number of an earlier one
+        cells = self.cells.reshape(tuple(self.shape))
+        inside = np.empty(blocks.num_entries, dtype=np.int32)
+        count = hashing.fill_window(cells, origin, blocks.coords, blocks.slot_of, blocks.num_entries, inside)
+        self.near = np.sort(inside[:count])
+        self.mirror.wrote()
+
+    @property
+    def local_origin(self) -> NDArray[np.int64]:
+        """Blocks (3,) from the origin of the map to the local origin that is nearest to the window."""
+        assert self.origin is not None
+        return LOCAL_GRID * np.rint((self.origin + self.shape // 2) / LOCAL_GRID).astype(np.int64)
+
+    def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to the window's lattice (3, 4) float32: voxels, origin at the first voxel of the window."""
+        assert self.origin is not None
+        return to_lattice(T_world_camera, self.block_size / BLOCK, self.origin)
+
+    def allocate(self, cells: NDArray[np.int32], blocks: VoxelBlocks, frame_number: int) -> None:
+        """Allocate voxels for cells (n,) that have none."""
+        slots = blocks.allocate(self.entries_of(cells, blocks), frame_number)
+        self._set(cells, slots)
+        self.near = np.concatenate([self.near, slots])
+
+    def release(self, slots: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
+        """Release slots (n,); their blocks get so many observations of emptiness."""
+        if len(slots) == 0:
+            return
+        assert self.origin is not None
+        entries = blocks.release(slots, free_count)
+        coords = tuple((blocks.coords[entries] - self.origin).T)
+        cells = np.asarray(np.ravel_multi_index(coords, tuple(self.shape)))
+        self._set(cells, -2 - entries)
+        self.near = hashing.in_use(self.near, blocks.entry_of)
+
+    def set_free(self, cells: NDArray[np.int32], blocks: VoxelBlocks, free_count: int) -> None:
+        """Make entries for unknown cells (n,) with so many observations of emptiness."""
+        if len(cells) == 0:
+            return
+        entries = self.entries_of(cells, blocks)
+        self._set(cells, -2 - entries)
+        blocks.free_count[entries] = min(free_count, 255)
+
+    def _set(self, cells: NDArray[np.integer], values: NDArray[np.int32]) -> None:
+        self.cells[cells] = values
+        self.mirror.wrote(cells)
+
+    def entries_of(self, cells: NDArray[np.int32], blocks: VoxelBlocks) -> NDArray[np.int32]:
+        """Entries (n,) of cells (n,); new ones where there is none.
+
+        Raises:
+            MapError: A cell lies too far from where the map began.
+        """
+        assert self.origin is not None
+        coords = np.stack(np.unravel_index(cells, tuple(self.shape)), axis=1) + self.origin
+        if np.abs(coords).max(initial=0) >= MAX_COORDINATE:
+            farthest = MAX_COORDINATE * self.block_size
+            raise MapError(
+                f"a reading lies more than {farthest:.0f} m from where the map began; with voxels of "
+                f"{self.block_size / BLOCK} m it cannot be larger: set volume.voxel_size to a larger value"
+            )
+        unknown = int(np.count_nonzero(self.cells[cells] == -1))
+        return blocks.entries_at(coords.astype(np.int32), unknown)

@@ -1,0 +1,164 @@
+"""Blocks of half the voxel size inside the blocks of a coarser level of the map."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.adaptive_raycasting import FinerLevels
+from dudmap.core.backends.mirror import grown
+from dudmap.core.backends.parameters import VoxelGrid
+from dudmap.core.map.voxel_blocks import BLOCK, INTENSITY, BlockRecords, VoxelBlocks
+
+NO_VOXELS = np.zeros((1, BLOCK**3), dtype=np.int32)
+NO_CHILDREN = np.full((0, 8), -1, dtype=np.int32)
+"""Stand for a level that a map does not have."""
+OCTANTS = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=np.int32)
+"""Offset (8, 3) of each child of a block in units of its own size, number 4 dx + 2 dy + dz."""
+NEIGHBOURHOOD = np.array([[i, j, k] for i in (-1, 0, 1) for j in (-1, 0, 1) for k in (-1, 0, 1)], dtype=np.int32)
+"""Offset (27, 3) of a block's neighbours, itself in the middle, number 9 (dx + 1) + 3 (dy + 1) + dz + 1."""
+
+
+class FineBlocks:
+    """One level of refinement. A block covers one octant of its parent, a block of the next coarser level.
+
+    Args:
+        voxel_size: Edge of a voxel of this level, metres.
+        blocks: Empty blocks to use; None makes some.
+        finer: The next finer level.
+
+    Attributes:
+        voxel_size: See above.
+        blocks: Blocks of this level; their coordinates are in units of their own size.
+        children: (slots of the parents, 8) int32: slot of the child in each octant, -1 = none.
+        parents: (slots,) int32 slot of the parent of each block.
+        calm: (slots,) uint8 successive evaluations in which a block was not needed.
+    """
+
+    def __init__(self, voxel_size: float, blocks: VoxelBlocks | None = None, finer: "FineBlocks | None" = None) -> None:
+        self.voxel_size, self._finer = voxel_size, finer
+        self.blocks = blocks or VoxelBlocks()
+        self.children = np.full((0, 8), -1, dtype=np.int32)
+        self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
+        self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+
+    def make_room(self, parents: VoxelBlocks) -> None:
+        """Have room for the links of all slots of the parents and of this level."""
+        if len(self.children) < len(parents.entry_of):
+            self.children = grown(self.children, len(parents.entry_of), -1)
+        if len(self.parents) < len(self.blocks.entry_of):
+            self.parents = grown(self.parents, len(self.blocks.entry_of), -1)
+            self.calm = grown(self.calm, len(self.blocks.entry_of), 0)
+
+    def open(
+        self, parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64], frame_number: int
+    ) -> NDArray[np.int32]:
+        """New, empty blocks in octants (n,) of parents in slots (n,) that have none there; their slots (n,) int32."""
+        coords = (2 * parents.slot_coords[slots] + OCTANTS[octants]).astype(np.int32)
+        entries = self.blocks.entries_at(coords, len(coords))
+        new = self.blocks.allocate(entries, frame_number)
+        self.make_room(parents)
+        self.parents[new], self.calm[new] = slots, 0
+        self.children[slots, octants] = new
+        return new
+
+    def drop(self, slots: NDArray[np.int32]) -> None:
+        """Remove blocks (n,), with those inside them."""
+        if len(slots) == 0:
+            return
+        if self._finer is not None:
+            self._finer.drop(self._finer.children_of(slots))
+        octants = self.octants_of(slots)
+        self.children[self.parents[slots], octants] = -1
+        self.blocks.release(slots, 0)
+        self.parents[slots] = -1
+
+    def records(self, slots: NDArray[np.int32]) -> BlockRecords:
+        """Copies of blocks (n,), all of which own voxels; ``calm`` stands in place of the observations of emptiness."""
+        owners = np.arange(len(slots), dtype=np.int32)
+        voxels = self.blocks.geometry[slots], self.blocks.colors[slots], self.blocks.fused[slots]
+        return BlockRecords(self.blocks.slot_coords[slots], self.calm[slots], owners, *voxels)
+
+    def remove(self, slots: NDArray[np.int32], frame_number: int) -> None:
+        """Forget blocks (n,), whose parents are forgotten next."""
+        blocks = self.blocks
+        self.children[self.parents[slots], self.octants_of(slots)] = -1
+        self.parents[slots] = -1
+        dropped = np.flatnonzero(blocks.slot_of[: blocks.num_entries] < 0)  # earlier; nothing is known of them
+        blocks.remove(np.concatenate([blocks.entry_of[slots], dropped]), frame_number)
+
+    def insert(self, parents: VoxelBlocks, records: BlockRecords, frame_number: int) -> None:
+        """Add blocks, none of which is known, after their parents."""
+        slots = self.blocks.insert(replace(records, free_count=np.zeros_like(records.free_count)), frame_number)
+        self.make_room(parents)
+        self.calm[slots], self.parents[slots] = records.free_count, parents.slots_at(records.coords >> 1)
+        self.children[self.parents[slots], self.octants_of(slots)] = slots
+
+    def take_colors(
+        self, slots: NDArray[np.int32], other: "FineBlocks", interpolated: tuple[NDArray[np.int32], NDArray[np.int32]]
+    ) -> None:
+        """Give blocks (n,) the colours and intensities that they have in another map.
+
+        Args:
+            slots: The blocks.
+            other: This level of the other map.
+            interpolated: (n, 512) each, voxels and colours that the coarser level has there: where the other map is not
+                refined, or has no colour, these count.
+        """
+        blocks, (voxels, colors) = self.blocks, interpolated
+        there = other.blocks.slots_at(blocks.slot_coords[slots].astype(np.int32))
+        painted = (there[:, None] >= 0) & (other.blocks.colors[there] != 0)
+        colors = np.where(painted, other.blocks.colors[there], colors)
+        intensities = np.where(painted, other.blocks.geometry[there], voxels) & INTENSITY
+        blocks.write(slots, (blocks.geometry[slots] & ~INTENSITY) | intensities, colors)
+
+    def octants_of(self, slots: NDArray[np.int32]) -> NDArray[np.int64]:
+        """Octant (n,) of the parent that each of these blocks (n,) covers."""
+        low = (self.blocks.slot_coords[slots] & 1).astype(np.int64)
+        return 4 * low[:, 0] + 2 * low[:, 1] + low[:, 2]
+
+    def children_of(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all children of the parents in slots (m,), in their order."""
+        found = self.children[slots[slots < len(self.children)]].ravel()  # there is room once a block has been opened
+        return found[found >= 0]
+
+    def link(self, parents: VoxelBlocks) -> NDArray[np.bool_]:
+        """Find the parents of all blocks anew, by coordinates.
+
+        Returns:
+            (n,) whether each of the active slots has a parent.
+        """
+        self.children = np.full((len(parents.entry_of), 8), -1, dtype=np.int32)
+        self.parents = np.full(len(self.blocks.entry_of), -1, dtype=np.int32)
+        self.calm = np.zeros(len(self.blocks.entry_of), dtype=np.uint8)
+        slots = self.blocks.active_slots
+        found = parents.slots_at((self.blocks.slot_coords[slots] >> 1).astype(np.int32))
+        known = found >= 0
+        self.parents[slots[known]] = found[known]
+        self.children[found[known], self.octants_of(slots[known])] = slots[known]
+        return known
+
+    def grid(self, origin: NDArray[np.int64], sdf_unit: float) -> VoxelGrid:
+        """The voxels for ``Backend.fuse``, with coordinates from ``origin`` (3,), in blocks of this level."""
+        coords = self.blocks.slot_coords
+        coords = coords if not origin.any() else (coords - origin).astype(coords.dtype)
+        nothing = np.empty(0, dtype=np.int32)
+        return VoxelGrid(
+            nothing, np.zeros(3, np.int64), origin, self.blocks.geometry, self.blocks.colors,
+            coords, self.blocks.free_count, self.voxel_size, sdf_unit,
+        )  # fmt: skip
+
+
+def neighbourhood(blocks: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+    """Slots (n, 27) int32 of each block and its neighbours in the order of ``NEIGHBOURHOOD``; -1 = none."""
+    coords = blocks.slot_coords[slots][:, None] + NEIGHBOURHOOD
+    return blocks.slots_at(coords.reshape(-1, 3).astype(np.int32)).reshape(-1, 27)
+
+
+def two_levels(levels: Sequence[FineBlocks]) -> FinerLevels:
+    """The finer levels of a map, at most two, as views and meshes read them."""
+    missing = [(NO_CHILDREN, NO_VOXELS, NO_VOXELS)] * (2 - len(levels))
+    arrays = [(level.children, level.blocks.geometry, level.blocks.colors) for level in levels]
+    (children1, geometry1, colors1), (children2, geometry2, colors2) = arrays + missing
+    return FinerLevels(children1, children2, geometry1, geometry2, colors1, colors2)

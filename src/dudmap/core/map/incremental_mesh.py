@@ -1,0 +1,107 @@
+"""Mesh of a growing map, of which only the changed parts are extracted again."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry.mesh import Mesh, joined
+from dudmap.core.map.volume import TsdfVolume
+
+EDGE = 4
+"""Blocks along the edge of a chunk."""
+Chunk = tuple[int, int, int]
+
+
+class IncrementalMesh:
+    """Mesh of a volume that is kept up to date while the map grows, for a live view.
+
+    The map is cut into chunks of 4x4x4 blocks. An update extracts the chunks that hold or touch a block written since
+    the last update; its time is proportional to the view, not to the map. All chunks together are the surface of
+    ``TsdfVolume.extract_mesh``, with duplicate vertices where chunks meet.
+    Updates and ``integrate`` must not run at the same time.
+
+    Args:
+        volume: The map.
+
+    Attributes:
+        chunks: Mesh of every chunk that has a surface, by its coordinates: chunk (i, j, k) begins at ``4 i``, ``4 j``,
+            ``4 k`` blocks.
+    """
+
+    def __init__(self, volume: TsdfVolume) -> None:
+        self.chunks: dict[Chunk, Mesh] = {}
+        self._volume = volume
+        self._map_id = volume.map_id
+        self._seen = -1
+        self._coords_of = np.empty((0, 3), dtype=np.int32)  # of every slot, at the last update
+        # a vertex beside a chunk, in a block around it, depends on the voxel sizes in all blocks that touch that one
+        self._reach = 2 if volume.levels else 1
+
+    def update(self) -> list[Chunk]:
+        """Extract what changed since the last update, and return the chunks that may have changed.
+
+        A returned chunk that is not in ``chunks`` has no surface any more.
+        """
+        removed: list[Chunk] = []
+        if self._volume.map_id != self._map_id:  # the map was cleared: its frames count from zero again
+            removed = list(self.chunks)
+            self.chunks.clear()
+            self._map_id, self._seen, self._coords_of = self._volume.map_id, -1, self._coords_of[:0]
+        slots, coords = self._volume.written_since(self._seen)
+        self._seen = self._volume.num_integrated
+        known = slots[slots < len(self._coords_of)]
+        changed = np.concatenate([coords, self._coords_of[known]])  # a slot may belong to another block now
+        if len(slots) and slots[-1] >= len(self._coords_of):
+            more = np.zeros((2 * (int(slots[-1]) + 1), 3), dtype=np.int32)
+            more[: len(self._coords_of)] = self._coords_of
+            self._coords_of = more
+        self._coords_of[slots] = coords
+        stale = _touched(changed, self._reach)
+        if self._volume.pager is not None:  # a block that waits on disk has left its slot, not the map
+            corners = _corners(-self._reach, EDGE - 1 + self._reach)
+            away = self._volume.pager.is_away((stale[:, None] * EDGE + corners).reshape(-1, 3))
+            stale = stale[~np.any(away.reshape(-1, 8), axis=1)]
+        if len(stale) == 0:
+            return removed
+        meshes = self._extract(stale)
+        keys: list[Chunk] = [(int(i), int(j), int(k)) for i, j, k in stale]
+        for key, mesh in zip(keys, meshes, strict=True):
+            if len(mesh.faces):
+                self.chunks[key] = mesh
+            else:
+                self.chunks.pop(key, None)
+        return keys + [key for key in removed if key not in self.chunks]
+
+    def mesh(self) -> Mesh:
+        """All chunks as one mesh."""
+        return joined(list(self.chunks.values()))
+
+    def _extract(self, stale: NDArray[np.int32]) -> list[Mesh]:
+        """Mesh of each of these chunks (n, 3)."""
+        reach = np.arange(-1, EDGE + 1, dtype=np.int32)
+        offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+        inner = np.all((offsets >= 0) & (offsets < EDGE), axis=1)
+        slots = self._volume.slots_at((stale[:, None] * EDGE + offsets).reshape(-1, 3)).reshape(len(stale), -1)
+        chunk_of = np.where(inner, np.arange(len(stale))[:, None], -1)
+        exists = slots >= 0
+        chosen, groups = slots[exists], chunk_of[exists]
+        # a block beside two chunks is listed for both and for its own chunk: keep one of them, its own chunk first
+        order = np.lexsort((-groups, chosen))
+        chosen, groups = chosen[order], groups[order]
+        once = np.ones(len(chosen), dtype=bool)
+        once[1:] = chosen[1:] != chosen[:-1]
+        meshes = self._volume.extract_chunks(chosen[once], groups[once])
+        return meshes + [joined([])] * (len(stale) - len(meshes))
+
+
+def _corners(low: int, high: int) -> NDArray[np.int32]:
+    """Corners (8, 3) of a cube."""
+    return np.array([[i, j, k] for i in (low, high) for j in (low, high) for k in (low, high)], dtype=np.int32)
+
+
+def _touched(blocks: NDArray[np.int32], reach: int) -> NDArray[np.int32]:
+    """Chunks (m, 3) that hold a voxel within so many blocks of these blocks (n, 3), each once."""
+    chunks = ((blocks[:, None] + _corners(-reach, reach)) // EDGE).reshape(-1, 3).astype(np.int64)
+    packed = ((chunks[:, 0] + (1 << 20)) << 42) | ((chunks[:, 1] + (1 << 20)) << 21) | (chunks[:, 2] + (1 << 20))
+    unique = np.unique(packed)
+    axes = [(unique >> shift) & ((1 << 21) - 1) for shift in (42, 21, 0)]
+    return (np.stack(axes, axis=1) - (1 << 20)).astype(np.int32)

@@ -1,0 +1,73 @@
+"""How many blocks of a map fit into the memory that the process may use."""
+
+import ctypes
+import sys
+from pathlib import Path
+
+from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.voxel_blocks import VoxelBlocks
+from dudmap.errors import ConfigError
+
+SAFE_SHARE = 0.75
+"""Share of the limit that is used: what is needed for a moment, such as the mesh of a region, fits into the rest."""
+LEAST = 400_000_000
+"""Memory to leave for the kernels, the frames and the part of the map in view, bytes."""
+_STATM = Path("/proc/self/statm")
+
+
+class MemoryLimit:
+    """Memory limit of the process, shared by all its maps.
+
+    What the program needs besides the voxels differs between cameras, configurations and platforms, so that it is
+    measured each time: the maps may have what the others leave. Which blocks are in memory changes no result.
+
+    Args:
+        limit: Largest resident memory of the process, bytes.
+
+    Raises:
+        ConfigError: The limit leaves no room for a map, or the memory cannot be read on this platform.
+    """
+
+    def __init__(self, limit: int) -> None:
+        self.limit = limit
+        taken = resident_bytes()
+        if limit < taken + LEAST:
+            raise ConfigError(
+                f"found a memory limit of {limit / 1e6:.0f} MB; the program takes {taken / 1e6:.0f} MB before the "
+                f"first frame, so that at least {(taken + LEAST) / 1e6:.0f} MB are needed"
+            )
+
+    def __call__(self, blocks: VoxelBlocks | BlockTree) -> int:
+        """Largest number of blocks with voxels, of all levels, that a map may have in memory now."""
+        spare = SAFE_SHARE * self.limit - resident_bytes()
+        if spare < 0 and _return_freed():
+            spare = SAFE_SHARE * self.limit - resident_bytes()
+        return blocks.num_slots + int(spare / blocks.slot_bytes)  # released slots are resident too
+
+    def capacity(self, blocks: VoxelBlocks) -> int:
+        """Number of slots to provide at the start, so that the arrays need not be copied while they grow."""
+        return int(self.limit / blocks.slot_bytes)
+
+
+def resident_bytes() -> int:
+    """Resident memory of the process; where only its maximum is known, that.
+
+    Raises:
+        ConfigError: It cannot be read on this platform.
+    """
+    try:
+        import resource
+    except ImportError as error:
+        raise ConfigError("the memory of the process cannot be read on Windows; run without a memory limit") from error
+    if _STATM.exists():
+        return int(_STATM.read_text(encoding="ascii").split()[1]) * resource.getpagesize()
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak if sys.platform == "darwin" else 1024 * peak
+
+
+def _return_freed() -> bool:
+    """Have the C library give freed memory back to the system, which it keeps for itself in pieces between others."""
+    if sys.platform != "linux":
+        return False
+    trim = getattr(ctypes.CDLL(None), "malloc_trim", None)  # of glibc only
+    return trim is not None and bool(trim(0))

@@ -1,0 +1,115 @@
+"""The blocks of a map, of which those far from the view may wait on disk: which are in memory, and reading them all."""
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import VolumeConfig
+from dudmap.core.backends.spec import Backend
+from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
+from dudmap.core.map.block_tree import BlockTree
+from dudmap.core.map.block_window import BlockWindow
+from dudmap.core.map.fine_blocks import FineBlocks
+from dudmap.core.map.integrator import Integrator
+from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+
+
+class PagedMap:
+    """What ``TsdfVolume`` does with its blocks as a whole, wherever they are; its attributes are described there."""
+
+    config: VolumeConfig
+    backend: Backend
+    levels: Sequence[FineBlocks]
+    pager: BlockPager | None
+    block_size: float
+    blocks: VoxelBlocks
+    window: BlockWindow
+    _integrator: Integrator
+    _window_cells: int
+    _frame_number: int
+    _left: NDArray[np.int64] | None  # where the window was when all blocks left the memory
+
+    @property
+    def all_blocks(self) -> VoxelBlocks | BlockTree:
+        """The blocks in memory with all finer ones."""
+        return self.blocks
+
+    @property
+    def num_blocks(self) -> int:
+        """Blocks that own voxels, also those that are not in memory."""
+        return self.blocks.num_voxel_blocks + (self.pager.num_blocks if self.pager else 0)
+
+    @property
+    def view_bytes(self) -> int:
+        """Memory of the voxels around the view."""
+        return len(self.window.near) * self.blocks.slot_bytes
+
+    def _new_blocks(self) -> VoxelBlocks:
+        """Empty blocks, with room for as many as will be in memory."""
+        return VoxelBlocks() if self.pager is None else self.pager.new_blocks()
+
+    def _empty(self) -> None:
+        """Have no blocks and no window in memory."""
+        self.blocks, self.window = self._new_blocks(), BlockWindow(self.block_size, self._window_cells)
+
+    def page_out(self) -> None:
+        """Have all blocks wait on disk, where the map may do so, until they are needed again."""
+        if self.pager is not None and self.blocks.num_entries:
+            self.pager.page_out(self.all_blocks, self._frame_number)
+            self._left = self._left if self.window.origin is None else self.window.origin
+            self._empty()
+
+    def _place_window(self, origin: NDArray[np.int64]) -> None:
+        self._bring(origin, origin + self.window.shape)
+        self.window.fill(origin, self.blocks)
+
+    def _bring(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> None:
+        """Have the blocks from ``low`` up to ``high`` (3,), and all that touch them, in memory."""
+        if self.pager is not None:
+            self.pager.focus(self.all_blocks, low, high, self._frame_number)
+
+    def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
+        """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
+        for region in regions_of(self.blocks, self.pager):
+            first = np.array(region, dtype=np.int32) * REGION
+            self._bring(first, first + REGION)
+            yield first
+        if self.pager is not None and self.window.origin is not None:
+            self._place_window(self.window.origin)
+
+    def records(self) -> Iterator[BlockRecords]:
+        """Copies of all blocks, in parts: everything at once if it is in memory, else region by region."""
+        if self.pager is None:
+            yield self.all_blocks.records(np.arange(self.blocks.num_entries), by_slot=True)  # as in the mesh
+            return
+        for first in self._visited_regions():
+            yield self.all_blocks.records(self.blocks.entries_in(first, first + REGION))
+
+    def take_colors(self, other: "PagedMap") -> None:
+        """Replace the colours and intensities by those of a map of the same world; distances and weights stay.
+
+        A voxel that has none in the other map loses its own, and takes those of the next reading near the surface.
+        """
+        assert other.config == self.config
+        number = self._frame_number + 1
+        for level in range(self._num_levels):
+            for first in self._visited_regions():
+                other._bring(first, first + REGION)
+                slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
+                slots = slots[slots >= 0]
+                self._take_level_colors(level, slots, other, number)
+                self.blocks.written[slots] = number
+                if self.pager is not None:
+                    self.pager.changed(first)
+        self._frame_number = number
+
+    @property
+    def _num_levels(self) -> int:
+        return 1
+
+    def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
+        """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one, as frame
+        ``number``."""
+        assert level == 0
+        self.blocks.take_colors(slots, other.blocks)

@@ -1,0 +1,125 @@
+"""Where the map needs smaller voxels: where the surface bends or is finely coloured and the sensor resolves it."""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.backends.cpu.refinement import SATURATED, examine, prolong
+from dudmap.core.backends.parameters import TruncationBand
+from dudmap.core.map.fine_blocks import FineBlocks, neighbourhood
+from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
+
+FIRST = 3
+"""Frames after which a block is examined for the first time."""
+PERIOD = 16
+"""Frames from one examination of a block to the next."""
+HYSTERESIS = 0.5
+"""Share of the thresholds below which a block with smaller voxels no longer needs them."""
+MAX_CALM = 3
+"""Successive examinations of that result after which its smaller voxels are dropped."""
+FILTERED = 0.5
+"""Standard deviation of a filtered reading relative to that of a raw one: assumed, since part of the noise of a sensor
+is the same over the window of the filter."""
+BEND_NOISE = np.sqrt(6) / 4
+"""Standard deviation of the bend along one axis for distances with the standard deviation 1."""
+SIGNIFICANT = 2.0
+"""Standard deviations of the bend of noise that a bend must exceed in addition to the threshold."""
+
+
+class Refinement:
+    """Opens and drops the blocks of one level.
+
+    Args:
+        config: Thresholds.
+        sensor: Noise of the readings.
+        band: Truncation band of the coarser level.
+        voxel_size: Of the coarser level, metres.
+        sdf_unit: Metres per step of a stored distance.
+    """
+
+    def __init__(
+        self,
+        config: VolumeConfig,
+        sensor: SensorConfig,
+        band: TruncationBand,
+        voxel_size: float,
+        sdf_unit: float,
+    ) -> None:
+        self.config, self.sensor = config, sensor
+        self.voxel_size = voxel_size
+        self._by_voxel, self._saturated = sdf_unit / voxel_size, float(SATURATED * band.front / voxel_size)
+
+    def update(
+        self,
+        level: FineBlocks,
+        parents: VoxelBlocks,
+        slots: NDArray[np.int32],
+        depths: NDArray[np.float64],
+        number: int,
+    ) -> NDArray[np.int32]:
+        """Examine blocks of the coarser level that a frame was fused into.
+
+        Args:
+            level: Blocks of this level, changed here.
+            parents: Those of the coarser one.
+            slots: (n,) int32 slots of the parents.
+            depths: (n,) depth of their centres in the view, metres.
+            number: Number of the frame.
+
+        Returns:
+            (m,) int32 slots of the parents whose children changed.
+        """
+        sigma = self.sensor.sigma(depths)
+        fused = parents.fused[slots].astype(np.int64)
+        due = (fused == FIRST) | ((fused > FIRST) & ((_phases(parents, slots) + number) % PERIOD == 0))
+        due &= (depths > 0) & (sigma < level.voxel_size)
+        slots, sigma, fused = slots[due], sigma[due], fused[due]
+        if len(slots) == 0:
+            return slots
+        near = neighbourhood(parents, slots)
+        bend, texture, found = examine(parents.geometry, near, self._by_voxel, self._saturated)
+        surface = found.astype(bool)
+        noise = SIGNIFICANT * BEND_NOISE * FILTERED * sigma / (self.voxel_size * np.sqrt(np.minimum(fused, 64)))
+        needed = np.maximum(
+            bend / np.hypot(self.config.adaptive_bend, noise)[:, None], texture / self.config.adaptive_texture
+        )
+        children = level.children[slots]
+        rows, octants = np.nonzero(surface & (needed > 1) & (children < 0))
+        if len(rows):
+            opened = level.open(parents, slots[rows], octants, number)
+            blocks = level.blocks
+            prolong(parents.geometry, parents.colors, near[rows], octants, opened, blocks.geometry, blocks.colors)
+        dropped = self._drop_calm(level, children, surface, needed)
+        changed = np.zeros(len(slots), dtype=bool)
+        changed[rows] = True
+        return slots[changed | dropped]
+
+    def _drop_calm(
+        self, level: FineBlocks, children: NDArray[np.int32], surface: NDArray[np.bool_], needed: NDArray[np.float32]
+    ) -> NDArray[np.bool_]:
+        """Drop children (n, 8) that are not needed any more; whether a parent (n,) lost one."""
+        rows, octants = np.nonzero(children >= 0)
+        slots = children[rows, octants]
+        calm = ~surface[rows, octants] | (needed[rows, octants] < HYSTERESIS)
+        level.calm[slots] = np.where(calm, level.calm[slots] + 1, 0)
+        unneeded = level.calm[slots] >= MAX_CALM
+        level.drop(slots[unneeded])
+        out = np.zeros(len(children), dtype=bool)
+        out[rows[unneeded]] = True
+        return out
+
+
+def prolonged(
+    parents: VoxelBlocks, slots: NDArray[np.int32], octants: NDArray[np.int64]
+) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    """Interpolation of the coarser level in octants (n,) of blocks in slots (n,): voxels and colours (n, 512)."""
+    voxels, colors = np.empty((2, len(slots), BLOCK**3), dtype=np.int32)
+    rows = np.arange(len(slots), dtype=np.int32)
+    prolong(parents.geometry, parents.colors, neighbourhood(parents, slots), octants, rows, voxels, colors)
+    return voxels, colors
+
+
+def _phases(parents: VoxelBlocks, slots: NDArray[np.int32]) -> NDArray[np.int64]:
+    """Numbers (n,) that spread the examinations of blocks over the frames; of their place alone, so that it does not
+    matter when blocks came into memory. Along each axis all remainders by ``PERIOD`` follow each other."""
+    return parents.slot_coords[slots].astype(np.int64) @ np.array([1, 3, 5])

@@ -1,0 +1,368 @@
+"""Voxel-hashed truncated signed distance field with colour and known free space (thesis section 4.5)."""
+
+import itertools
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.backends.cpu import meshing
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.cpu.integration import used_readings
+from dudmap.core.backends.parameters import (
+    FREE,
+    SURFACE,
+    UNKNOWN,
+    MapSample,
+    MeshParameters,
+    RaycastParameters,
+    RaycastResult,
+    VoxelGrid,
+)
+from dudmap.core.backends.spec import Backend
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh, joined
+from dudmap.core.map.block_pager import REGION, BlockPager
+from dudmap.core.map.fine_blocks import FineBlocks
+from dudmap.core.map.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.core.map.map_file import read_map, write_map
+from dudmap.core.map.memory_limit import MemoryLimit
+from dudmap.core.map.paged_map import PagedMap
+from dudmap.core.map.voxel_blocks import BLOCK
+from dudmap.errors import MapError
+
+__all__ = ["FREE", "SURFACE", "UNKNOWN", "MapSample", "RaycastResult", "TsdfVolume"]
+
+_MAP_IDS = itertools.count()
+MAX_JUMP = 5.0
+"""Largest change of the distance within one cell that still is a surface, voxels: a projective distance grows with
+one over the cosine of the angle of incidence; a steeper change is the border between a band and free space."""
+MAX_WINDOW = 288
+"""Largest number of blocks along the edge of the window; its cells then take 96 MB."""
+
+
+class TsdfVolume(PagedMap):
+    """The map: blocks of 8x8x8 voxels in a hash, and one byte per block of space known to be free.
+
+    Args:
+        camera: Camera of the frames that will be integrated.
+        config: Voxel size, truncation, weights.
+        sensor: Noise of the depth readings.
+        depth_max: Farthest reading that will be integrated, metres.
+        backend: Compute device, of this map alone; None takes the CPU.
+        max_blocks: Largest number of blocks with voxels in memory, or the memory limit of the process; the blocks
+            farthest from the view wait on disk. None keeps all in memory.
+        extent: Depth that the window covers, metres; None covers ``depth_max``.
+
+    Attributes:
+        blocks: The blocks of the map that are in memory.
+        pager: Moves the others; None if all are in memory.
+        window: Those around the view.
+        voxel_size, block_size: Edge of a voxel and of a block, metres.
+        band: Truncation band around a reading; ``truncation``, ``truncation_behind``: its smallest widths, metres.
+        sdf_unit: Metres per step of a stored distance.
+        map_id: Number of the map in this process; ``clear`` gives a new one.
+        levels: Blocks with smaller voxels (``AdaptiveVolume``), coarser levels first; none here.
+
+    Raises:
+        MapError: The voxels are too small for a window that covers ``depth_max``.
+    """
+
+    levels: Sequence[FineBlocks] = ()
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: VolumeConfig | None = None,
+        sensor: SensorConfig | None = None,
+        depth_max: float = 6.0,
+        backend: Backend | None = None,
+        max_blocks: int | MemoryLimit | None = None,
+        extent: float | None = None,
+    ) -> None:
+        self.camera = camera
+        self.pager = None if max_blocks is None else BlockPager(max_blocks)
+        self.config = config or VolumeConfig()
+        self.sensor = sensor or SensorConfig()
+        self.depth_max = depth_max
+        self.backend: Backend = backend or CpuBackend()
+        scale = StorageScale.of(self.config, self.sensor, depth_max)
+        self._integrator = Integrator(self.config, scale, depth_max, self.backend)
+        self.voxel_size, self.sdf_unit, self.band = scale.voxel_size, scale.sdf_unit, scale.band
+        self.block_size = BLOCK * self.voxel_size
+        self.truncation, self.truncation_behind = self.band.front, self.band.behind
+        half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
+                         max(camera.cy, camera.height - camera.cy) / camera.fy])  # fmt: skip
+        extent = depth_max if extent is None else extent
+        self._reach = extent * (1 + float(half @ half)) / 2  # centre and radius of the sphere around the frustum
+        cells = np.ceil(2 * (self._reach + self.band.limit) / self.block_size) + 8
+        if not cells <= MAX_WINDOW:  # also where a field of view of almost 180 degrees makes it infinite
+            longest = extent * (MAX_WINDOW - 8) / cells
+            raise MapError(
+                f"voxels of {self.voxel_size} m with readings up to {extent} m need too large a window; "
+                f"set preprocess.depth_max to {longest:.2f} or less, or volume.voxel_size to a larger value"
+            )
+        self._window_cells = int(cells)
+        self.clear()
+
+    def clear(self) -> None:
+        """Remove everything that was integrated."""
+        self._empty()
+        if self.pager is not None:
+            self.pager.clear()
+        self._left = None
+        self._frame_number = 0
+        self.map_id = next(_MAP_IDS)
+
+    @property
+    def is_empty(self) -> bool:
+        """Whether nothing has been integrated yet."""
+        return self.num_blocks == 0
+
+    @property
+    def num_free_blocks(self) -> int:
+        """Blocks in memory known to be free space; they own no voxels."""
+        return self.blocks.num_free(self.config.free_after)
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of the map: voxels, including released slots that were not reused yet, the index of all entries, the
+        hash table.
+
+        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory. So
+        is the window, whose size depends on the view and the voxels, not on the map.
+        """
+        return self.blocks.num_bytes
+
+    @property
+    def entry_bytes(self) -> float:
+        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
+        return self.blocks.entry_bytes
+
+    @property
+    def active_slots(self) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        return self.blocks.active_slots
+
+    # -- writing -----------------------------------------------------------------------------------------------------
+
+    def integrate(
+        self,
+        frame: Frame,
+        T_world_camera: NDArray[np.float64],
+        static_mask: NDArray[np.bool_] | None = None,
+        weights: NDArray[np.uint8] | None = None,
+        count: int = 1,
+    ) -> None:
+        """Fuse a frame seen from a known pose: allocate, average (eq. 4.18-4.23), carve, remember free space.
+
+        Args:
+            frame: Depth (m) and colour of the volume's camera.
+            T_world_camera: (4, 4).
+            static_mask: (H, W) bool; pixels that are False change nothing. None fuses all.
+            weights: (H, W) uint8 weight of each reading; None = by the configuration.
+            count: Number of equal frames that it stands for: their weights and observations of emptiness add up.
+
+        Raises:
+            MapError: The images do not have the camera's size.
+        """
+        if frame.depth.shape != self.camera.shape or frame.color.shape[:2] != self.camera.shape:
+            raise MapError(
+                f"the volume's camera is {self.camera.width}x{self.camera.height}, but depth is "
+                f"{frame.depth.shape[1]}x{frame.depth.shape[0]} and colour "
+                f"{frame.color.shape[1]}x{frame.color.shape[0]}"
+            )
+        used = np.ones(frame.depth.shape, dtype=bool) if static_mask is None else np.ascontiguousarray(static_mask)
+        depth = np.empty(frame.depth.shape, dtype=np.float32)
+        used_readings(np.ascontiguousarray(frame.depth, np.float32), used, np.float32(self.depth_max), depth)
+        self.look_at(T_world_camera)
+        self._frame_number += 1
+        self._fuse(depth, frame.color, weights, T_world_camera, count)
+
+    def _fuse(
+        self,
+        depth: NDArray[np.float32],
+        color: NDArray[np.uint8],
+        weights: NDArray[np.uint8] | None,
+        T_world_camera: NDArray[np.float64],
+        count: int,
+    ) -> NDArray[np.int32]:
+        """Fuse an image whose view the window covers; see ``Integrator.integrate``."""
+        return self._integrator.integrate(
+            self.blocks, self.window, self.camera, depth, color, weights, T_world_camera, self._frame_number, count
+        )
+
+    def take_over(self, other: "TsdfVolume") -> None:
+        """Replace the content by that of a map with the same parameters, which must not be used afterwards."""
+        assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
+        self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
+        self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
+
+    def for_camera(
+        self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
+    ) -> "TsdfVolume":
+        """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
+        volume must not be used afterwards."""
+        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
+        other.pager, other._frame_number = self.pager or other.pager, self._frame_number
+        other.blocks = self.blocks
+        return other
+
+    def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
+        """Move the window so that it covers what a camera at this pose can see."""
+        middle = T_world_camera[:3, 3] + T_world_camera[:3, 2] * self._reach
+        origin = self.window.moved(middle, self._left)
+        if origin is not None:
+            self._left = None
+            self._place_window(origin)
+
+    # -- reading -----------------------------------------------------------------------------------------------------
+
+    @property
+    def grid(self) -> VoxelGrid:
+        """The blocks around the view as the back end takes them; valid until the next ``integrate``."""
+        return self._integrator.grid(self.blocks, self.window)
+
+    def T_grid_camera(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
+        """Camera to the lattice of ``grid`` (3, 4) float32, voxels."""
+        return self.window.T_grid_camera(T_world_camera)
+
+    def sample(
+        self,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        camera: Camera,
+        T_world_camera: NDArray[np.float64],
+    ) -> MapSample:
+        """Distance, intensity difference and occupancy of the map at the points of a depth image (h, w) of ``camera``
+        at a pose inside the window."""
+        T = self.T_grid_camera(T_world_camera)
+        return self.backend.sample(self.grid, depth, intensity, camera.intrinsics, T, self.config.free_after)
+
+    def known_share(
+        self, depth: NDArray[np.float32], camera: Camera, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.float32]:
+        """Share of the information on the surface at each reading (h, w) that the map has without it.
+
+        Weights are information: the running average of readings of weight g has the variance 1 / w where w is the sum
+        of their weights (eq. 4.19), and one more reading brings it to 1 / (w + g). The share is w / (w + g), n / (n +
+        1) after n equal readings; 0 where the map has no surface or there is no reading.
+
+        Args:
+            depth: (h, w) float32, metres, 0 = none.
+            camera: Its camera.
+            T_world_camera: (4, 4).
+        """
+        rows, columns = np.nonzero(depth)
+        points = camera.points(columns, rows, depth[rows, columns].astype(np.float64))
+        voxels = np.rint((points @ T_world_camera[:3, :3].T + T_world_camera[:3, 3]) / self.voxel_size).astype(np.int32)
+        slots, local = self.slots_at(voxels // BLOCK), voxels % BLOCK
+        numbers = (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]
+        words = self.blocks.geometry[np.maximum(slots, 0), numbers]
+        weights = np.where(slots >= 0, (words >> 8) & 0xFF, 0)
+        out = np.zeros(depth.shape, np.float32)
+        gains = self._integrator.reading_weights(depth, camera)
+        out[rows, columns] = weights / (weights + gains[rows, columns])
+        return out
+
+    def raycast(self, T_world_camera: NDArray[np.float64], camera: Camera | None = None) -> RaycastResult:
+        """The map seen by ``camera`` (default: the volume's own) from a pose, by sphere tracing (eq. 4.12)."""
+        camera = camera or self.camera
+        self.look_at(T_world_camera)
+        parameters = RaycastParameters(DEPTH_MIN, self.depth_max, self.config.min_weight)
+        return self.backend.raycast(self.grid, T_world_camera, camera.intrinsics, camera.shape, parameters)
+
+    def extract_mesh(self, min_weight: int | None = None) -> Mesh:
+        """Triangles of the zero level by marching cubes, where every corner has at least ``min_weight`` observations.
+
+        Raises:
+            MapError: The map is empty.
+        """
+        if self.is_empty:
+            raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
+        if self.pager is not None:
+            return joined(list(self.extract_pieces(min_weight)))
+        slots, blocks = self.active_slots, self.blocks
+        return Mesh(
+            *meshing.extract(
+                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+                self._mesh_parameters(min_weight),
+            )
+        )  # fmt: skip
+
+    def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
+        """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.
+
+        Blocks that are not in memory come and go meanwhile; frames must not be integrated until the end.
+        """
+        reach = np.arange(-1, REGION + 1, dtype=np.int32)
+        offsets = np.stack(np.meshgrid(reach, reach, reach, indexing="ij"), axis=-1).reshape(-1, 3)
+        inner = np.all((offsets >= 0) & (offsets < REGION), axis=1)
+        for first in self._visited_regions():
+            slots = self.slots_at(first + offsets)
+            exists = slots >= 0
+            if np.any(exists & inner):
+                yield from self.extract_chunks(slots[exists], np.where(inner[exists], 0, -1), min_weight)
+
+    def _mesh_parameters(self, min_weight: int | None) -> MeshParameters:
+        min_weight = self.config.min_weight if min_weight is None else min_weight
+        return MeshParameters(self.voxel_size, self.sdf_unit, min_weight, MAX_JUMP * self.voxel_size)
+
+    def extract_chunks(
+        self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None
+    ) -> list[Mesh]:
+        """Meshes of groups of blocks that share no vertices, each equal to its part of ``extract_mesh``.
+
+        Args:
+            slots: (n,) int32, the blocks to mesh and all blocks that touch one of them.
+            chunks: (n,) int64, the group of each block, counted from 0; -1 for blocks that only lend their voxels.
+            min_weight: As of ``extract_mesh``.
+        """
+        blocks = self.blocks
+        meshes = meshing.extract_chunks(
+            blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
+            self._mesh_parameters(min_weight), chunks,
+        )  # fmt: skip
+        return [Mesh(*mesh) for mesh in meshes]
+
+    @property
+    def num_integrated(self) -> int:
+        """Frames that were integrated."""
+        return self._frame_number
+
+    def written_since(self, num_integrated: int) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+        """Slots (n,) int32, and the coordinates (n, 3) int32 of their blocks, written after so many frames.
+
+        A slot that was released is among them, with the coordinates of the block that had it or of the next one.
+        """
+        blocks = self.blocks
+        slots = np.flatnonzero(blocks.written[: blocks.num_slots] > num_integrated).astype(np.int32)
+        return slots, blocks.slot_coords[slots].astype(np.int32)
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        return self.blocks.slots_at(coords)
+
+    # -- files -------------------------------------------------------------------------------------------------------
+
+    def save(self, path: str | Path) -> None:
+        """Write the map as NumPy archive, replacing an older file at the end; ``load`` gives an equal volume.
+
+        Raises:
+            MapError: The file cannot be written.
+        """
+        write_map(path, self)
+
+    @classmethod
+    def load(cls, path: str | Path) -> "TsdfVolume":
+        """Read a map that ``save`` wrote.
+
+        Raises:
+            MapError: The file is missing, damaged or not a map of this version.
+        """
+        from dudmap.core.map.adaptive_volume import volume_of
+
+        return volume_of(read_map(path))

@@ -1,0 +1,335 @@
+"""Blocks of 8x8x8 voxels: the hash table that finds them and the memory that holds them."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.backends.mirror import Mirror, grown
+from dudmap.core.backends.parameters import BLOCK
+
+__all__ = ["BLOCK", "VoxelBlocks", "grown"]
+
+COORDINATE_BITS = 18
+"""Bits of a block's coordinate: three of them and the number of one of 512 maps are a key of the database."""
+MAX_COORDINATE = 1 << (COORDINATE_BITS - 1)
+"""Bound of a block's coordinates: 10.4 km with blocks of 8 cm."""
+INTENSITY = 0xFF
+"""Bits of a voxel's geometry word that hold its intensity (``core/formulas/voxel.py``)."""
+MAX_LOAD = 0.8
+"""Largest load factor of the hash table: an insertion takes 16 ns then, 9 ns after the table has grown."""
+
+
+@dataclass(frozen=True, eq=False)
+class BlockRecords:
+    """Blocks taken out of a map.
+
+    Attributes:
+        coords: (n, 3) int32 block coordinates.
+        free_count: (n,) uint8 observations of emptiness.
+        owners: (m,) int32 rows of ``coords`` of the blocks that own voxels.
+        geometry, colors: (m, 512) int32 packed voxels.
+        fused: (m,) uint8 frames that were fused into a block, 255 or more.
+        finer: Of each finer level, the blocks inside these (``FineBlocks.records``).
+    """
+
+    coords: NDArray[np.int32]
+    free_count: NDArray[np.uint8]
+    owners: NDArray[np.int32]
+    geometry: NDArray[np.int32]
+    colors: NDArray[np.int32]
+    fused: NDArray[np.uint8]
+    finer: "tuple[BlockRecords, ...]" = ()
+
+
+class VoxelBlocks:
+    """The map's content, block by block.
+
+    An entry is a block that has been observed; an entry near a surface owns a slot of 512 voxels. Arrays are larger
+    than their content and grow by factors.
+
+    Args:
+        slots: Number of slots to provide at the start. Those that are not used take no memory.
+
+    Attributes:
+        table: Hash table of entry numbers (``core/backends/cpu/hashing.py``).
+        coords: (entries, 3) int32 block coordinates.
+        slot_of: (entries,) int32 slot of each entry, -1 = no voxels.
+        free_count: (entries,) uint8 observations of emptiness.
+        num_entries: Number of entries.
+        geometry, colors: (slots, 512) int32 packed voxels; ``write`` changes them.
+        geometry_mirror, colors_mirror: The same for back ends, which may hold them on a device.
+        entry_of: (slots,) int32 entry of each slot, -1 = unused.
+        slot_coords: (slots, 3) int32 block coordinates by slot.
+        written: (slots,) int32 number of the frame that last wrote to a slot.
+        fused: (slots,) uint8 frames that were fused into a slot, 255 or more.
+        num_slots: Number of slots in use or released.
+    """
+
+    def __init__(self, slots: int = 1 << 10) -> None:
+        self.table = np.full(1 << 14, hashing.EMPTY, dtype=np.int32)
+        self.coords = np.empty((1 << 12, 3), dtype=np.int32)
+        self.slot_of = np.full(1 << 12, -1, dtype=np.int32)
+        self.free_count = np.zeros(1 << 12, dtype=np.uint8)
+        self.num_entries = 0
+        self.geometry_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
+        self.colors_mirror = Mirror(np.zeros((slots, BLOCK**3), dtype=np.int32))
+        self.entry_of = np.full(slots, -1, dtype=np.int32)
+        self.slot_coords = np.zeros((slots, 3), dtype=np.int32)
+        self.written = np.zeros(slots, dtype=np.int32)
+        self.fused = np.zeros(slots, dtype=np.uint8)
+        self.use_slots(0)
+        self._released = np.empty(0, dtype=np.int32)
+
+    @property
+    def geometry(self) -> NDArray[np.int32]:
+        """Packed voxels (slots, 512) int32 in the host's memory, up to date."""
+        return self.geometry_mirror.host
+
+    @geometry.setter
+    def geometry(self, array: NDArray[np.int32]) -> None:
+        self.geometry_mirror = Mirror(array)
+
+    @property
+    def colors(self) -> NDArray[np.int32]:
+        """Packed colours (slots, 512) int32 in the host's memory, up to date."""
+        return self.colors_mirror.host
+
+    @colors.setter
+    def colors(self, array: NDArray[np.int32]) -> None:
+        self.colors_mirror = Mirror(array)
+
+    def write(self, slots: NDArray[np.integer], geometry: NDArray[np.int32], colors: NDArray[np.int32]) -> None:
+        """Replace the voxels (n, 512) of slots (n,)."""
+        self.geometry[slots], self.colors[slots] = geometry, colors
+        self.geometry_mirror.wrote(slots)
+        self.colors_mirror.wrote(slots)
+
+    def take_colors(self, slots: NDArray[np.integer], other: "VoxelBlocks") -> None:
+        """Give slots (n,) the colours and intensities that their blocks have in another map; 0 where it has none."""
+        there = other.slots_at(self.slot_coords[slots].astype(np.int32))
+        known = there >= 0
+        intensities, colors = np.zeros((2, len(slots), BLOCK**3), dtype=np.int32)
+        intensities[known] = other.geometry[there[known]] & INTENSITY
+        colors[known] = other.colors[there[known]]
+        self.write(slots, (self.geometry[slots] & ~INTENSITY) | intensities, colors)
+
+    @property
+    def num_voxel_blocks(self) -> int:
+        """Blocks that own voxels."""
+        return self.num_slots - len(self._released)
+
+    def num_free(self, observations: int) -> int:
+        """Blocks without voxels that have at least so many observations of emptiness."""
+        n = self.num_entries
+        return int(np.count_nonzero((self.free_count[:n] >= observations) & (self.slot_of[:n] < 0)))
+
+    @property
+    def num_bytes(self) -> int:
+        """Memory of all slots, also the released ones, of all entries and of the hash table.
+
+        The spare capacity of the arrays is left out: it is address space that the system has not backed with memory.
+        """
+        return self.num_slots * self.slot_bytes + self.num_entries * self._index_bytes + self.table.nbytes
+
+    @property
+    def slot_bytes(self) -> int:
+        """Bytes of a slot."""
+        slots = (self.slot_coords, self.entry_of, self.written, self.fused)
+        return 2 * 4 * BLOCK**3 + sum(_row_bytes(array) for array in slots)
+
+    @property
+    def entry_bytes(self) -> float:
+        """Bytes of a block without voxels, such as free space: its entry and its share of the hash table."""
+        return self._index_bytes + self.table.nbytes / max(self.num_entries, 1)
+
+    @property
+    def _index_bytes(self) -> int:
+        return sum(_row_bytes(array) for array in (self.coords, self.slot_of, self.free_count))
+
+    @property
+    def active_slots(self) -> NDArray[np.int32]:
+        """Slots (n,) int32 of all blocks that own voxels, ascending."""
+        return np.flatnonzero(self.entry_of[: self.num_slots] >= 0).astype(np.int32)
+
+    def entries_at(self, coords: NDArray[np.int32], unknown: int) -> NDArray[np.int32]:
+        """Entries (n,) int32 of blocks at coordinates (n, 3); new ones for those (at most ``unknown``) without one."""
+        self.reserve_entries(self.num_entries + unknown)
+        entries, self.num_entries = hashing.insert_all(self.table, self.coords, self.num_entries, coords)
+        return entries
+
+    def reserve_entries(self, needed: int) -> None:
+        """Have room for so many entries."""
+        if needed > len(self.coords):
+            capacity = max(needed, 2 * len(self.coords))
+            self.coords = grown(self.coords, capacity, 0)
+            self.slot_of = grown(self.slot_of, capacity, -1)
+            self.free_count = grown(self.free_count, capacity, 0)
+        if needed > MAX_LOAD * len(self.table):
+            size = max(int(needed / MAX_LOAD), len(self.table)) * 3 // 2  # a search in a full table would not end
+            self.table = np.full(size, hashing.EMPTY, dtype=np.int32)
+            hashing.rebuild(self.table, self.coords, self.num_entries)
+
+    def reserve_slots(self, needed: int) -> None:
+        """Have room for so many slots."""
+        if needed > len(self.entry_of):
+            capacity = max(needed, len(self.entry_of) * 3 // 2)
+            self.geometry_mirror.grow(capacity)
+            self.colors_mirror.grow(capacity)
+            self.entry_of = grown(self.entry_of, capacity, -1)
+            self.slot_coords = grown(self.slot_coords, capacity, 0)
+            self.written = grown(self.written, capacity, 0)
+            self.fused = grown(self.fused, capacity, 0)
+
+    def allocate(self, entries: NDArray[np.int32], frame_number: int) -> NDArray[np.int32]:
+        """New slots (n,) int32 for entries that have none."""
+        kept = max(len(self._released) - len(entries), 0)
+        reused, self._released = self._released[kept:][::-1], self._released[:kept]
+        needed = self.num_slots + len(entries) - len(reused)
+        self.reserve_slots(needed)
+        slots = np.concatenate([reused, np.arange(self.num_slots, needed, dtype=np.int32)])
+        self.use_slots(needed)
+        self.entry_of[slots] = entries
+        self.slot_coords[slots] = self.coords[entries]
+        self.written[slots] = frame_number
+        self.fused[slots] = 0
+        self.slot_of[entries] = slots
+        return slots
+
+    def use_slots(self, num_slots: int) -> None:
+        """Take the slots below a number for used."""
+        self.num_slots = num_slots
+        self.geometry_mirror.used = self.colors_mirror.used = num_slots
+
+    def release(self, slots: NDArray[np.int32], observations: int) -> NDArray[np.int32]:
+        """Release and empty slots; their entries (n,) int32 get at least so many observations of emptiness."""
+        entries = self.entry_of[slots]
+        self.slot_of[entries] = -1
+        self.free_count[entries] = np.maximum(self.free_count[entries], observations)
+        self.entry_of[slots] = -1
+        self.geometry_mirror.fill(slots, 0)
+        self.colors_mirror.fill(slots, 0)
+        self._released = np.concatenate([self._released, slots[::-1]])
+        return entries
+
+    def entries_in(self, low: NDArray[np.integer], high: NDArray[np.integer]) -> NDArray[np.int64]:
+        """Entries (n,) of the blocks from ``low`` up to, not including, ``high`` (3,), ascending."""
+        coords = self.coords[: self.num_entries]
+        return np.flatnonzero(np.all((coords >= low) & (coords < high), axis=1))
+
+    def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
+        """Copies of the blocks of entries (n,), the voxels in the order of the entries or of the slots."""
+        slots = self.slot_of[entries]
+        owners = np.flatnonzero(slots >= 0).astype(np.int32)
+        if by_slot:
+            owners = owners[np.argsort(slots[owners])]
+        slots = slots[owners]
+        return BlockRecords(
+            self.coords[entries], self.free_count[entries], owners,
+            self.geometry[slots], self.colors[slots], self.fused[slots],
+        )  # fmt: skip
+
+    def remove(self, entries: NDArray[np.integer], frame_number: int) -> None:
+        """Forget entries (n,) and their voxels. The other entries are numbered anew; slots keep their numbers."""
+        n = self.num_entries
+        slots = self.slot_of[entries]
+        slots = np.sort(slots[slots >= 0])
+        kept = np.ones(n, dtype=bool)
+        kept[entries] = False
+        self.entry_of[slots] = -1
+        self.geometry_mirror.fill(slots, 0)
+        self.colors_mirror.fill(slots, 0)
+        self.written[slots] = frame_number
+        self._released = np.concatenate([self._released, slots[::-1]])
+        number = (np.cumsum(kept) - 1).astype(np.int32)
+        owned = self.active_slots
+        self.entry_of[owned] = number[self.entry_of[owned]]
+        m = int(np.count_nonzero(kept))
+        for array, unused in ((self.coords, 0), (self.slot_of, -1), (self.free_count, 0)):
+            array[:m] = array[:n][kept]
+            array[m:n] = unused
+        self.num_entries = m
+        self.table.fill(hashing.EMPTY)
+        hashing.rebuild(self.table, self.coords, m)
+
+    def insert(self, records: BlockRecords, frame_number: int) -> NDArray[np.int32]:
+        """Add blocks, none of which is known; slots (m,) int32 of those that own voxels."""
+        entries = self.entries_at(records.coords, len(records.coords))
+        self.free_count[entries] = records.free_count
+        slots = self.allocate(entries[records.owners], frame_number)
+        self.write(slots, records.geometry, records.colors)
+        self.fused[slots] = records.fused
+        return slots
+
+    def owned_slots(self) -> NDArray[np.int64]:
+        """Number (entries,) of slots that each entry owns."""
+        return (self.slot_of[: self.num_entries] >= 0).astype(np.int64)
+
+    def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
+        entries = hashing.find_all(self.table, self.coords, coords)
+        return np.where(entries >= 0, self.slot_of[entries], -1).astype(np.int32)
+
+    def neighbours(self, slots: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Slots (n, 8) of the blocks at offsets (dx, dy, dz) in {0, 1}, column 4 dx + 2 dy + dz; -1 = none."""
+        out = np.empty((len(slots), 8), dtype=np.int32)
+        for column in range(8):
+            offset = np.array([column >> 2, (column >> 1) & 1, column & 1], dtype=np.int32)
+            out[:, column] = self.slots_at(self.slot_coords[slots] + offset)
+        return out
+
+    @classmethod
+    def restored(
+        cls,
+        coords: NDArray[np.int32],
+        free_count: NDArray[np.uint8],
+        entries: NDArray[np.int32],
+        geometry: NDArray[np.int32],
+        colors: NDArray[np.int32],
+    ) -> "VoxelBlocks":
+        """Blocks of a map file: all entries, and entry and voxels of each slot.
+
+        Raises:
+            ValueError: The arrays do not belong together, or a block is there twice.
+        """
+        _check_restored(coords, free_count, entries, geometry, colors)
+        blocks, n, m = cls(), len(coords), len(entries)
+        blocks.table = np.full(max(1 << 14, 2 * n), hashing.EMPTY, dtype=np.int32)
+        blocks.coords, blocks.free_count, blocks.num_entries = coords.astype(np.int32), free_count.copy(), n
+        hashing.rebuild(blocks.table, blocks.coords, n)
+        blocks.geometry, blocks.colors, blocks.num_slots = geometry.copy(), colors.copy(), m
+        blocks.entry_of, blocks.slot_coords = entries.copy(), blocks.coords[entries]
+        blocks.written = np.zeros(m, np.int32)
+        blocks.fused = np.zeros(m, np.uint8)
+        blocks.slot_of = np.full(n, -1, dtype=np.int32)
+        blocks.slot_of[entries] = np.arange(m, dtype=np.int32)
+        return blocks
+
+
+def _check_restored(coords: NDArray, free_count: NDArray, entries: NDArray, geometry: NDArray, colors: NDArray) -> None:
+    """Check types, shapes and ranges of the arrays of a map file, which kernels take as they are.
+
+    Raises:
+        ValueError: They are not those of a map.
+    """
+    n, m = len(coords), len(entries)
+    wanted = {
+        "coords": (coords, np.int32, (n, 3)), "free_count": (free_count, np.uint8, (n,)),
+        "entries": (entries, np.int32, (m,)), "geometry": (geometry, np.int32, (m, BLOCK**3)),
+        "colors": (colors, np.int32, (m, BLOCK**3)),
+    }  # fmt: skip
+    for name, (array, kind, shape) in wanted.items():
+        if array.dtype != kind or array.shape != shape:
+            raise ValueError(f"{name} is {array.dtype} {array.shape}; expected {np.dtype(kind)} {shape}")
+    if m and not (0 <= entries.min() and entries.max() < n and len(np.unique(entries)) == m):
+        raise ValueError("the voxels of a block belong to no block, or two to one")
+    if n and np.abs(coords.astype(np.int64)).max() > MAX_COORDINATE - 1:
+        raise ValueError("a block lies farther away than block coordinates reach")
+    if len(np.unique(coords, axis=0)) != n:
+        raise ValueError("a block is there twice")
+
+
+def _row_bytes(array: NDArray) -> int:
+    """Memory of one element along the first axis."""
+    return array.itemsize * int(np.prod(array.shape[1:], dtype=np.int64))

@@ -1,0 +1,89 @@
+"""Mapping: frames whose pose is known become part of the map, and its first moments are corrected."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.bootstrap import Bootstrap, StartFrame
+from dudmap.core.dynamics.masks import grown_mask
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.redundancy import RedundantViews
+from dudmap.core.tracking.color_motion import ColorMotion
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
+
+
+class Mapper:
+    """Fuses frames into the current map of the atlas.
+
+    Args:
+        config: All parameters.
+        camera: Of the frames, without lens distortion.
+        atlas: The maps.
+        bootstrap: The first frames of the current map.
+        predictor: Knows for how long slow motion cannot be seen yet.
+        color_motion: Colours moved by the velocity of the camera.
+        redundancy: Is told which views the map holds.
+        localize: Frames that are not fused do not become keyframes either.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        camera: Camera,
+        atlas: Atlas,
+        bootstrap: Bootstrap,
+        predictor: PosePredictor,
+        color_motion: ColorMotion,
+        redundancy: RedundantViews,
+        *,
+        localize: bool,
+    ) -> None:
+        self._config, self._camera, self._atlas, self._bootstrap = config, camera, atlas, bootstrap
+        self._predictor, self._color_motion, self._redundancy = predictor, color_motion, redundancy
+        self._localize = localize
+
+    def revise_start(self, view: FrameView, prediction: PosePrediction) -> None:
+        """Make the map anew of the first frame without what a later image shows to have moved in it; once slow motion
+        can be seen, fuse the frames that were held back until then."""
+        self._begin_anew(self._bootstrap.revised(prediction.moving_before), view)
+        if not self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+            for frame in self._bootstrap.released():
+                self.integrate(replace(frame.view, timer=view.timer), frame.estimate, frame.dynamic_mask)
+
+    def recolor_first_frame(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Make the map of the first frame anew with its colours moved by the velocity that the second one shows."""
+        first = self._color_motion.first_frame(view.timestamp, estimate.T_world_camera)
+        self._begin_anew(None if first is None else self._bootstrap.recolored(first), view)
+
+    def _begin_anew(self, first: StartFrame | None, view: FrameView) -> None:
+        """Empty the map and fuse its first frame again; None leaves it as it is."""
+        if first is not None:
+            self._atlas.clear_map()
+            self.integrate(replace(first.view, timer=view.timer), first.estimate, first.dynamic_mask)
+
+    def extend(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_], *, fuse: bool) -> None:
+        """Fuse a frame, and keep it for relocalization if the camera has been nowhere near."""
+        if self._config.relocalization.enabled and not (view.blind or self._localize):
+            with view.timer("keyframe"):
+                T_world_camera = estimate.T_world_camera
+                self._atlas.keyframes.add(view.observation, T_world_camera, ~dynamic_mask, self._atlas.current)
+        if fuse:
+            self.integrate(view, estimate, dynamic_mask)
+        if self._predictor.ego_motion.slow_motion_is_hidden(view.timestamp):
+            self._bootstrap.add(view, estimate, dynamic_mask, fused=fuse)
+
+    def integrate(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Fuse the static pixels of a frame, in the exposure of the map, and keep it for later corrections."""
+        observation = view.observation
+        with view.timer("integrate"):
+            static = ~grown_mask(dynamic_mask, self._config.dynamics.margin_px * self._camera.width // 640)
+            frame = Frame(observation.timestamp, observation.depth, observation.rgb)
+            recorded = observation.as_recorded
+            self._atlas.integrate(frame, static, estimate.T_world_camera, estimate.exposure, recorded)
+            self._redundancy.update(self._atlas.volume, view, estimate)

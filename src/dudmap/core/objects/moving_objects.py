@@ -1,0 +1,79 @@
+"""Moving objects of a recording: identity and velocity of all, shape and trajectory of the rigid ones."""
+
+from collections import deque
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.observation import Level
+from dudmap.core.objects.object_fusion import ObjectFusion
+from dudmap.core.objects.object_map import RigidObject
+from dudmap.core.objects.object_tracker import Mover, ObjectTracker
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView
+
+MOST_WAITING = 30
+"""Frames whose moving objects nobody has asked for yet: 0.2 MB each."""
+
+
+@dataclass(eq=False)
+class _Frame:
+    """A tracked frame: arguments of ``ObjectTracker.update``, and the objects once they were found."""
+
+    timestamp: float
+    dynamic: NDArray[np.bool_]
+    level: Level
+    T_world_camera: NDArray[np.float64]
+    movers: tuple[Mover, ...] | None = None
+
+
+class MovingObjects:
+    """Tracks the objects that the labels show to move; nothing here influences the camera's pose or the map.
+
+    Args:
+        config: ``movers`` switches tracking and fusion on and off.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.tracker = ObjectTracker(config.movers) if config.movers.enabled else None
+        self.fusion = ObjectFusion(config) if config.movers.enabled and config.movers.meshes else None
+        self._waiting: deque[_Frame] = deque()
+
+    def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
+        """Take note of a tracked frame; the function that is returned finds its moving objects, by id.
+
+        They are found when somebody asks for them or for those of a later frame, at the latest ``MOST_WAITING`` frames
+        later, or at once where their shapes are fused.
+        """
+        if self.tracker is None or estimate.labels is None:
+            return tuple
+        level, T_world_camera = view.labelled, estimate.T_world_camera
+        level = Level(level.camera, level.depth, level.intensity)  # without the images it is made from
+        frame = _Frame(view.timestamp, estimate.labels.dynamic, level, T_world_camera)
+        self._waiting.append(frame)
+        if self.fusion is not None:
+            with view.timer("bodies"):
+                fused = self.fusion.update(
+                    view.observation, self._movers(frame), level, T_world_camera, estimate.exposure
+                )
+            frame.movers = tuple(fused)
+        elif len(self._waiting) > MOST_WAITING:
+            self._movers(self._waiting[0])
+        return partial(self._movers, frame)
+
+    def _movers(self, frame: "_Frame") -> tuple[Mover, ...]:
+        """The moving objects of a frame, after those of the frames before it."""
+        assert self.tracker is not None
+        while frame.movers is None:
+            first = self._waiting.popleft()
+            found = self.tracker.update(first.timestamp, first.dynamic, first.level, first.T_world_camera)
+            first.movers = tuple(found)
+        return frame.movers
+
+    def rigid_objects(self, Ts_world_camera: Mapping[float, NDArray[np.float64]]) -> list[RigidObject]:
+        """Shape and trajectory of the objects so far, given the camera poses (4, 4) by time; empty without fusion."""
+        return [] if self.fusion is None else self.fusion.objects(dict(Ts_world_camera))

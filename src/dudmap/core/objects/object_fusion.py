@@ -1,0 +1,285 @@
+"""Rigid fusion: a map and a trajectory of its own for every moving object that proves to be rigid.
+
+An object is registered to its own map as the camera is to the map of the static world (thesis section 4.4), and fused
+there: Ruenz and Agapito, Co-Fusion (2017). No classifier tells which objects are rigid: the fused surface of a rigid
+object is observed again wherever it is not occluded, that of a person's leg is soon seen through. The objects never
+influence the camera's pose or the map.
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.objects.object_map import ObjectTrack, ObjectVolume, RigidObject
+from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.objects.object_view import ObjectView, crop_object
+from dudmap.core.tracking.tracker import Tracker, TrackingResult
+
+MAX_OBJECTS = 4
+"""Most objects that are registered in one frame; each costs a few milliseconds and some megabytes."""
+MAX_MESHES = 50
+"""Most meshes that are kept of objects no longer tracked."""
+MAX_SEEN_THROUGH = 0.08
+"""Largest share of a rigid object's surface that a frame may see through: edges of the mask, errors of the pose."""
+MAX_OFF_SURFACE = 0.25
+"""Largest share of a rigid object's readings that may contradict its map."""
+YOUNG_FRAMES = 10
+"""Frames that a map must hold before a misfit is evidence against a rigid object. Until then the map is restarted, also
+where much more of the object comes into view: a map started on a narrow strip is distorted."""
+GROWN = 1.5
+"""Visible surface, relative to that at the start of the map, that restarts a young map."""
+MAX_RESTARTS = 20
+"""Most restarts of a map."""
+COLOR_SHARE = 0.3
+"""Weight of intensity residuals relative to the camera's registration: shading changes on a rotating object."""
+MAX_POINTS = 2000
+"""Most surface points of an object that the check for being seen through uses."""
+
+
+class ObjectFusion:
+    """Shape and trajectory of the moving objects of a sequence.
+
+    Args:
+        config: All parameters; those of tracker, sensor, preprocessing, volume and movers are used.
+    """
+
+    def __init__(self, config: Config) -> None:
+        self.config = config
+        tracker = config.tracker.model_copy(
+            update={
+                "iterations": (8, 8, 6),
+                "damping": 1e-4,
+                "exposure": False,
+                "min_inliers": 0.1,
+                "min_condition": 1e-6,
+                "min_information": 0.0,
+                "color_weight": COLOR_SHARE * config.tracker.color_weight,
+            }
+        )
+        self.tracker = Tracker(tracker, config.sensor, config.preprocess.smoothing_px)
+        self._volume_config = config.volume.model_copy(update={"voxel_size": config.movers.mesh_voxel_size})
+        self._rng = np.random.default_rng(0)
+        self._tracks: dict[int, ObjectTrack] = {}
+        self._closed: set[int] = set()
+        self._results: list[tuple[RigidObject, dict[float, NDArray[np.float64]]]] = []
+
+    def objects(self, poses: dict[float, NDArray[np.float64]]) -> list[RigidObject]:
+        """All objects so far, by number.
+
+        Args:
+            poses: Poses T_world_camera (4, 4) by time, from which the trajectories of the objects follow.
+        """
+        out = []
+        for result, Ts in self._results + [track.result() for track in self._tracks.values()]:
+            if result.mesh is not None:
+                known = [(t, poses[t] @ T) for t, T in Ts.items() if t in poses]
+                result = replace(result, trajectory=Trajectory.from_poses(known))
+            out.append(result)
+        return sorted(out, key=lambda result: result.id)
+
+    def update(
+        self,
+        observation: Observation,
+        movers: Sequence[Mover],
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float],
+    ) -> list[Mover]:
+        """Register and fuse the objects of a tracked frame.
+
+        Args:
+            observation: The frame.
+            movers: Its moving objects.
+            level: The image that their masks belong to.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset of the frame.
+
+        Returns:
+            The objects; those with a map have the velocity of its centre. That differs from the velocity of the visible
+            surface: of a rolling ball only the upper half may be in view, which is faster than the ball.
+        """
+        now = observation.timestamp
+        for id, track in list(self._tracks.items()):
+            if now - track.last_seen > self.config.movers.memory:
+                self._close(id)
+        for mover in sorted(movers, key=lambda mover: -np.count_nonzero(mover.mask)):
+            track = self._tracks.get(mover.id)
+            if mover.id in self._closed or (track is None and len(self._tracks) >= MAX_OBJECTS):
+                continue
+            view = crop_object(observation, mover, level, exposure)
+            if view is None:
+                continue
+            if track is None:
+                self._start(mover, view, now, T_world_camera)
+                continue
+            self._register_and_fuse(track, mover, view, observation, T_world_camera)
+            misfit = track.misfits[0] if track.misfits else ""
+            young = len(track.Ts_camera_object) < YOUNG_FRAMES and len(track.restarts) < MAX_RESTARTS
+            if young and (misfit or view.area > GROWN * track.area):
+                self._start(mover, view, now, T_world_camera, (*track.restarts, misfit))
+            elif track.rejection_reason(final=False):
+                self._close(mover.id)
+        return [self._with_velocity(mover, now) for mover in movers]
+
+    def _with_velocity(self, mover: Mover, now: float) -> Mover:
+        """Object with the slope of a line through the recent positions of the centre of its map as its velocity."""
+        track = self._tracks.get(mover.id)
+        if track is None or len(track.Ts_camera_object) < YOUNG_FRAMES:
+            return mover
+        if track.last_seen != now or len(track.recent_poses) < 3:
+            return mover
+        centre = np.append((track.points.min(axis=0) + track.points.max(axis=0)) / 2, 1.0)
+        positions = np.array([T[:3] @ centre for _, T in track.recent_poses])
+        times = np.array([time for time, _ in track.recent_poses])
+        times = times - times.mean()
+        return replace(mover, velocity=times @ positions / np.sum(times**2))
+
+    def _close(self, id: int) -> None:
+        """End the tracking of an object for good; its mesh is kept if it is rigid."""
+        result, Ts = self._tracks.pop(id).result()
+        self._closed.add(id)
+        if result.rigid and sum(other.rigid for other, _ in self._results) >= MAX_MESHES:
+            result = RigidObject(id, False, f"{MAX_MESHES} meshes are kept already", result.frames)
+        self._results.append((result, Ts if result.rigid else {}))
+
+    def _start(
+        self,
+        mover: Mover,
+        view: ObjectView,
+        now: float,
+        T_world_camera: NDArray[np.float64],
+        restarts: tuple[str, ...] = (),
+    ) -> None:
+        """Start a map with one frame; the object's origin is the centroid of its visible side."""
+        T = np.eye(4)
+        T[:3, 3] = mover.centroid
+        volume = ObjectVolume(
+            view.levels[-1].camera, self._volume_config, self.config.sensor, self.config.preprocess.depth_max
+        )
+        track = ObjectTrack(mover.id, volume, view.area, T, T.copy(), now, now, restarts=restarts)
+        track.velocity[:3] = mover.velocity
+        self._tracks[mover.id] = track
+        self._fuse(track, view, se3.inverse(T) @ T_world_camera, now)
+
+    def _register_and_fuse(
+        self,
+        track: ObjectTrack,
+        mover: Mover,
+        view: ObjectView,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+    ) -> None:
+        """Register a frame to the object's map; fuse it if it is consistent with the map."""
+        now, duration = observation.timestamp, observation.timestamp - track.last_seen
+        still = np.zeros(3)
+        velocities = (
+            track.velocity,
+            np.concatenate([mover.velocity, still]),
+            np.concatenate([track.velocity[:3], still]),
+        )
+        predictions = [_predicted(track.T_world_object, velocity, duration) for velocity in velocities]
+        result = self._align(track.volume, view, [se3.inverse(T) @ T_world_camera for T in predictions])
+        T_object_camera = result.T_world_camera
+        track.last_seen = now
+        if not result.converged:
+            track.misfits.append(result.reason)
+            track.velocity = np.concatenate([mover.velocity, np.zeros(3)])
+            track.T_world_object = predictions[1]
+            track.checks.append((np.nan, np.nan))
+            return
+        seen_through = self._seen_through_share(track, observation, T_object_camera)
+        off_surface = self._off_surface_share(track, view, T_object_camera)
+        track.checks.append((seen_through, off_surface))
+        T = T_world_camera @ se3.inverse(T_object_camera)
+        rotation = (T @ se3.inverse(track.T_world_object))[:3, :3]
+        translation = T[:3, 3] - track.T_world_object[:3, 3]
+        track.velocity = np.concatenate([translation, se3.log_rotation(rotation)]) / duration
+        track.T_world_object = T
+        window = self.config.movers.velocity_window
+        track.recent_poses = [pose for pose in track.recent_poses if now - pose[0] < window] + [(now, T)]
+        if seen_through > MAX_SEEN_THROUGH:
+            track.misfits.append(f"{seen_through:.0%} of its surface is seen through")
+        elif off_surface > MAX_OFF_SURFACE:
+            track.misfits.append(f"{off_surface:.0%} of its surface does not fit")
+        if seen_through <= 2 * MAX_SEEN_THROUGH and off_surface <= MAX_OFF_SURFACE:
+            self._fuse(track, view, T_object_camera, now)
+
+    def _align(self, volume: ObjectVolume, view: ObjectView, guesses: list[NDArray[np.float64]]) -> TrackingResult:
+        """Pose T_object_camera by registration, started from the guess of the lowest cost.
+
+        A reading that is off the map at that guess shows a side of the object not seen before and gets weight 0. In the
+        camera's registration such a reading has a cost, which here would pull the object back towards its known side.
+        """
+        volume.look_at(guesses[0])
+        systems = [self.tracker.linearize(volume, view.levels[0], T, view.weights[0]) for T in guesses]
+        T = guesses[int(np.argmin([system.cost for system in systems]))]
+        weights = []
+        for level, weight in zip(view.levels, view.weights, strict=True):
+            sample = volume.sample(level.depth, level.intensity, level.camera, T)
+            weights.append(weight * np.isfinite(sample.distance).astype(np.float32))
+        return self.tracker.align(volume, view.levels, T, weights, first_level=3 - len(view.levels))
+
+    def _fuse(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64], now: float) -> None:
+        """Integrate a frame into the object's map, and update the sample of its surface and its displacement."""
+        level, mask = view.levels[-1], view.mask
+        track.volume.camera = level.camera
+        track.volume.integrate(Frame(now, level.depth, view.color), T_object_camera, mask)
+        track.Ts_camera_object[now] = se3.inverse(T_object_camera)
+        flat = np.flatnonzero(mask)
+        flat = self._rng.choice(flat, min(len(flat), MAX_POINTS // 10), replace=False)
+        v, u = np.divmod(flat, mask.shape[1])
+        points = level.camera.points(u, v, level.depth.reshape(-1)[flat])
+        points = (points @ T_object_camera[:3, :3].T + T_object_camera[:3, 3]).astype(np.float32)
+        kept = track.points
+        if len(kept) + len(points) > MAX_POINTS:  # a random sample of everything fused so far
+            kept = kept[self._rng.permutation(len(kept))[: MAX_POINTS - len(points)]]
+        track.points = np.concatenate([kept, points])
+        sample = track.points[:: max(1, len(track.points) // 50)].astype(np.float64)
+        change = track.T_world_object[:3] - track.T_first[:3]
+        displacement = float(np.median(np.linalg.norm(sample @ change[:, :3].T + change[:, 3], axis=1)))
+        track.max_displacement = max(track.max_displacement, displacement)
+
+    def _seen_through_share(
+        self, track: ObjectTrack, observation: Observation, T_object_camera: NDArray[np.float64]
+    ) -> float:
+        """Share of the object's fused surface, where it is not occluded, that the readings lie behind."""
+        T, camera = se3.inverse(T_object_camera), observation.camera
+        points = track.points @ T[:3, :3].T + T[:3, 3]
+        pixels, z = np.rint(camera.project(points)), points[:, 2]
+        inside = (z > 0.1) & (pixels >= 3).all(axis=1) & (pixels < [camera.width - 3, camera.height - 3]).all(axis=1)
+        u, v = pixels[inside].astype(np.int64).T
+        z = z[inside]
+        around = np.stack([observation.depth[v + dv, u + du] for du, dv in ((0, 0), (3, 0), (-3, 0), (0, 3), (0, -3))])
+        around = np.where(around > 0, around, np.inf)
+        nearest = around.min(axis=0)
+        margin = np.float32(0.03) + 3 * self.config.sensor.sigma(z)
+        read = np.isfinite(around[0])
+        seen_through = read & (nearest > z + margin)
+        seen = read & (np.abs(around - z).min(axis=0) <= margin)
+        return float(np.count_nonzero(seen_through) / max(np.count_nonzero(seen_through | seen), 1))
+
+    def _off_surface_share(self, track: ObjectTrack, view: ObjectView, T_object_camera: NDArray[np.float64]) -> float:
+        """Share of the object's readings within the band of its map that lie off its surface."""
+        level = view.levels[-1]
+        sample = track.volume.sample(level.depth, level.intensity, level.camera, T_object_camera)
+        known = view.mask & np.isfinite(sample.distance)
+        sigma = self.config.sensor.sigma(level.depth[known])
+        off = np.abs(sample.distance[known]) > 0.005 + 1.5 * sigma
+        return float(np.count_nonzero(off) / max(np.count_nonzero(known), 1))
+
+
+def _predicted(
+    T_world_object: NDArray[np.float64], velocity: NDArray[np.float64], duration: float
+) -> NDArray[np.float64]:
+    """Pose after some seconds at a velocity (6,) of the origin and of the rotation, world axes."""
+    T = T_world_object.copy()
+    T[:3, 3] += velocity[:3] * duration
+    T[:3, :3] = se3.exp(np.concatenate([np.zeros(3), velocity[3:] * duration]))[:3, :3] @ T[:3, :3]
+    return T

@@ -1,0 +1,156 @@
+"""Map and poses of one moving object while it is tracked, and the test whether they prove it rigid."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import SensorConfig, VolumeConfig
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+
+EXTENT = 1.0
+"""The window of an object's map is that of a camera with readings up to this, metres: a cube of about 2.5 m."""
+MIN_FRAMES = 10
+"""Fewest registered frames that prove an object rigid."""
+MIN_DURATION = 0.5
+"""Shortest time that proves an object rigid, seconds."""
+MAX_MISFITS = 0.3
+"""Largest share of registered frames that may contradict the map of a rigid object."""
+MIN_DISPLACEMENT = 0.03
+"""Smallest displacement of a moving object, metres."""
+MIN_COMPONENT = 0.05
+"""Connected components of a mesh with a smaller share of the largest one's vertices than this are removed."""
+
+
+@dataclass(frozen=True, eq=False)
+class RigidObject:
+    """Outcome of fusing a moving object: its model if it is rigid, else the reason why there is none.
+
+    Attributes:
+        id: Number of the object.
+        rigid: Whether it is one rigid object that has moved.
+        reason: Why it is not, empty if it is.
+        frames: Frames that were fused.
+        mesh: Its shape, metres, object frame: the origin is the centre of the mesh's box, the axes are the world's at
+            first sight. None if it is not rigid.
+        trajectory: Its poses T_world_object, given the current estimate of the camera's poses; None if it is not rigid.
+    """
+
+    id: int
+    rigid: bool
+    reason: str
+    frames: int
+    mesh: Mesh | None = None
+    trajectory: Trajectory | None = None
+
+
+class ObjectVolume(TsdfVolume):
+    """Map of an object: its window stays around the object's origin wherever the camera is.
+
+    Args:
+        camera: Any; ``camera`` is set to that of each image.
+        config: Voxel size, truncation, weights; an object's map is not carved.
+        sensor: Noise of the depth readings.
+        depth_max: Farthest reading, metres.
+    """
+
+    def __init__(self, camera: Camera, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> None:
+        super().__init__(camera, config.model_copy(update={"carving": False}), sensor, depth_max, extent=EXTENT)
+        self._T_object_window = np.eye(4)
+        self._T_object_window[2, 3] = -self._reach
+
+    def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
+        """Place the window around the origin; the camera's pose has no influence."""
+        del T_world_camera
+        super().look_at(self._T_object_window)
+
+
+@dataclass(eq=False)
+class ObjectTrack:
+    """State of an object that is being registered and fused.
+
+    Attributes:
+        id: Number of the object.
+        volume: Its map.
+        area: Visible surface when the map was started, square metres.
+        T_world_object: (4, 4) its current pose.
+        T_first: (4, 4) its pose when the map was started.
+        first_seen, last_seen: Seconds.
+        velocity: (6,) of the origin and of the rotation, m/s and rad/s, world axes.
+        Ts_camera_object: Poses (4, 4) of the frames that were fused, by time.
+        points: (n, 3) float32, a sample of the fused surface, object frame, metres.
+        misfits: Reason for each frame that contradicted the map.
+        checks: Per registered frame, the shares of the surface seen through and of the readings off the surface; NaN
+            where the registration failed.
+        max_displacement: Largest displacement of its surface since the map was started, metres.
+        recent_poses: Times and poses T_world_object of the last ``velocity_window`` seconds.
+        restarts: For each restart of the map the misfit that caused it; empty if a larger view did.
+    """
+
+    id: int
+    volume: ObjectVolume
+    area: float
+    T_world_object: NDArray[np.float64]
+    T_first: NDArray[np.float64]
+    first_seen: float
+    last_seen: float
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(6))
+    Ts_camera_object: dict[float, NDArray[np.float64]] = field(default_factory=dict)
+    points: NDArray[np.float32] = field(default_factory=lambda: np.empty((0, 3), np.float32))
+    misfits: list[str] = field(default_factory=list)
+    checks: list[tuple[float, float]] = field(default_factory=list)
+    max_displacement: float = 0.0
+    recent_poses: list[tuple[float, NDArray[np.float64]]] = field(default_factory=list)
+    restarts: tuple[str, ...] = ()
+
+    def rejection_reason(self, *, final: bool = True) -> str:
+        """Why the object is not proven to be rigid; empty if it is.
+
+        Args:
+            final: Whether no more frames will come. Before that, only evidence against a rigid object is a reason.
+        """
+        frames, contradicting = len(self.checks), len(self.misfits)
+        if frames >= MIN_FRAMES and contradicting > MAX_MISFITS * frames:
+            return f"not rigid: {contradicting} of {frames} frames do not fit, the last: {self.misfits[-1]}"
+        if not final:
+            return ""
+        duration = self.last_seen - self.first_seen
+        if len(self.Ts_camera_object) < MIN_FRAMES or duration < MIN_DURATION:
+            misfits = [reason for reason in self.restarts if reason]
+            if len(misfits) >= MIN_FRAMES // 2:
+                return f"not rigid: {len(misfits)} maps were contradicted by the next frames, the last: {misfits[-1]}"
+            return f"seen too short: {len(self.Ts_camera_object)} frames in {duration:.1f} s"
+        if self.max_displacement < MIN_DISPLACEMENT:
+            return f"moved by {100 * self.max_displacement:.1f} cm only"
+        return ""
+
+    def result(self) -> tuple[RigidObject, dict[float, NDArray[np.float64]]]:
+        """Outcome for the object, and its poses T_camera_object by time; no poses if it is not rigid."""
+        reason, frames = self.rejection_reason(), len(self.Ts_camera_object)
+        if reason:
+            return RigidObject(self.id, False, reason, frames), {}
+        mesh = _main_components(self.volume.extract_mesh())
+        centre = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+        T = np.eye(4)
+        T[:3, 3] = centre
+        mesh = replace(mesh, vertices=mesh.vertices - centre)
+        return RigidObject(self.id, True, "", frames, mesh), {t: pose @ T for t, pose in self.Ts_camera_object.items()}
+
+
+def _main_components(mesh: Mesh) -> Mesh:
+    """Mesh without connected components much smaller than the largest, which stem from readings beside the object."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    a, b, c = mesh.faces.T
+    ends = np.concatenate([a, b]), np.concatenate([b, c])
+    size = len(mesh.vertices)
+    _, component = connected_components(coo_array((np.ones(len(ends[0]), np.int8), ends), shape=(size, size)), False)
+    counts = np.bincount(component)
+    kept = (counts >= MIN_COMPONENT * counts.max())[component]
+    number = np.cumsum(kept) - 1
+    faces = number[mesh.faces[kept[a]]].astype(np.int32)
+    return Mesh(mesh.vertices[kept], faces, mesh.colors[kept], mesh.normals[kept])

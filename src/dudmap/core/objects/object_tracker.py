@@ -1,0 +1,302 @@
+"""Moving objects with a lasting identity, position, extent and velocity (thesis section 7.1).
+
+There is no classifier: an object is a set of pixels labelled as moving that is connected in space. Its estimates never
+influence the camera's pose or the map.
+"""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import MoversConfig
+from dudmap.core.backends.median import median
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.optical_flow import grey
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.objects.regions import (
+    MIN_SHARE,
+    MovingPixels,
+    Region,
+    boxes_overlap,
+    connected_regions,
+    is_fully_visible,
+    split_between,
+    trimmed_box,
+)
+from dudmap.core.objects.scene_flow import InstanceFrame, displacements
+
+OUTLIER_SPEED = 0.7
+"""A displacement whose velocity differs from the median of its neighbours by more than this is a change of the mask,
+m/s."""
+ESTABLISHED = 0.5
+"""Objects that were separate for this long stay separate when they touch, seconds."""
+
+
+@dataclass(frozen=True, eq=False)
+class Mover:
+    """One moving object in one frame.
+
+    Attributes:
+        id: Number from 1 on, the same for as long as the object is tracked.
+        mask: (h, w) bool, at the resolution of the labels.
+        points: (N, 3) float32, metres, world frame, of the pixels in the mask that have a reading.
+        centroid: (3,) metres, world frame, mean of the points: of the visible side, not of the object.
+        box: (2, 3) metres, world frame, smallest and largest coordinates, without the outermost 1 % of the points.
+        velocity: (3,) m/s, world frame; 0 until the object has been seen twice.
+        age: Seconds since it was first seen.
+    """
+
+    id: int
+    mask: NDArray[np.bool_]
+    points: NDArray[np.float32]
+    centroid: NDArray[np.float64]
+    box: NDArray[np.float64]
+    velocity: NDArray[np.float64]
+    age: float
+
+    @property
+    def speed(self) -> float:
+        """Length of the velocity, m/s."""
+        return float(np.linalg.norm(self.velocity))
+
+
+@dataclass(frozen=True, eq=False)
+class _Measurement:
+    """Measurement of an object's motion in one frame.
+
+    Attributes:
+        time: Seconds.
+        duration: Seconds since the object was last seen.
+        displacement: (3,) metres since then, by optical flow; None if unknown.
+        positions: (2, 3) metres: centroid, and centre of the box.
+        fully_visible: Whether nothing cuts the object off.
+    """
+
+    time: float
+    duration: float
+    displacement: NDArray[np.float64] | None
+    positions: NDArray[np.float64]
+    fully_visible: bool
+
+
+@dataclass(eq=False)
+class _Track:
+    """State of an object over time; times in seconds, centroid and box (m) as last seen, area in square metres."""
+
+    id: int
+    first_seen: float
+    last_seen: float
+    centroid: NDArray[np.float64]
+    box: NDArray[np.float64]
+    area: float = 0.0
+    velocity: NDArray[np.float64] = field(default_factory=lambda: np.zeros(3))
+    measurements: list[_Measurement] = field(default_factory=list)
+
+
+class ObjectTracker:
+    """Segments the moving pixels of each frame into objects and associates these with those of earlier frames.
+
+    The moving pixels of the last frame, displaced by the velocities of their objects, predict the object in each pixel.
+    Where two objects that were separate touch, the connected region is split between them by the nearest predicted
+    pixel.
+
+    The velocity of an object is estimated over the last ``velocity_window`` seconds. While the object is fully visible,
+    it is the slope of a line through its positions: the visible surface of a rolling ball is faster than the ball. The
+    position of an object that is cut off by the image border or by an occluder is unknown; there it is the mean of its
+    displacements from frame to frame without outliers, each the median over the object's pixels, matched by
+    forward-backward optical flow (Lucas and Kanade 1981).
+
+    Args:
+        config: Sizes and times.
+    """
+
+    def __init__(self, config: MoversConfig) -> None:
+        self.config = config
+        self._tracks: list[_Track] = []
+        self._last: InstanceFrame | None = None
+        self._next_id = 1
+
+    def update(
+        self, timestamp: float, dynamic: NDArray[np.bool_], level: Level, T_world_camera: NDArray[np.float64]
+    ) -> list[Mover]:
+        """Moving objects of a tracked frame, by number.
+
+        Args:
+            timestamp: Seconds.
+            dynamic: (h, w) bool, moving pixels.
+            level: The image they were found in.
+            T_world_camera: (4, 4).
+        """
+        self._tracks = [track for track in self._tracks if timestamp - track.last_seen <= self.config.memory]
+        predicted_ids = self._predicted_ids(timestamp, level.camera, T_world_camera)
+        pixels = connected_regions(dynamic, level, T_world_camera, predicted_ids)
+        objects = [] if pixels is None else self._segment(pixels)
+        if pixels is None or not objects:
+            self._last = None
+            return []
+        boxes = [trimmed_box(pixels.points[indices]) for indices in objects]
+        centroids = [pixels.points[indices].mean(axis=0, dtype=np.float64) for indices in objects]
+        tracks = self._associate(timestamp, objects, centroids, boxes, pixels.predicted_id)
+        frame = _instance_frame(timestamp, level, pixels, objects, tracks)
+        known_displacements: dict[int, NDArray[np.float64]] = {}
+        if self._last is not None and self._last.ids.shape == frame.ids.shape:
+            known = [track.id for track in self._tracks if track.last_seen == self._last.timestamp]
+            known_displacements = displacements(self._last, frame, known, self.config.max_jump)
+        movers = []
+        for indices, track, centroid, box in zip(objects, tracks, centroids, boxes, strict=True):
+            mask = frame.ids == track.id
+            measurement = _Measurement(
+                timestamp,
+                timestamp - track.last_seen,
+                known_displacements.get(track.id),
+                np.stack([centroid, box.mean(axis=0)]),
+                is_fully_visible(mask, level.depth),
+            )
+            self._update_velocity(track, measurement)
+            track.centroid, track.box, track.last_seen = centroid, box, timestamp
+            track.area = float(pixels.area[indices].sum())
+            age = timestamp - track.first_seen
+            movers.append(Mover(track.id, mask, frame.points[mask], centroid, box, track.velocity.copy(), age))
+        self._last = frame
+        return sorted(movers, key=lambda mover: mover.id)
+
+    def _predicted_ids(
+        self, timestamp: float, camera: Camera, T_world_camera: NDArray[np.float64]
+    ) -> NDArray[np.int32]:
+        """Object predicted in each 2x2 pixels at constant velocity: ((h + 1) // 2, (w + 1) // 2), 0 = none."""
+        h, w = (camera.height + 1) // 2, (camera.width + 1) // 2
+        out = np.zeros((h, w), dtype=np.int32)
+        last = self._last
+        if last is None or last.ids.shape != camera.shape:
+            return out
+        number = last.ids[::2, ::2]
+        occupied = number > 0
+        number = number[occupied]
+        shift = np.zeros((self._next_id, 3), dtype=np.float32)
+        for track in self._tracks:
+            shift[track.id] = track.velocity * (timestamp - last.timestamp)
+        T = se3.inverse(T_world_camera).astype(np.float32)
+        points = (last.points[::2, ::2][occupied] + shift[number]) @ T[:3, :3].T + T[:3, 3]
+        order = np.argsort(-points[:, 2])  # the nearest point is written last
+        order = order[: np.count_nonzero(points[:, 2] > 0)]
+        number = number[order]
+        u, v = ((camera.project(points[order]) + 0.5) / 2).astype(np.int64).T
+        inside = (u >= 0) & (v >= 0) & (u < w) & (v < h)
+        out[v[inside], u[inside]] = number[inside]
+        return out
+
+    def _segment(self, pixels: MovingPixels) -> list[NDArray[np.int64]]:
+        """Pixels (k,) of each object: regions are split where two objects touch, fragments are joined to objects."""
+        regions = [
+            Region.of(pixels, indices)
+            for start, stop in pixels.ranges
+            for indices in self._split(np.arange(start, stop), pixels)
+        ]
+        regions.sort(key=lambda region: -region.area)
+        groups: list[list[Region]] = []
+        for region in regions:
+            same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
+            fitting = next((group for group in same + groups if self._is_fragment(region, group)), None)
+            groups.append([region]) if fitting is None else fitting.append(region)
+        return [
+            np.concatenate([region.indices for region in group])
+            for group in groups
+            if sum(region.area for region in group) >= self.config.min_area
+        ]
+
+    def _split(self, indices: NDArray[np.int64], pixels: MovingPixels) -> list[NDArray[np.int64]]:
+        """A region, split between the established objects that are predicted in it if there are several."""
+        predicted = pixels.predicted_id[indices]
+        counts = np.bincount(predicted)
+        ids = [
+            track.id
+            for track in self._tracks
+            if track.id < len(counts)
+            and counts[track.id] >= MIN_SHARE * pixels.shape[0] * pixels.shape[1]
+            and self._is_established(track, float(pixels.area[indices[predicted == track.id]].sum()))
+        ]
+        return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)
+
+    def _is_fragment(self, region: Region, group: list[Region]) -> bool:
+        """Whether a region belongs to an object: close to it, and predicted to be the same or much smaller."""
+        if region.predicted_id == 0 or region.predicted_id != group[0].predicted_id:
+            other = next((track for track in self._tracks if track.id == region.predicted_id), None)
+            if region.area >= 0.5 * sum(part.area for part in group):
+                return False
+            if other and self._is_established(other, region.area):
+                return False
+        return any(region.is_near(part, self.config.merge_distance) for part in group)
+
+    def _is_established(self, track: _Track, area: float) -> bool:
+        """Whether an object has been seen for some time and a visible surface (m^2) is a substantial part of it."""
+        known = track.last_seen - track.first_seen >= ESTABLISHED and track.area >= 2 * self.config.min_area
+        return known and area >= 0.3 * track.area
+
+    def _associate(
+        self,
+        timestamp: float,
+        objects: list[NDArray[np.int64]],
+        centroids: list[NDArray[np.float64]],
+        boxes: list[NDArray[np.float64]],
+        predicted_id: NDArray[np.int32],
+    ) -> list[_Track]:
+        """Track of each object, greedily by increasing cost: distance from the prediction - max_jump * shared pixels.
+
+        Only pairs are considered that share more than 0.3 of the pixels, lie closer than ``max_jump`` or have
+        overlapping boxes. An object without a track begins a new one.
+        """
+        candidates = []
+        for i, (indices, centroid, box) in enumerate(zip(objects, centroids, boxes, strict=True)):
+            counts = np.bincount(predicted_id[indices], minlength=self._next_id)
+            for j, track in enumerate(self._tracks):
+                shift = track.velocity * (timestamp - track.last_seen)
+                distance = float(np.linalg.norm(track.centroid + shift - centroid))
+                shared = counts[track.id] / len(indices)
+                if shared > 0.3 or distance < self.config.max_jump or boxes_overlap(track.box + shift, box):
+                    candidates.append((distance - self.config.max_jump * shared, i, j))
+        tracks: dict[int, _Track] = {}
+        assigned: set[int] = set()
+        for _, i, j in sorted(candidates):
+            if i not in tracks and j not in assigned:
+                tracks[i] = self._tracks[j]
+                assigned.add(j)
+        for i in range(len(objects)):
+            if i not in tracks:
+                tracks[i] = _Track(self._next_id, timestamp, timestamp, centroids[i], boxes[i])
+                self._tracks.append(tracks[i])
+                self._next_id += 1
+        return [tracks[i] for i in range(len(objects))]
+
+    def _update_velocity(self, track: _Track, measurement: _Measurement) -> None:
+        """Velocity of an object: median of the estimates from displacements and from the slopes of its positions."""
+        recent = [m for m in track.measurements if measurement.time - m.time < self.config.velocity_window]
+        track.measurements = [*recent, measurement]
+        estimates = []
+        velocities = np.array(
+            [m.displacement / m.duration for m in track.measurements if m.displacement is not None and m.duration > 0]
+        )
+        if len(velocities):
+            deviation = np.linalg.norm(velocities - median(velocities), axis=1)
+            estimates.append(velocities[deviation <= max(OUTLIER_SPEED, float(np.median(deviation)))].mean(axis=0))
+        usable = [m for m in track.measurements if m.fully_visible] if velocities.size else track.measurements
+        if len(usable) >= 2 and (measurement.fully_visible or not velocities.size):
+            times = np.array([m.time for m in usable])
+            times = times - times.mean()
+            positions = np.stack([m.positions for m in usable])
+            estimates += list(np.einsum("t,tij->ij", times, positions) / np.sum(times**2))
+        if estimates:
+            track.velocity = median(np.array(estimates))
+
+
+def _instance_frame(
+    timestamp: float, level: Level, pixels: MovingPixels, objects: list[NDArray[np.int64]], tracks: list[_Track]
+) -> InstanceFrame:
+    """Images of the numbers and points of the moving objects of a frame."""
+    ids = np.zeros(pixels.shape, dtype=np.int32)
+    points = np.zeros((*pixels.shape, 3), dtype=np.float32)
+    points.reshape(-1, 3)[pixels.flat] = pixels.points
+    for indices, track in zip(objects, tracks, strict=True):
+        ids.reshape(-1)[pixels.flat[indices]] = track.id
+    return InstanceFrame(timestamp, grey(level), ids, points)

@@ -1,0 +1,322 @@
+"""Atlas: submaps, each with a world frame of its own, their keyframes, stored frames and trajectories.
+
+Submaps are joined when one is recognised from another: Elvira, Tardos and Montiel, ORBSLAM-Atlas (2019).
+"""
+
+from bisect import bisect_left
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.exposure import exposed_color
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.stream_check import Repeats
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
+from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
+
+
+@dataclass(eq=False)
+class TimedPose:
+    """Pose (4, 4) of a frame in the world of a submap; timestamp in seconds.
+
+    ``repeats`` is empty for a tracked frame, ``depth`` for one whose pose is predicted, since its depth image repeats,
+    and ``frame`` for one with the pose of the frame that it repeats, or interpolated between tracked frames.
+    """
+
+    timestamp: float
+    T_world_camera: NDArray[np.float64]
+    submap: int
+    repeats: Repeats = ""
+
+
+class Atlas:
+    """The submaps and everything whose pose changes when a submap is corrected or joined with another.
+
+    Args:
+        make_volume: Creates an empty map.
+        keyframes: Keyframes of all submaps.
+        history: Stored frames, from which maps are rebuilt; None if neither loops nor submaps are enabled.
+        number: Number of the first submap.
+
+    Attributes:
+        volumes: Maps by the numbers of their submaps; while one is rebuilt, its provisional map.
+        rebuildings: The new maps that are not complete yet, by the numbers of their submaps.
+        current: Number of the submap that is tracked.
+        poses: Poses of all tracked frames, in order of time.
+        saved: Number of the submap that began as a saved map, None if there is none. Its world frame is kept: other
+            submaps are joined with it, and no loop closure changes it, since not all its frames are stored.
+    """
+
+    def __init__(
+        self,
+        make_volume: Callable[[], TsdfVolume],
+        keyframes: KeyframeDatabase,
+        history: FrameStore | None,
+        number: int = 0,
+    ) -> None:
+        self.make_volume = make_volume
+        self.keyframes = keyframes
+        self.history = history
+        self.volumes = {number: make_volume()}
+        self.rebuildings: dict[int, MapRebuilding] = {}
+        self.current = number
+        self.poses: list[TimedPose] = []
+        self.saved: int | None = None
+
+    def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
+        """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera.
+
+        Args:
+            saved: The map.
+            camera: The camera.
+            max_blocks: As of ``TsdfVolume``.
+        """
+        self.saved = self.current
+        self.volumes[self.current] = saved.volume.for_camera(camera, self.volume.backend, max_blocks)
+        self.keyframes.keyframes += [replace(keyframe, submap=self.current) for keyframe in saved.keyframes]
+
+    @property
+    def volume(self) -> TsdfVolume:
+        """The map of the current submap."""
+        return self.volumes[self.current]
+
+    def integrate(
+        self,
+        frame: Frame,
+        static_mask: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        exposure: tuple[float, float] = (1.0, 0.0),
+        recorded: Frame | None = None,
+    ) -> None:
+        """Fuse the static pixels of a frame into the current map, and keep the frame for later corrections.
+
+        Args:
+            frame: Depth and registered colour.
+            static_mask: (H, W) bool.
+            T_world_camera: (4, 4).
+            exposure: Gain and offset to the colours of the map.
+            recorded: The frame with its colour as it was recorded, which is kept; None for the same.
+        """
+        color = exposed_color(frame.color, exposure)
+        self.volume.integrate(replace(frame, color=color), T_world_camera, static_mask)
+        if self.history is not None:
+            self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
+
+    def recolor(self) -> None:
+        """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
+
+        A saved map keeps its colours: not all its frames are stored.
+        """
+        assert self.history is not None
+        self.complete()
+        for number, volume in self.volumes.items():
+            if number == self.saved:
+                continue
+            painted = self.make_volume()
+            self.history.reintegrate(painted, self.nodes(number))
+            volume.take_colors(painted)
+        self.switch_to(self.current)
+
+    def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
+        """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
+        number = min(bisect_left(self.poses, timestamp, key=lambda pose: pose.timestamp), len(self.poses) - 1)
+        near = [
+            pose
+            for pose in self.poses[max(number - 1, 0) : number + 2]
+            if abs(pose.timestamp - timestamp) <= VELOCITY_LIFETIME
+            and pose.submap == self.poses[number].submap
+            and (not pose.repeats or pose.timestamp == timestamp)
+        ]
+        if len(near) < 2:
+            return np.zeros(6)
+        motion = se3.log(se3.inverse(near[0].T_world_camera) @ near[-1].T_world_camera)
+        return motion / (near[-1].timestamp - near[0].timestamp)
+
+    def as_saved_map(self) -> SavedMap:
+        """The main map and its keyframes; how well frames fit it is left to the caller."""
+        self.complete()
+        main = self.by_size()[0]
+        return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
+
+    def clear_map(self) -> None:
+        """Empty the current map, which is the newest, and forget the frames stored of it."""
+        self.volume.clear()
+        while self.history is not None and self.history.submaps and self.history.submaps[-1] == self.current:
+            self.history.drop_last()
+
+    def add_pose(self, timestamp: float, T_world_camera: NDArray[np.float64], repeats: Repeats = "") -> None:
+        """Append the pose (4, 4) of a frame in the current submap; poses that were predicted since the last tracked
+        frame are interpolated between that and this one."""
+        new = TimedPose(timestamp, T_world_camera, self.current, repeats)
+        first = len(self.poses)
+        while repeats != "depth" and first and self.poses[first - 1].repeats == "depth":
+            first -= 1
+        if 0 < first < len(self.poses) and self.poses[first - 1].submap == self.current:
+            ends = self.poses[first - 1], new
+            stamps, Ts = (np.array([getattr(end, name) for end in ends]) for name in ("timestamp", "T_world_camera"))
+            for pose in self.poses[first:]:
+                pose.T_world_camera = se3.interpolate_in_time(stamps, Ts, pose.timestamp)
+                pose.repeats = "frame"
+        self.poses.append(new)
+
+    def start_submap(self) -> None:
+        """Make a new, empty submap the current one."""
+        number = max(self.volumes) + 1
+        self.switch_to(number)
+        self.volumes[number] = self.make_volume()
+
+    def switch_to(self, number: int) -> None:
+        """Make a submap the current one; the maps of the others leave the memory where they may."""
+        self.current = number
+        for other, volume in self.volumes.items():
+            if other != number:
+                volume.page_out()
+
+    def make_room(self) -> None:
+        """Have the current map leave the memory, unless another one of the same view fits beside it."""
+        limit = None if self.volume.pager is None else self.volume.pager.max_blocks
+        if isinstance(limit, MemoryLimit):
+            if limit.limit - resident_bytes() < self.volume.view_bytes:
+                self.volume.page_out()
+
+    def volume_around(self, number: int, T_world_camera: NDArray[np.float64]) -> TsdfVolume:
+        """The map of a submap, which holds what is near to a pose (4, 4) even while it is rebuilt."""
+        if number in self.rebuildings:
+            self.rebuildings[number].show(self.volumes[number], T_world_camera, SHOWN)
+        return self.volumes[number]
+
+    def continue_rebuilding(self) -> None:
+        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames."""
+        if not self.rebuildings:
+            return
+        number = self.current if self.current in self.rebuildings else min(self.rebuildings)
+        rebuilding, shown, last = self.rebuildings[number], 0, self.poses[-1]
+        if last.submap == number:
+            shown = rebuilding.show(self.volumes[number], last.T_world_camera, 1)
+        if rebuilding.fuse(PER_FRAME - shown):
+            self._take(rebuilding)
+
+    def complete(self) -> None:
+        """Complete all maps that are being rebuilt."""
+        for rebuilding in list(self.rebuildings.values()):
+            self.volumes[rebuilding.submap].clear()  # makes room
+            rebuilding.fuse()
+            self._take(rebuilding)
+
+    def _take(self, rebuilding: MapRebuilding) -> None:
+        """Use a complete map."""
+        volume = self.volumes[rebuilding.submap]
+        volume.take_over(rebuilding.volume)
+        del self.rebuildings[rebuilding.submap]
+        if rebuilding.submap != self.current:
+            volume.page_out()
+
+    def by_size(self) -> list[int]:
+        """Numbers of the submaps: the saved one, then those with more tracked frames first."""
+        sizes = {number: sum(pose.submap == number for pose in self.poses) for number in self.volumes}
+        return sorted(self.volumes, key=lambda number: (number != self.saved, -sizes[number]))
+
+    def trajectory(self, submap: int) -> Trajectory:
+        """Trajectory of the frames tracked in a submap."""
+        return Trajectory.from_poses(
+            (pose.timestamp, pose.T_world_camera) for pose in self.poses if pose.submap == submap
+        )
+
+    def nodes(self, submap: int) -> list[int]:
+        """Numbers of the stored frames of a submap, in order of time."""
+        if self.history is None:
+            return []
+        return [n for n, number in enumerate(self.history.submaps) if number == submap]
+
+    def correct(
+        self,
+        nodes: list[int],
+        Ts_new: NDArray[np.float64],
+        volume: TsdfVolume,
+        fused: Sequence[int] | None = None,
+    ) -> NDArray[np.float64]:
+        """Set new poses of the stored frames of the current submap, and replace its map.
+
+        Trajectory and keyframes receive the correction interpolated in time between the stored frames; one that was
+        removed has that of the frame that shows its place now.
+
+        Args:
+            nodes: Numbers of all stored frames of the submap, in order of time.
+            Ts_new: (n, 4, 4) their new poses.
+            volume: The map built from them, or from some of them.
+            fused: Numbers of the latter; the map is used until another one, of all, is complete. None = all.
+
+        Returns:
+            (4, 4) motion of the newest stored frame.
+        """
+        assert self.history is not None
+        stamps, positions = self.history.timeline(nodes)
+        corrections = np.stack(
+            [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
+        )
+        in_time = corrections[positions]
+        for place in (*self.poses, *self.keyframes.keyframes):
+            if place.submap == self.current:
+                place.T_world_camera = se3.interpolate_in_time(stamps, in_time, place.timestamp) @ place.T_world_camera
+        for n, T in zip(nodes, Ts_new, strict=True):
+            self.history.Ts_world_camera[n] = T
+        self.volume.take_over(volume)
+        self.rebuildings.pop(self.current, None)  # of an earlier correction
+        if fused is not None and len(fused) < len(nodes):
+            new = self.make_volume()
+            self.rebuildings[self.current] = MapRebuilding(self.history, self.current, new, [], fused)
+        return corrections[-1]
+
+    def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
+        """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
+        assert self.history is not None
+        moved_nodes, kept_nodes = self.nodes(source), self.nodes(target)
+        for moved in (*self.poses, *self.keyframes.keyframes):
+            if moved.submap == source:
+                moved.T_world_camera = T_target_source @ moved.T_world_camera
+                moved.submap = target
+        for n in moved_nodes:
+            self.history.Ts_world_camera[n] = T_target_source @ self.history.Ts_world_camera[n]
+            self.history.submaps[n] = target
+        del self.volumes[source]
+        self.rebuildings.pop(source, None)
+        if len(moved_nodes) <= AT_ONCE or target == self.saved:  # not all frames of a saved map are stored
+            self.history.reintegrate(self.volumes[target], moved_nodes)
+            if target in self.rebuildings:
+                self.rebuildings[target].add_shown(moved_nodes)
+        else:
+            self._fuse_gradually(target, kept_nodes)
+        self.switch_to(target)
+
+    def _fuse_gradually(self, target: int, kept_nodes: list[int]) -> None:
+        """Add the stored frames of a submap that its map lacks over the frames to come.
+
+        Args:
+            target: Number of the submap.
+            kept_nodes: Numbers of the stored frames that its map, or the one that replaces it, holds or is to hold
+                first.
+        """
+        assert self.history is not None
+        running = self.rebuildings.pop(target, None)
+        if running is None:
+            volume = self.make_volume()
+            volume.take_over(self.volumes[target])
+            volume.page_out()
+            running = MapRebuilding(self.history, target, volume, kept_nodes, [])
+        provisional = self.make_volume()
+        nodes = np.array(self.nodes(target))
+        Ts = np.array([self.history.Ts_world_camera[n] for n in nodes])
+        near = nodes[nearest_views(Ts, self.poses[-1].T_world_camera, AT_ONCE)].tolist()
+        self.history.reintegrate(provisional, near)
+        self.volumes[target].take_over(provisional)
+        self.rebuildings[target] = running.restarted(near)

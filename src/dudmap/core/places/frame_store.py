@@ -1,0 +1,315 @@
+"""Store of fused frames on disk, from which the map is rebuilt with corrected poses or masks."""
+
+import weakref
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.exposure import exposed_color
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.frame_file import FilePlace, FrameFile
+from dudmap.core.places.glimpse import DEPTH_UNIT, Glimpse, depth_steps
+
+JPEG_QUALITY = 95
+MAX_PENDING = 3
+"""Frames that may wait for the encoding thread before ``add`` waits for it."""
+EncodedFrame = tuple[bytes, bytes, bytes]
+"""Depth, colour and mask of a stored frame as files."""
+
+
+@dataclass(frozen=True)
+class StoredFrame:
+    """A frame as it was fused.
+
+    Attributes:
+        frame: Depth in steps of ``DEPTH_UNIT``, and colour (JPEG) with the exposure of the map, registered to the depth
+            with the calibration now in use.
+        static: (H, W) bool, pixels that were fused.
+        T_world_camera: (4, 4).
+        count: Number of fused frames that it represents.
+    """
+
+    frame: Frame
+    static: NDArray[np.bool_]
+    T_world_camera: NDArray[np.float64]
+    count: int
+
+
+class RemovedFrames:
+    """Frames that are no longer stored, in the order of removal.
+
+    Attributes:
+        timestamps: Seconds.
+        serials, heirs: Serials of the frames, and of those that showed their places when they were removed.
+    """
+
+    def __init__(self) -> None:
+        self.timestamps: list[float] = []
+        self.serials: list[int] = []
+        self.heirs: list[int] = []
+
+    def add(self, timestamp: float, serial: int, heir: int) -> None:
+        """Note that a frame is removed."""
+        self.timestamps.append(timestamp)
+        self.serials.append(serial)
+        self.heirs.append(heir)
+
+    def standing_for(self, position: dict[int, int]) -> tuple[list[float], list[int]]:
+        """Times of the removed frames whose places stored frames show now, and the positions of the latter.
+
+        Args:
+            position: Of the stored frames, by serial.
+        """
+        last: dict[int, int] = {}
+        for serial, heir in zip(reversed(self.serials), reversed(self.heirs), strict=True):
+            last[serial] = last.get(heir, heir)  # an heir is removed later than what it stands for, if at all
+        found = [(t, position[last[n]]) for t, n in zip(self.timestamps, self.serials, strict=True)
+                 if last[n] in position]  # fmt: skip
+        return [timestamp for timestamp, _ in found], [number for _, number in found]
+
+
+class FrameStore:
+    """A selection of the fused frames in a temporary file, which the operating system removes.
+
+    A frame is stored if the camera has moved or turned since the last stored frame, or if a number of frames were
+    fused since; other frames increase the count of the stored frame before them. Frames are encoded (16-bit PNG and
+    JPEG, about 0.2 MB at 640x480) in one background thread; memory grows by about 1.5 kB per stored frame. Frames are
+    numbered in the order of time; ``remove`` lowers the numbers of later ones. Not for concurrent calls.
+
+    Args:
+        camera: Camera of the frames.
+        distance: Distance from the last stored frame from which on a frame is stored, metres.
+        angle_deg: Angle to the last stored frame from which on a frame is stored, degrees.
+        gap: Largest count of a stored frame; 1 stores every frame.
+        registered: Registers the colour of a frame that was stored as it was recorded; None for colours that are
+            registered as they are.
+
+    Attributes:
+        timestamps: Of the stored frames, seconds.
+        Ts_world_camera: Their poses (4, 4); updated when the map is corrected.
+        counts: Number of fused frames that each represents.
+        submaps: Numbers of their submaps.
+        serials: Numbers of the stored frames that never change, and are never given again; ascending.
+        links: Standard deviations, metres and radians, of the motion to a stored frame, by its serial, from the one
+            before it in its submap, where frames between them were removed.
+        removed: The frames that were removed, and what stands for each: three numbers a frame, for ever.
+        archived: Returns a frame, by its serial, that is not in the file of this store, but in the database of a
+            continued run.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        distance: float = 0.08,
+        angle_deg: float = 5.0,
+        gap: int = 15,
+        registered: Callable[[Frame], Frame] | None = None,
+    ) -> None:
+        self.camera = camera
+        self.registered = registered
+        self.color_timestamps: list[float | None] = []
+        self.distance, self.angle_deg, self.gap = distance, angle_deg, gap
+        self.timestamps: list[float] = []
+        self.Ts_world_camera: list[NDArray[np.float64]] = []
+        self.counts: list[int] = []
+        self.submaps: list[int] = []
+        self.serials: list[int] = []
+        self.links: dict[int, tuple[float, float]] = {}
+        self.removed = RemovedFrames()
+        self._next_serial = 0
+        self.archived: Callable[[int], EncodedFrame] | None = None
+        self._places: list[FilePlace | None] = []  # None for an archived frame
+        self._glimpses: dict[int, Glimpse] = {}  # by serial; follow from the frames
+        self._file = FrameFile()
+        self._encoder: ThreadPoolExecutor | None = None
+        self._pending: deque[Future[EncodedFrame]] = deque()
+
+    @classmethod
+    def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
+        """The store that a configuration asks for; None if neither loops nor submaps need one."""
+        loops = config.loops
+        if not config.relocalization.enabled or not (loops.enabled or config.submaps.enabled):
+            return None
+        return cls(camera, loops.keep_distance, loops.keep_angle_deg, loops.keep_gap)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def add(
+        self,
+        frame: Frame,
+        static: NDArray[np.bool_],
+        T_world_camera: NDArray[np.float64],
+        submap: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
+    ) -> bool:
+        """Store a fused frame, or increase the count of the last stored one.
+
+        Args:
+            frame: Depth as it was fused, and colour as it was recorded; the arrays must not change afterwards.
+            static: (H, W) bool, pixels that were fused. The others are stored too, for corrected masks.
+            T_world_camera: (4, 4).
+            submap: Number of the submap it was fused into.
+            exposure: Gain and offset to the colours of the map.
+
+        Returns:
+            Whether the frame was stored.
+
+        Raises:
+            MapError: The temporary file cannot be written.
+        """
+        if self.timestamps and self.submaps[-1] == submap and self.counts[-1] < self.gap:
+            if agree(self.Ts_world_camera[-1], T_world_camera, self.distance, self.angle_deg):
+                self.counts[-1] += 1
+                return False
+        if self._encoder is None:
+            self._encoder = ThreadPoolExecutor(1, thread_name_prefix="dudmap-frames")
+            weakref.finalize(self, self._encoder.shutdown, wait=False)
+        self.timestamps.append(frame.timestamp)
+        self.Ts_world_camera.append(T_world_camera.copy())
+        self.counts.append(1)
+        self.submaps.append(submap)
+        self.color_timestamps.append(frame.color_timestamp)
+        self.serials.append(self._next_serial)
+        self._glimpses[self._next_serial] = Glimpse.of(frame.depth, static)
+        self._next_serial += 1
+        self._pending.append(self._encoder.submit(_encoded, frame, static, exposure))
+        self._write(MAX_PENDING)
+        return True
+
+    def drop_last(self) -> None:
+        """Remove the frame stored last, as if it had never been."""
+        self._drop(len(self) - 1)
+
+    def remove(self, number: int, heir: int, link: tuple[float, float]) -> None:
+        """Remove a stored frame that is neither the first nor the last of its submap.
+
+        Args:
+            number: Its number; those of later frames fall by one.
+            heir: Number of the stored frame that shows its place now, and gets its corrections.
+            link: Standard deviations of the motion from the frame before it in its submap to the one after it.
+        """
+        after = self.submaps.index(self.submaps[number], number + 1)
+        self.links[self.serials[after]] = link
+        self.removed.add(self.timestamps[number], self.serials[number], self.serials[heir])
+        self._drop(number)
+
+    def _drop(self, number: int) -> None:
+        if number >= len(self._places):  # it is being encoded
+            self._write(0)
+        place, serial = self._places[number], self.serials[number]
+        if place is not None:
+            self._file.release(place)
+        self.links.pop(serial, None)
+        self._glimpses.pop(serial, None)
+        columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self.serials
+        for column in (*columns, self._places):
+            del column[number]
+
+    def timeline(self, numbers: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Times (n,) ascending of stored frames and of the removed ones whose place they show now, and for each time
+        the position of that stored frame in ``numbers``, which ascend."""
+        position = {self.serials[number]: n for n, number in enumerate(numbers)}
+        removed_stamps, removed_positions = self.removed.standing_for(position)
+        stamps = np.array([self.timestamps[number] for number in numbers] + removed_stamps)
+        positions = np.array([*range(len(numbers)), *removed_positions], np.int64)
+        order = np.argsort(stamps, kind="stable")
+        return stamps[order], positions[order]
+
+    def glimpse(self, number: int) -> Glimpse:
+        """What a stored frame shows, coarsely."""
+        serial = self.serials[number]
+        if serial not in self._glimpses:  # of a continued run
+            steps, mask = _decoded(self.encoded(number)[::2])
+            self._glimpses[serial] = Glimpse.of_stored(steps, mask > 0)
+        return self._glimpses[serial]
+
+    def __getitem__(self, number: int) -> StoredFrame:
+        """The stored frame of a number, 0 = oldest."""
+        import cv2
+
+        depth_file, color_file, mask_file = self.encoded(number)
+        steps, mask = _decoded((depth_file, mask_file))
+        bgr = np.asarray(cv2.imdecode(np.frombuffer(color_file, np.uint8), cv2.IMREAD_COLOR))
+        depth = steps.astype(np.float32) * np.float32(DEPTH_UNIT)
+        rgb = np.asarray(cv2.cvtColor(bgr, cv2.COLOR_BGR2RGB), dtype=np.uint8)
+        frame = Frame(self.timestamps[number], depth, rgb, self.color_timestamps[number])
+        frame = frame if self.registered is None else self.registered(frame)
+        return StoredFrame(frame, mask > 0, self.Ts_world_camera[number], self.counts[number])
+
+    def encoded(self, number: int) -> EncodedFrame:
+        """The files of a stored frame."""
+        self._write(0)
+        place = self._places[number]
+        if place is None:
+            assert self.archived is not None
+            return self.archived(self.serials[number])
+        depth, color, mask = self._file.read(place)
+        return depth, color, mask
+
+    def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
+        """Take the frames, whose times and poses are set, from an archive."""
+        self.archived = archived
+        self._places, self._glimpses = [None] * len(self), {}
+
+    def __iter__(self) -> Iterator[StoredFrame]:
+        return (self[number] for number in range(len(self)))
+
+    def reintegrate(
+        self,
+        volume: TsdfVolume,
+        numbers: Sequence[int] | None = None,
+        Ts_world_camera: Sequence[NDArray[np.float64]] | None = None,
+        static_masks: Sequence[NDArray[np.bool_] | None] | None = None,
+    ) -> None:
+        """Fuse stored frames into a map, each with the weight of the frames it represents.
+
+        Args:
+            volume: The map, usually an empty one.
+            numbers: Numbers of the frames, in the order of fusion; None = all.
+            Ts_world_camera: Poses (4, 4); None = the stored ones.
+            static_masks: (H, W) bool each, pixels that are fused; None = those fused before.
+        """
+        for i, number in enumerate(range(len(self)) if numbers is None else numbers):
+            stored = self[number]
+            T = stored.T_world_camera if Ts_world_camera is None else Ts_world_camera[i]
+            static = None if static_masks is None else static_masks[i]
+            volume.integrate(stored.frame, T, stored.static if static is None else static, count=stored.count)
+
+    def _write(self, max_pending: int) -> None:
+        """Write encoded frames to the file until at most this many are pending."""
+        while self._pending and (len(self._pending) > max_pending or self._pending[0].done()):
+            parts = self._pending.popleft().result()
+            self._places.append(self._file.write(parts))
+
+
+def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:
+    """Depth as 16-bit PNG, exposed colour as JPEG, static mask as 1-bit PNG."""
+    import cv2
+
+    png = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]  # the fastest
+    steps = depth_steps(frame.depth)
+    bgr = cv2.cvtColor(exposed_color(frame.color, exposure), cv2.COLOR_RGB2BGR)
+    depth = cv2.imencode(".png", steps, png)[1]
+    color = cv2.imencode(".jpg", bgr, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1]
+    mask = cv2.imencode(".png", static.astype(np.uint8) * np.uint8(255), [*png, cv2.IMWRITE_PNG_BILEVEL, 1])[1]
+    return depth.tobytes(), color.tobytes(), mask.tobytes()
+
+
+def _decoded(files: Sequence[bytes]) -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
+    """Depth in steps and mask of their files."""
+    import cv2
+
+    kinds = cv2.IMREAD_UNCHANGED, cv2.IMREAD_GRAYSCALE
+    steps, mask = (
+        np.asarray(cv2.imdecode(np.frombuffer(file, np.uint8), kind)) for file, kind in zip(files, kinds, strict=True)
+    )
+    return steps, mask

@@ -1,0 +1,229 @@
+"""Loop closing: places seen before are recognised, and the drift since then is taken out of trajectory and map."""
+
+import weakref
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_thinning import FrameThinning
+from dudmap.core.places.loop_correction import LoopCorrector
+from dudmap.core.places.loop_verification import LoopQuery, LoopVerifier
+from dudmap.core.places.place_recognition import Keyframe, PlacedFeatures, PlaceMatch
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import Tracker
+
+NEAR_DISTANCE, NEAR_ANGLE_DEG = 0.5, 30.0
+"""A keyframe within this distance (m) and angle (deg) of the camera counts as seen."""
+CHECK_INTERVAL = 5
+"""Frames between two checks for keyframes nearby, and from the start of a search to its evaluation."""
+SAME_DISTANCE, SAME_ANGLE_DEG = 0.03, 1.0
+"""Two frames confirm each other if their corrections differ by less than this, metres and degrees."""
+MAX_VERIFIED = 2
+"""Matches of one frame that are verified by registration at most."""
+MAX_BACKOFF = 4
+"""After n failed searches in a row the next one waits n times ``loops.gap`` frames, up to this factor."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopSearch:
+    """A frame that is being compared with keyframes in the background.
+
+    Attributes:
+        query: The frame.
+        submap: Number of the submap it was tracked in.
+        returned: Whether keyframes nearby have not been seen for ``loops.min_age``, so that a match is expected.
+        matches: The result, pending.
+        due: Number of the frame at which the result is evaluated.
+    """
+
+    query: LoopQuery
+    submap: int
+    returned: bool
+    matches: "Future[list[PlaceMatch]]"
+    due: int
+
+
+@dataclass(frozen=True, eq=False)
+class PendingCorrection:
+    """A correction (4, 4) of the current world, measured by one frame in a submap and not yet confirmed."""
+
+    submap: int
+    T_corrected_tracked: NDArray[np.float64]
+
+
+class LoopCloser:
+    """Detects, verifies and closes loops, and joins submaps.
+
+    A match is accepted if its features (3D-3D RANSAC), the distances to the local map of the matched time and the
+    intensities of that map give the same camera pose, a second frame confirms the correction, and the newest frame has
+    not been registered to the older surfaces meanwhile.
+
+    Features are matched in one background thread. The result is evaluated ``CHECK_INTERVAL`` frames later whether or
+    not it is ready earlier, so that the same recording always gives the same result.
+
+    Args:
+        config: All parameters.
+        atlas: Submaps, keyframes and stored frames.
+        tracker: Registers frames.
+
+    Attributes:
+        closed: Number of corrections and joins made.
+    """
+
+    def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
+        self.config = config
+        self.atlas = atlas
+        self.verifier = LoopVerifier(config, atlas, tracker)
+        self.corrector = LoopCorrector(atlas)
+        self.thinning = FrameThinning(config, atlas, self.corrector)
+        self.closed = 0
+        self._frame = 0
+        self._next_search = 0
+        self._failures = 0
+        self._newest_keyframe: float | None = None  # timestamp; their number ends at ``max_keyframes``
+        self._search: LoopSearch | None = None
+        self._executor: ThreadPoolExecutor | None = None
+        self._pending: PendingCorrection | None = None
+
+    def close(self, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
+        """Search for a loop closure with a tracked frame, and evaluate the last search when it is due.
+
+        Args:
+            query: The frame.
+            monitor: Judges registrations by the residuals of recent frames.
+
+        Returns:
+            (4, 4) motion of the camera's pose by a correction of the atlas, None if nothing was corrected.
+        """
+        self._frame += 1
+        self.thinning.thin()
+        if self._search is not None:
+            if self._frame < self._search.due:
+                return None
+            search, self._search = self._search, None
+            if search.submap == self.atlas.current:
+                return self._evaluate(search, query, monitor)
+        keyframes = self.atlas.keyframes.keyframes
+        newest = keyframes[-1].timestamp if keyframes else None
+        new_keyframe, self._newest_keyframe = newest != self._newest_keyframe, newest
+        if not new_keyframe and self._frame % CHECK_INTERVAL:
+            return None
+        now = query.observation.timestamp
+        near = self._near(query.tracking.T_world_camera)
+        returned = any(self._is_old(keyframe, now) for keyframe in near)
+        candidates = [keyframe for keyframe in keyframes if self._is_candidate(keyframe, now)]
+        wanted = new_keyframe or returned or self._pending is not None or len(self.atlas.volumes) > 1
+        if candidates and wanted and self._frame >= self._next_search:
+            self._start_search(query, candidates, returned)
+        if not returned:  # keyframes the camera has returned to keep their age until the search is evaluated
+            _mark_seen(near, now)
+        return None
+
+    def _start_search(self, query: LoopQuery, candidates: list[Keyframe], returned: bool) -> None:
+        """Match the features of a frame with those of the candidates in the background."""
+        if self._executor is None:
+            self._executor = ThreadPoolExecutor(1, thread_name_prefix="dudmap-loops")
+            weakref.finalize(self, self._executor.shutdown, wait=False)
+        matches = self._executor.submit(self.atlas.keyframes.match, self._features(query), candidates)
+        self._search = LoopSearch(query, self.atlas.current, returned, matches, self._frame + CHECK_INTERVAL)
+        self._next_search = self._frame + self.config.loops.gap
+
+    def _features(self, query: LoopQuery) -> PlacedFeatures:
+        """Features of a frame; those of the newest keyframe if the frame has just become one."""
+        keyframes, T = self.atlas.keyframes.keyframes, query.tracking.T_world_camera
+        newest = keyframes[-1] if keyframes else None
+        # a keyframe of a saved map may have the same time, but not the same pose
+        if newest and newest.timestamp == query.observation.timestamp and np.array_equal(newest.T_world_camera, T):
+            return newest.features
+        return self.atlas.keyframes.extract(query.observation, query.static_mask)
+
+    def _near(self, T_world_camera: NDArray[np.float64]) -> list[Keyframe]:
+        """Keyframes of the current submap whose place is seen from a pose."""
+        return self.atlas.keyframes.near(T_world_camera, self.atlas.current, NEAR_DISTANCE, NEAR_ANGLE_DEG)
+
+    def _is_old(self, keyframe: Keyframe, now: float) -> bool:
+        return now - keyframe.last_seen > self.config.loops.min_age
+
+    def _is_candidate(self, keyframe: Keyframe, now: float) -> bool:
+        if keyframe.submap != self.atlas.current:
+            return self.config.submaps.enabled
+        correctable = self.config.loops.enabled and self.atlas.current != self.atlas.saved
+        return correctable and self._is_old(keyframe, now)
+
+    def _evaluate(self, search: LoopSearch, newest: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
+        """Verify the matches of a search; returns the motion of the pose by a correction, None if none was made."""
+        query, limits = search.query, self.config.loops
+        T = query.tracking.T_world_camera
+        pending, self._pending = self._pending, None
+        failed = search.returned
+        for place in search.matches.result()[:MAX_VERIFIED]:
+            submap = place.keyframe.submap
+            in_current = submap == self.atlas.current
+            # the pose of the features alone is less accurate than the registration
+            if in_current and agree(place.T_world_camera, T, 1.5 * limits.min_distance, 1.5 * limits.min_angle_deg):
+                return self._confirm_no_drift(place, query)
+            if in_current and not self.verifier.is_plausible(place, T):
+                continue
+            T_found = self.verifier.register(place, query, monitor)
+            if T_found is None:
+                failed = True
+                continue
+            self._failures = 0
+            if in_current and agree(T_found, T, limits.min_distance, limits.min_angle_deg):
+                return self._confirm_no_drift(place, query)
+            confirmed = (
+                pending is not None
+                and pending.submap == submap
+                and agree(pending.T_corrected_tracked @ T, T_found, SAME_DISTANCE, SAME_ANGLE_DEG)
+            )
+            if not confirmed:
+                self._pending = PendingCorrection(submap, T_found @ se3.inverse(T))
+                self._next_search = self._frame
+                return None
+            T_corrected_tracked = T_found @ se3.inverse(T)
+            if not in_current:
+                return self._join(submap, T_corrected_tracked)
+            if self.verifier.is_drifted(place, newest, T_corrected_tracked):
+                return self._correct(place, query, T_found)
+            failed = True
+        if failed:  # registration is expensive: linear back-off
+            self._failures = min(self._failures + 1, MAX_BACKOFF)
+            self._next_search = self._frame + self._failures * limits.gap
+        return None
+
+    def _confirm_no_drift(self, place: PlaceMatch, query: LoopQuery) -> None:
+        """Store that there was no drift between a place and now, as a constraint of later corrections."""
+        self._failures = 0
+        T = query.tracking.T_world_camera
+        edge = self.corrector.measured_edge(place.keyframe, T, T)
+        if edge is not None:
+            self.corrector.edges.append(edge)
+        _mark_seen(self._near(T), query.observation.timestamp)
+
+    def _correct(self, place: PlaceMatch, query: LoopQuery, T_found: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """Correct the current submap by a verified place; returns the motion of the newest pose."""
+        edge = self.corrector.measured_edge(place.keyframe, query.tracking.T_world_camera, T_found)
+        correction = None if edge is None else self.corrector.correct(edge)
+        self.closed += correction is not None
+        return correction
+
+    def _join(self, other: int, T_other_current: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Join the current submap with another; the world of the older one stays. Returns the motion of the pose."""
+        current = self.atlas.current
+        self.closed += 1
+        if other < current:
+            self.atlas.join(current, other, T_other_current)
+            return T_other_current
+        self.atlas.join(other, current, se3.inverse(T_other_current))
+        return np.eye(4)
+
+
+def _mark_seen(keyframes: list[Keyframe], now: float) -> None:
+    for keyframe in keyframes:
+        keyframe.last_seen = now

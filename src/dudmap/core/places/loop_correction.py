@@ -1,0 +1,206 @@
+"""Correction of a submap after a loop closure: pose graph optimization and the map built from its poses."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.exposure import fit_exposure
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.map_rebuilding import AT_ONCE, nearest_views, view_distances
+from dudmap.core.places.place_recognition import Keyframe
+from dudmap.core.places.pose_graph import Edge, optimize
+
+TRUNCATED_DISTANCE = 0.05
+"""Distances to the map are truncated at this value in that comparison, metres."""
+ODOMETRY_NOISE = 0.002, 0.02
+"""Standard deviation of a tracked motion: metres (or radians), and per metre of its path."""
+LOOP_NOISE = 0.005, 0.003
+"""Standard deviation of a motion measured at a loop closure: metres and radians."""
+MAX_RATIO, MAX_OFFSETS = 1.5, (LOOP_NOISE[0], 0.01)
+"""A correction is rejected if the frames of the new pass fit the map of the old one worse than this ratio times the
+misfit to a map of their own, plus an offset: for distances the noise of the measured motion, metres; for intensities in
+units of the range 0..1.
+
+The right correction of ``benchmarks/long_corridor.py`` gives 1.1 times that misfit; motions that were made wrong by
+2 cm and 1 degree or by 5 cm gave more than 2 times.
+"""
+
+
+class LoopCorrector:
+    """Distributes the drift measured by loop closures over the stored frames of the current submap.
+
+    Args:
+        atlas: The submaps; its frame store must exist.
+
+    Attributes:
+        edges: Motions measured by the loop closures so far, between numbers of stored frames.
+    """
+
+    def __init__(self, atlas: Atlas) -> None:
+        self.atlas = atlas
+        self.edges: list[Edge] = []
+
+    def measured_edge(
+        self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
+    ) -> Edge | None:
+        """Motion to the newest stored frame from the one nearest in time to a keyframe, or what stands for that now.
+
+        Args:
+            keyframe: Keyframe of the current submap that was recognised.
+            T_tracked: (4, 4) tracked pose of the frame that recognised it.
+            T_measured: (4, 4) pose of that frame relative to the map at the time of the keyframe.
+
+        Returns:
+            None if both are the same stored frame.
+        """
+        history = self.atlas.history
+        assert history is not None
+        nodes = self.atlas.nodes(self.atlas.current)
+        if len(nodes) < 2:
+            return None
+        timestamps, positions = history.timeline(nodes)
+        old, new = nodes[positions[int(np.argmin(np.abs(timestamps - keyframe.timestamp)))]], nodes[-1]
+        if old == new:
+            return None
+        T_camera_new = se3.inverse(T_tracked) @ history.Ts_world_camera[new]
+        T_old_new = se3.inverse(history.Ts_world_camera[old]) @ T_measured @ T_camera_new
+        return Edge(old, new, T_old_new, *LOOP_NOISE)
+
+    def correct(self, loop: Edge) -> NDArray[np.float64] | None:
+        """Optimize the pose graph with a new loop edge and begin to rebuild the map from the corrected poses.
+
+        The correction is applied to the atlas, and the edge stored, only if the poses are finite and the stored frames
+        of the new pass around the loop fit a map of those of the old pass about as well as a map of their own.
+
+        Returns:
+            (4, 4) motion of the newest pose, None if the correction was rejected.
+        """
+        history = self.atlas.history
+        assert history is not None
+        nodes = self.atlas.nodes(self.atlas.current)
+        index = {n: i for i, n in enumerate(nodes)}
+        Ts = np.stack([history.Ts_world_camera[n] for n in nodes])
+        edges = _odometry_edges(Ts, [history.links.get(history.serials[n]) for n in nodes])
+        for edge in (*self.edges, loop):
+            if edge.a in index and edge.b in index:
+                edges.append(Edge(index[edge.a], index[edge.b], edge.T_a_b, edge.sigma_distance, edge.sigma_angle))
+        Ts_new = optimize(Ts, edges)
+        if not np.all(np.isfinite(Ts_new)):
+            return None
+        old, new = _passes(Ts_new, index[loop.a], index[loop.b])
+        self.atlas.make_room()
+        before = self._misfit(self._map_of(nodes, Ts, new), nodes, Ts, new)
+        volume = self._map_of(nodes, Ts_new, old)
+        if _is_worse(self._misfit(volume, nodes, Ts_new, new), before):
+            return None
+        history.reintegrate(volume, [nodes[i] for i in new], list(Ts_new[new]))
+        self.edges.append(loop)
+        return self.atlas.correct(nodes, Ts_new, volume, [nodes[i] for i in (*old, *new)])
+
+    def move_edges(self, number: int, heir: int) -> None:
+        """Let the measured motions that begin or end at a stored frame, which is about to be removed, do so at the one
+        that shows its place now.
+
+        Both are registered to the same map, so that the motion between them has the noise of one measured at a loop.
+        Of two motions between the same frames the more precise one is kept. Numbers above the frame's fall by one.
+        """
+        assert self.atlas.history is not None
+        Ts = self.atlas.history.Ts_world_camera
+        T_heir_frame = se3.inverse(Ts[heir]) @ Ts[number]
+        best: dict[tuple[int, int], Edge] = {}
+        for edge in self.edges:
+            if number in (edge.a, edge.b):
+                sigmas = np.hypot((edge.sigma_distance, edge.sigma_angle), LOOP_NOISE).tolist()
+                if edge.a == number:
+                    edge = Edge(heir, edge.b, T_heir_frame @ edge.T_a_b, *sigmas)
+                else:
+                    edge = Edge(edge.a, heir, edge.T_a_b @ se3.inverse(T_heir_frame), *sigmas)
+                if edge.a == edge.b:
+                    continue
+            edge = replace(edge, a=edge.a - (edge.a > number), b=edge.b - (edge.b > number))
+            ends = min(edge.a, edge.b), max(edge.a, edge.b)
+            if ends not in best or edge.sigma_distance < best[ends].sigma_distance:
+                best[ends] = edge
+        self.edges = list(best.values())
+
+    def _map_of(self, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]) -> TsdfVolume:
+        """Map of some of the stored frames ``nodes`` with poses (n, 4, 4)."""
+        assert self.atlas.history is not None
+        volume = self.atlas.make_volume()
+        self.atlas.history.reintegrate(volume, [nodes[i] for i in chosen], list(Ts[chosen]))
+        return volume
+
+    def _misfit(
+        self, volume: TsdfVolume, nodes: list[int], Ts: NDArray[np.float64], chosen: list[int]
+    ) -> tuple[float, float]:
+        """Mean distance (m) and mean intensity difference (0..1) of some of the stored frames ``nodes`` with poses (n,
+        4, 4) to a map, infinite where they see none of it.
+
+        Gain and offset of each frame are fitted, since the exposure drifts, too.
+        """
+        import cv2
+
+        history = self.atlas.history
+        assert history is not None
+        camera = self.atlas.keyframes.camera.scaled(2)
+        distances, differences = [], []
+        for i in chosen:
+            stored, T = history[nodes[i]], Ts[i]
+            depth = np.where(stored.static, stored.frame.depth, np.float32(0))[1::4, 1::4]
+            grey = cv2.cvtColor(stored.frame.color, cv2.COLOR_RGB2GRAY)
+            size = (depth.shape[1], depth.shape[0])
+            intensity = cv2.resize(grey, size, interpolation=cv2.INTER_AREA).astype(np.float32) / np.float32(255)
+            volume.look_at(T)
+            sample = volume.sample(np.ascontiguousarray(depth), np.asarray(intensity), camera, T)
+            gain, offset = fit_exposure(intensity, sample.difference, np.ones_like(intensity))
+            difference = sample.difference + (1 - gain) * intensity - offset
+            distances.append(np.minimum(np.abs(sample.distance[np.isfinite(sample.distance)]), TRUNCATED_DISTANCE))
+            differences.append(np.abs(difference[np.isfinite(difference)]))
+        return _mean(distances), _mean(differences)
+
+
+def _mean(parts: list[NDArray[np.float32]]) -> float:
+    values = np.concatenate(parts)
+    return float(values.mean()) if len(values) else np.inf
+
+
+def _is_worse(after: tuple[float, float], before: tuple[float, float]) -> bool:
+    """Whether frames fit a map clearly worse than their own, in distance or intensity."""
+    return any(a > MAX_RATIO * b + offset for a, b, offset in zip(after, before, MAX_OFFSETS, strict=True))
+
+
+def _passes(Ts: NDArray[np.float64], a: int, b: int) -> tuple[list[int], list[int]]:
+    """Numbers of the poses of a path (n, 4, 4) that view what pose ``b``, where a loop ends, views: those before and
+    those after the way from ``a`` to ``b`` has led farthest from there, about as many of each."""
+    farthest = min(max(a + int(np.argmax(view_distances(Ts[a:b], Ts[b]))), 1), len(Ts) - 1)
+    half = AT_ONCE // 2
+    num_new = max(half, AT_ONCE - farthest)
+    new = nearest_views(Ts[farthest:], Ts[b], num_new) + farthest
+    old = nearest_views(Ts[:farthest], Ts[b], AT_ONCE - len(new))
+    return old.tolist(), new.tolist()
+
+
+def _odometry_edges(Ts: NDArray[np.float64], links: list[tuple[float, float] | None]) -> list[Edge]:
+    """Tracked motion from each stored frame (n, 4, 4) to the next, with the given standard deviations of the motion
+    that leads to it where there are any."""
+    motions = se3.inverse(Ts[:-1]) @ Ts[1:]
+    known = [link or (sigma, sigma) for link, sigma in zip(links[1:], odometry_sigmas(Ts), strict=True)]
+    return [Edge(i, i + 1, T, *sigmas) for i, (T, sigmas) in enumerate(zip(motions, known, strict=True))]
+
+
+def odometry_sigmas(Ts: NDArray[np.float64]) -> list[float]:
+    """Standard deviations (n - 1,), metres and radians, of the steps along a path (n, 4, 4), which grow with it."""
+    return (ODOMETRY_NOISE[0] + ODOMETRY_NOISE[1] * step_lengths(Ts)).tolist()
+
+
+def step_lengths(Ts: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n - 1,) of the steps along a path (n, 4, 4), as of ``lengths``."""
+    return lengths(se3.inverse(Ts[:-1]) @ Ts[1:])
+
+
+def lengths(motions: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Lengths (n,) of motions (n, 4, 4), metres; a turn by one radian counts as one metre."""
+    return np.linalg.norm(motions[:, :3, 3], axis=1) + se3.rotation_angles(motions)

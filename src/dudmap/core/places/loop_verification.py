@@ -1,0 +1,158 @@
+"""Geometric verification of recognised places: plausible drift, and registration against the map of that time."""
+
+from bisect import bisect_left
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import islice
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.atlas import Atlas, TimedPose
+from dudmap.core.places.loop_correction import TRUNCATED_DISTANCE, step_lengths
+from dudmap.core.places.map_rebuilding import view_distances
+from dudmap.core.places.place_recognition import PlaceMatch
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import Tracker, TrackingResult
+
+LOCAL_FRAMES = 8
+"""Stored frames, those nearest to the recognised pose, of which the local map of a place is built."""
+LOCAL_DISTANCE, LOCAL_ANGLE_DEG = 0.8, 45.0
+"""Largest distance (m) and angle (deg) of these frames from the recognised pose."""
+DRIFT_ALLOWANCE = 0.05
+"""Drift that is believed after any path, metres and radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class LoopQuery:
+    """A tracked frame that may show a known place.
+
+    Attributes:
+        observation: The frame.
+        levels: Its image pyramid, coarse to fine.
+        static_weights: Per level (h, w), weights of the pixels in a registration; None = 1.
+        static_mask: (H, W) bool.
+        tracking: Its registration against the current map.
+    """
+
+    observation: Observation
+    levels: list[Level]
+    static_weights: list[NDArray[np.float32]] | None
+    static_mask: NDArray[np.bool_]
+    tracking: TrackingResult
+
+
+class LoopVerifier:
+    """Decides whether a frame shows a recognised place.
+
+    Args:
+        config: All parameters; used are ``loops`` and ``relocalization``.
+        atlas: Submaps, poses and stored frames; read only.
+        tracker: Registers frames.
+    """
+
+    def __init__(self, config: Config, atlas: Atlas, tracker: Tracker) -> None:
+        self.config = config
+        self.atlas = atlas
+        self.tracker = tracker
+
+    def is_plausible(self, place: PlaceMatch, T_world_camera: NDArray[np.float64]) -> bool:
+        """Whether the path since a place was last seen is long enough for the drift that the match implies.
+
+        Args:
+            place: Match in the current submap.
+            T_world_camera: (4, 4) tracked pose of the frame.
+        """
+        since = [pose.T_world_camera for pose in self._poses_since(place)]
+        path = step_lengths(np.reshape(since[::3], (-1, 4, 4))).sum()  # every third: less jitter
+        limit = DRIFT_ALLOWANCE + self.config.loops.max_drift * path
+        drift = se3.inverse(place.T_world_camera) @ T_world_camera
+        return bool(np.linalg.norm(drift[:3, 3]) < limit) and se3.rotation_angle(drift) < limit
+
+    def register(self, place: PlaceMatch, query: LoopQuery, monitor: QualityMonitor) -> NDArray[np.float64] | None:
+        """Pose (4, 4) of a frame in a local map built from the frames stored up to the time of the place.
+
+        A place in a saved map, whose frames are not stored, is verified against that map.
+
+        Returns:
+            None unless features, distances and intensities agree.
+        """
+        limits = self.config.relocalization
+        local = self._local_map(place)
+        if local is None:
+            return None
+        exposure = query.tracking.exposure
+        found = self.tracker.align(local, query.levels, place.T_world_camera, query.static_weights, exposure=exposure)
+        if (
+            found.converged
+            and len(found.unobservable) == 0
+            and not monitor.reason_to_doubt(found)
+            and found.inlier_share >= limits.min_on_map
+            and agree(found.T_world_camera, place.T_world_camera, limits.max_distance, limits.max_angle_deg)
+        ):
+            return found.T_world_camera
+        return None
+
+    def is_drifted(self, place: PlaceMatch, newest: LoopQuery, T_corrected_tracked: NDArray[np.float64]) -> bool:
+        """Whether the newest frame, too, fits the map of the time of a place better where a correction puts it.
+
+        Frames are registered to the whole map, also to what was seen long ago. Where the passes come near each other,
+        the registration finds back to the older surfaces by itself: a correction that was measured a few frames before
+        would then move the camera away from where it belongs. The older pass is what was stored before the way since
+        the place was last seen has led farthest from here; where it does not show what the frame sees, nothing speaks
+        against the correction.
+
+        Args:
+            place: Match in the current submap.
+            newest: The newest frame.
+            T_corrected_tracked: (4, 4) the correction.
+        """
+        T_tracked = newest.tracking.T_world_camera
+        T_corrected = T_corrected_tracked @ T_tracked
+        since = list(self._poses_since(place))
+        distances = view_distances(np.reshape([pose.T_world_camera for pose in since], (-1, 4, 4)), T_corrected)
+        older_pass = replace(place.keyframe, last_seen=since[int(np.argmax(distances))].timestamp)
+        local = self._local_map(PlaceMatch(older_pass, T_corrected, place.num_inliers))
+        return local is None or _misfit(local, newest, T_corrected) < _misfit(local, newest, T_tracked)
+
+    def _poses_since(self, place: PlaceMatch) -> Iterator[TimedPose]:
+        """The poses in the current submap since a place was last seen."""
+        poses = self.atlas.poses
+        begin = bisect_left(poses, place.keyframe.last_seen, key=lambda pose: pose.timestamp)
+        return (pose for pose in islice(poses, begin, None) if pose.submap == self.atlas.current)
+
+    def _local_map(self, place: PlaceMatch) -> TsdfVolume | None:
+        """Map around a place at the time when it was last seen; None without stored frames of it."""
+        history, keyframe = self.atlas.history, place.keyframe
+        assert history is not None
+        if keyframe.submap == self.atlas.saved:
+            return self.atlas.volumes[keyframe.submap]
+        nodes = [
+            n
+            for n in self.atlas.nodes(keyframe.submap)
+            if history.timestamps[n] <= keyframe.last_seen
+            and agree(history.Ts_world_camera[n], place.T_world_camera, LOCAL_DISTANCE, LOCAL_ANGLE_DEG)
+        ]
+        T_camera_world = se3.inverse(place.T_world_camera)
+        distances = [np.linalg.norm((T_camera_world @ history.Ts_world_camera[n])[:3, 3]) for n in nodes]
+        nearest = sorted(nodes[i] for i in np.argsort(distances, kind="stable")[:LOCAL_FRAMES])
+        if not nearest:
+            return None
+        local = self.atlas.make_volume()
+        history.reintegrate(local, nearest)
+        return local
+
+
+def _misfit(volume: TsdfVolume, query: LoopQuery, T_world_camera: NDArray[np.float64]) -> float:
+    """Mean truncated distance of the static readings of a frame at a pose (4, 4) to a map, metres."""
+    level = query.levels[-1]
+    weights = np.ones_like(level.depth) if query.static_weights is None else query.static_weights[-1]
+    volume.look_at(T_world_camera)
+    sample = volume.sample(level.depth, level.intensity, level.camera, T_world_camera)
+    distances = np.minimum(np.nan_to_num(np.abs(sample.distance), nan=TRUNCATED_DISTANCE), TRUNCATED_DISTANCE)
+    return float(np.average(distances, weights=np.where(level.depth > 0, weights, 0)))

@@ -1,0 +1,263 @@
+"""Place recognition: keyframes with features of known 3D position, and the poses they suggest for a frame.
+
+SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic and Zisserman 2012), pose by 3D-3D
+RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
+"""
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import RelocalizationConfig, SensorConfig
+from dudmap.core.frames.observation import Observation
+from dudmap.core.geometry.alignment import agree, rigid_ransac
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
+
+COARSE_FEATURES = 64
+"""Strongest features of each keyframe in the coarse comparison that selects the keyframes for matching."""
+MAX_MATCHED = 5
+"""Keyframes per frame whose features are all matched; it bounds the time of a query."""
+POSITION_ERROR = 0.01
+"""Largest error of a feature's position beyond the sensor's noise, metres per metre of depth.
+
+That are 2.6 pixels in an image 320 pixels wide with a horizontal field of view of 63 degrees.
+"""
+DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG = 0.1, 5.0
+"""Matches in one submap with poses nearer to each other than this (m, deg) are duplicates."""
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedFeatures:
+    """SIFT features of a frame whose depth is known, strongest first.
+
+    Attributes:
+        descriptors: (n, 128) float32, RootSIFT, unit length.
+        points: (n, 3) float64, metres, camera frame.
+    """
+
+    descriptors: NDArray[np.float32]
+    points: NDArray[np.float64]
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+@dataclass(eq=False)
+class Keyframe:
+    """A tracked frame whose features are stored.
+
+    Attributes:
+        timestamp: Seconds.
+        T_world_camera: (4, 4) in the world of its submap; updated when the map is corrected.
+        features: Its static features.
+        submap: Number of the submap it belongs to.
+        last_seen: Last time at which the camera was near its pose, seconds.
+    """
+
+    timestamp: float
+    T_world_camera: NDArray[np.float64]
+    features: PlacedFeatures
+    submap: int = 0
+    last_seen: float = -np.inf
+
+
+@dataclass(frozen=True, eq=False)
+class PlaceMatch:
+    """A frame recognised to show the place of a keyframe.
+
+    Attributes:
+        keyframe: The keyframe.
+        T_world_camera: (4, 4) pose of the frame in the world of the keyframe's submap.
+        num_inliers: Feature matches that agree with the pose.
+    """
+
+    keyframe: Keyframe
+    T_world_camera: NDArray[np.float64]
+    num_inliers: int
+
+
+class KeyframeDatabase:
+    """Keyframes along the trajectory, and the recognition of the places they show.
+
+    ``extract`` and ``match`` do not change the database. Not for concurrent calls of ``extract``.
+
+    Args:
+        config: Distances, limits and thresholds.
+        camera: Camera of the observations.
+        sensor: Noise model of the depth readings.
+    """
+
+    def __init__(self, config: RelocalizationConfig, camera: Camera, sensor: SensorConfig | None = None) -> None:
+        self.config = config
+        self.camera = camera
+        self.sensor = sensor or SensorConfig()
+        self.keyframes: list[Keyframe] = []
+        self._sift = SiftExtractor(config.max_features)
+        self._frames_since_last = config.keyframe_gap
+
+    def extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
+        """SIFT features of a frame that lie on one static surface.
+
+        Args:
+            observation: The frame.
+            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+        """
+        features = self._sift.extract(reduced_grey(observation.rgb, self.config.image_width))
+        if len(features) == 0:
+            return PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+        height, width = observation.depth.shape
+        reduced_height, reduced_width = features.image_shape
+        # pixel centres lie at whole numbers in both images
+        pixels = (features.pixels + 0.5) * (width / reduced_width, height / reduced_height) - 0.5
+        depth, usable = _depth_at(observation.depth, pixels)
+        if static_mask is not None:
+            usable &= np.all(_neighbourhood(static_mask, pixels), axis=1)
+        order = np.argsort(-features.responses, kind="stable")
+        order = order[usable[order]][: self.config.max_features]
+        u, v = pixels[order].T
+        points = self.camera.points(u, v, depth[order].astype(np.float64))
+        descriptors = features.descriptors[order]
+        root = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-9))
+        return PlacedFeatures(root.astype(np.float32), points)
+
+    def add(
+        self,
+        observation: Observation,
+        T_world_camera: NDArray[np.float64],
+        static_mask: NDArray[np.bool_] | None = None,
+        submap: int = 0,
+    ) -> bool:
+        """Make a tracked frame a keyframe if none of its submap is near; call with every tracked frame.
+
+        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt and
+        ``relocalization.min_inliers`` features.
+
+        Args:
+            observation: The frame.
+            T_world_camera: (4, 4).
+            static_mask: (H, W) bool, pixels that are not dynamic; None = all.
+            submap: Number of the submap it belongs to.
+
+        Returns:
+            Whether the frame was added.
+        """
+        self._frames_since_last += 1
+        if self._frames_since_last <= self.config.keyframe_gap:
+            return False
+        if self.near(T_world_camera, submap, self.config.keyframe_distance, self.config.keyframe_angle_deg):
+            return False
+        self._frames_since_last = 0
+        features = self.extract(observation, static_mask)
+        if len(features) < self.config.min_inliers:
+            return False
+        timestamp = observation.timestamp
+        self.keyframes.append(Keyframe(timestamp, T_world_camera.copy(), features, submap, timestamp))
+        if len(self.keyframes) > self.config.max_keyframes:
+            self._remove_most_redundant()
+        return True
+
+    def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
+        """Keyframes that a frame with these features may show, with the frame's pose.
+
+        Args:
+            features: Features of the frame.
+            among: Keyframes to compare with; None = all.
+
+        Returns:
+            Matches with distinct poses, those with more inliers first.
+        """
+        among = self.keyframes if among is None else among
+        if len(features) < self.config.min_inliers or not among:
+            return []
+        found: list[PlaceMatch] = []
+        for keyframe in _most_similar(features, among):
+            pairs = match_descriptors(
+                features.descriptors, keyframe.features.descriptors, self.config.ratio, mutual=True
+            )
+            if len(pairs) < self.config.min_inliers:
+                continue
+            a, b = keyframe.features.points[pairs[:, 1]], features.points[pairs[:, 0]]
+            T_keyframe_camera, inliers = rigid_ransac(
+                a, b, self._tolerance(a) + self._tolerance(b), self.config.min_share
+            )
+            num_inliers = int(np.count_nonzero(inliers))
+            if num_inliers >= max(self.config.min_inliers, self.config.min_share * len(pairs)):
+                found.append(PlaceMatch(keyframe, keyframe.T_world_camera @ T_keyframe_camera, num_inliers))
+        found.sort(key=lambda match: -match.num_inliers)
+        distinct: list[PlaceMatch] = []
+        for match in found:
+            if not any(
+                match.keyframe.submap == other.keyframe.submap
+                and agree(match.T_world_camera, other.T_world_camera, DUPLICATE_DISTANCE, DUPLICATE_ANGLE_DEG)
+                for other in distinct
+            ):
+                distinct.append(match)
+        return distinct
+
+    def near(
+        self, T_world_camera: NDArray[np.float64], submap: int, distance: float, angle_deg: float
+    ) -> list[Keyframe]:
+        """Keyframes of a submap that are closer to a pose (4, 4) than a distance (m) and an angle (deg)."""
+        if not self.keyframes:
+            return []
+        Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
+        close = np.linalg.norm(Ts[:, :3, 3] - T_world_camera[:3, 3], axis=1) < distance
+        cosine = (np.einsum("iab,ab->i", Ts[:, :3, :3], T_world_camera[:3, :3]) - 1) / 2
+        close &= cosine > np.cos(np.radians(angle_deg))
+        return [self.keyframes[n] for n in np.flatnonzero(close) if self.keyframes[n].submap == submap]
+
+    def _remove_most_redundant(self) -> None:
+        """Remove the older of the two keyframes of one submap whose poses are nearest to each other."""
+        Ts = np.array([keyframe.T_world_camera for keyframe in self.keyframes])
+        distance = np.linalg.norm(Ts[:, None, :3, 3] - Ts[None, :, :3, 3], axis=-1)
+        cosine = (np.einsum("iab,jab->ij", Ts[:, :3, :3], Ts[:, :3, :3]) - 1) / 2
+        angle_deg = np.degrees(np.arccos(np.clip(cosine, -1, 1)))
+        gap = np.maximum(distance / self.config.keyframe_distance, angle_deg / self.config.keyframe_angle_deg)
+        submaps = np.array([keyframe.submap for keyframe in self.keyframes])
+        gap[submaps[:, None] != submaps] = np.inf
+        gap[np.tril_indices(len(Ts))] = np.inf
+        del self.keyframes[int(np.unravel_index(np.argmin(gap), gap.shape)[0])]
+
+    def _tolerance(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Largest believable error (n,) of the position of a feature, metres."""
+        z = points[:, 2]
+        return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
+
+
+def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:
+    """The keyframes whose strongest features are most similar to the frame's, the best first.
+
+    The score of a keyframe sums, over the frame's features, how far its best cosine similarity exceeds the median of
+    all keyframes: features that many places share do not count.
+    """
+    if len(among) <= MAX_MATCHED:
+        return among
+    parts = [keyframe.features.descriptors[:COARSE_FEATURES] for keyframe in among]
+    starts = np.cumsum([0, *(len(part) for part in parts[:-1])])
+    similarity = np.concatenate(parts) @ features.descriptors.T
+    best = np.maximum.reduceat(similarity, starts, axis=0)  # per keyframe and feature of the frame
+    distinctive = np.clip(best - np.median(best, axis=0), 0, None)
+    return [among[n] for n in np.argsort(-distinctive.sum(axis=1), kind="stable")[:MAX_MATCHED]]
+
+
+def _neighbourhood(image: NDArray, pixels: NDArray[np.float64]) -> NDArray:
+    """Values (n, 9) of the 3x3 neighbourhoods of pixels (n, 2) of an image, clamped at its border."""
+    u, v = np.rint(pixels).astype(np.int64).T
+    offsets = np.arange(-1, 2)
+    rows = np.clip(v[:, None, None] + offsets[:, None], 0, image.shape[0] - 1)
+    columns = np.clip(u[:, None, None] + offsets[None, :], 0, image.shape[1] - 1)
+    return image[rows, columns].reshape(len(pixels), 9)
+
+
+def _depth_at(depth: NDArray[np.float32], pixels: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """Median depth (n,) of 3x3 neighbourhoods, and whether all their readings lie on one surface.
+
+    A corner at a depth edge has no well-defined position.
+    """
+    readings = _neighbourhood(depth, pixels)
+    median = np.median(readings, axis=1)
+    spread = readings.max(axis=1) - readings.min(axis=1)
+    return median, (readings.min(axis=1) > 0) & (spread < 0.02 + 0.02 * median)

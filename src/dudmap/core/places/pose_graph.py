@@ -1,0 +1,80 @@
+"""Pose graph optimization (Lu and Milios 1997; Grisetti et al. 2010)."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+
+MAX_ITERATIONS = 20
+MAX_STEP = 1e-9
+"""The optimization has converged when no pose moves by more than this, metres and radians."""
+
+
+@dataclass(frozen=True, eq=False)
+class Edge:
+    """Measured motion between two poses.
+
+    Attributes:
+        a, b: Indices of the poses.
+        T_a_b: (4, 4) measured motion.
+        sigma_distance: Standard deviation of its translation, metres, per axis.
+        sigma_angle: Standard deviation of its rotation, radians, per axis.
+    """
+
+    a: int
+    b: int
+    T_a_b: NDArray[np.float64]
+    sigma_distance: float
+    sigma_angle: float
+
+
+def optimize(Ts_world: NDArray[np.float64], edges: Sequence[Edge]) -> NDArray[np.float64]:
+    """Minimize the sum over all edges of ``|e|^2`` with ``e = log(T_a_b^-1 T_a^-1 T_b)``, weighted by the variances.
+
+    Gauss-Newton on SE(3) with updates ``T exp(xi)`` on the right; the first pose is fixed. The sparse normal equations
+    are solved by SciPy (SuperLU). The derivative of ``e`` by ``xi_b`` is ``I + ad(e) / 2``, the first two terms of the
+    series of the inverse right Jacobian; the derivative by ``xi_a`` is that times ``-Ad(T_b^-1 T_a)``.
+
+    Args:
+        Ts_world: (N, 4, 4) initial poses.
+        edges: Measured motions; they must connect all poses.
+
+    Returns:
+        (N, 4, 4) optimized poses; not finite if the normal equations are singular.
+    """
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.linalg import spsolve
+
+    Ts = np.array(Ts_world, dtype=np.float64)
+    n = len(Ts)
+    if n < 2 or not edges:
+        return Ts
+    a, b = np.array([(edge.a, edge.b) for edge in edges]).T
+    Ts_b_a = se3.inverse(np.stack([edge.T_a_b for edge in edges]))
+    sigmas = np.array([(edge.sigma_distance, edge.sigma_angle) for edge in edges])
+    weights = np.repeat(sigmas**-2.0, 3, axis=1)  # (E, 6)
+    pairs = np.stack([np.stack([a, a]), np.stack([a, b]), np.stack([b, a]), np.stack([b, b])])  # (4, 2, E)
+    entries = (6 * pairs[:, :, :, None, None] + np.indices((6, 6))[:, None]).transpose(1, 0, 2, 3, 4).reshape(2, -1)
+    for _ in range(MAX_ITERATIONS):
+        motions = se3.inverse(Ts[b]) @ Ts[a]
+        errors = se3.log_all(Ts_b_a @ se3.inverse(motions))
+        J_b = np.eye(6) + 0.5 * se3.small_adjoint(errors)
+        J_a = -J_b @ se3.adjoint(motions)
+        weighted = {"a": np.swapaxes(J_a, 1, 2) * weights[:, None], "b": np.swapaxes(J_b, 1, 2) * weights[:, None]}
+        gradient = np.zeros((n, 6))
+        np.add.at(gradient, a, np.einsum("eij,ej->ei", weighted["a"], errors))
+        np.add.at(gradient, b, np.einsum("eij,ej->ei", weighted["b"], errors))
+        products = [weighted[i] @ J for i in "ab" for J in (J_a, J_b)]
+        H = coo_matrix((np.stack(products).reshape(-1), (entries[0], entries[1]))).tocsc()
+        steps = np.zeros((n, 6))
+        steps[1:] = -spsolve(H[6:, 6:], gradient[1:].reshape(-1)).reshape(-1, 6)
+        if not np.all(np.isfinite(steps)):
+            return np.full_like(Ts, np.nan)
+        Ts[1:] = Ts[1:] @ se3.exp_all(steps[1:])
+        Ts[1:, :3, :3] = se3.nearest_rotation(Ts[1:, :3, :3])
+        if np.abs(steps).max() < MAX_STEP:
+            break
+    return Ts

@@ -1,0 +1,181 @@
+"""Relocalization: the pose of a lost frame from recognised keyframes, and the decision to start a new submap."""
+
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.dynamics.dominant_motion import AGREED, dominant_motion
+from dudmap.core.dynamics.ego_motion import LONGEST_BASELINE
+from dudmap.core.frames.pyramid import is_majority_dynamic
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.tracker import TrackingResult
+
+Register = Callable[[TsdfVolume, NDArray[np.float64]], PoseEstimate]
+"""Registers and labels the lost frame against a map, starting from a pose (4, 4) in the world of that map."""
+
+
+@dataclass(frozen=True, eq=False)
+class Relocalization:
+    """Verified pose of a frame after tracking was lost.
+
+    Attributes:
+        estimate: Pose and labels of the frame in the map of ``submap``.
+        submap: Number of the submap that the frame was recognised in. It may differ from the current one.
+    """
+
+    estimate: PoseEstimate
+    submap: int
+
+
+class Relocalizer:
+    """Recovers the camera pose after tracking was lost.
+
+    A lost frame is compared with all keyframes of the atlas. Each candidate pose is verified by registering the frame
+    against the map of the candidate's submap. The atlas is read only: switching it to the submap in which the frame
+    was found, and starting a new submap, are left to the caller.
+
+    Args:
+        config: All parameters; used are ``relocalization`` and ``submaps``.
+        atlas: Submaps and keyframes.
+        prior_map: Map of a first pass. If given, candidates are verified against it instead of the submap's own map.
+    """
+
+    def __init__(self, config: Config, atlas: Atlas, prior_map: TsdfVolume | None = None) -> None:
+        self.config = config
+        self.atlas = atlas
+        self.prior_map = prior_map
+        self._lost_since: float | None = None
+        self._crowded = False  # most of the view moved in the last tracked frame
+        self._recent: deque[FrameView] = deque()  # lost frames: the last, those of LONGEST_BASELINE
+        self._place_unknown = False
+        self._counted = -np.inf, 0  # time of the last frame that was to be recognised, and its features
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether no frame has been tracked since the last call of ``lost``."""
+        return self._lost_since is not None
+
+    def start_in_saved_map(self) -> None:
+        """Declare the camera's place in the current map unknown until a frame is recognised."""
+        self._place_unknown = True
+
+    @property
+    def reason(self) -> str:
+        """Sentence on why no registration from a predicted pose can be trusted, empty if one can."""
+        return "the camera has not been recognised in the saved map yet" if self._place_unknown else ""
+
+    def lost(self, timestamp: float, *, crowded: bool = False) -> None:
+        """Record a frame (timestamp in seconds) that was neither tracked nor relocalized.
+
+        Args:
+            timestamp: Seconds.
+            crowded: Whether most of the view moved in the last tracked frame.
+        """
+        if self._lost_since is None:
+            self._lost_since, self._crowded = timestamp, crowded
+
+    def found(self) -> None:
+        """Record that the camera is tracked again or that a new submap was started."""
+        self._lost_since, self._crowded, self._place_unknown = None, False, False
+        self._recent.clear()
+
+    def recover(
+        self, view: FrameView, register: Register, accept: Callable[[TrackingResult], bool]
+    ) -> Relocalization | None:
+        """Pose of a lost frame, verified by the registration against the map.
+
+        Candidates in the current submap are tried first, those with more matching features before others. The first
+        is taken whose registration converges, is accepted, has at least ``relocalization.min_on_map`` of the frame's
+        readings static and on the map, and stays within ``relocalization.max_distance`` and ``max_angle_deg`` of the
+        pose given by the features.
+
+        Args:
+            view: The lost frame; its timer receives the time of feature matching as stage ``recognise``.
+            register: Registers and labels this frame against a map.
+            accept: Whether the residuals of a registration are plausible.
+
+        Returns:
+            None if relocalization is switched off or no candidate passes.
+        """
+        limits = self.config.relocalization
+        if not limits.enabled:
+            return None
+        with view.timer("recognise"):
+            keyframes = self.atlas.keyframes
+            static_mask = None if view.known_dynamic is None else ~view.known_dynamic
+            features = keyframes.extract(view.observation, static_mask)
+            self._counted = view.observation.timestamp, len(features)
+            candidates = keyframes.match(features)
+        candidates = [candidate for candidate in candidates if candidate.keyframe.submap in self.atlas.volumes]
+        candidates.sort(key=lambda candidate: candidate.keyframe.submap != self.atlas.current)  # a stable sort
+        num_readings = max(np.count_nonzero(view.labelled.depth), 1)
+        for candidate in candidates:
+            submap, T_features = candidate.keyframe.submap, candidate.T_world_camera
+            prior = self.prior_map
+            volume = self.atlas.volume_around(submap, T_features) if prior is None else prior
+            estimate = register(volume, T_features)
+            tracking, labels = estimate.tracking, estimate.labels
+            static_share = 1.0 if labels is None else 1 - np.count_nonzero(labels.dynamic) / num_readings
+            if (
+                tracking.converged
+                and len(tracking.unobservable) == 0
+                and accept(tracking)
+                and static_share * tracking.inlier_share >= limits.min_on_map
+                and agree(tracking.T_world_camera, T_features, limits.max_distance, limits.max_angle_deg)
+            ):
+                return Relocalization(estimate, submap)
+        return None
+
+    def wants_new_submap(self, view: FrameView) -> bool:
+        """Whether tracking should go on in a new, empty submap that starts with this lost frame.
+
+        That is the case if the camera has been lost for ``submaps.patience`` seconds, the frame has enough depth
+        readings for a map and enough features for a keyframe, and it is not of people: see ``_shows_static_world``. It
+        is compared with the last lost image, in which fast people are found again, and with one LONGEST_BASELINE older,
+        since when slow people have moved.
+        """
+        config, observation = self.config.submaps, view.observation
+        while len(self._recent) > 1 and observation.timestamp - self._recent[0].timestamp > LONGEST_BASELINE:
+            self._recent.popleft()
+        recent = list(self._recent)
+        self._recent.append(view)
+        if not config.enabled or self.atlas.history is None or self._lost_since is None:
+            return False
+        if observation.timestamp - self._lost_since < config.patience:
+            return False
+        if np.count_nonzero(observation.depth) < config.min_readings * observation.depth.size:
+            return False
+        timestamp, count = self._counted
+        if timestamp != observation.timestamp:  # relocalisation is off
+            count = len(self.atlas.keyframes.extract(observation))
+        if count < self.config.relocalization.min_inliers:
+            return False
+        if len(recent) < 2:
+            return self._shows_static_world(recent[0] if recent else None, view)
+        return self._shows_static_world(recent[-1], view) and self._shows_static_world(recent[0], view)
+
+    def _shows_static_world(self, before: FrameView | None, view: FrameView) -> bool:
+        """Whether the motion from an earlier lost image to this one is certainly that of the camera.
+
+        Two images do not tell which of two motions is the camera's. A crowd may fill most of the pixels, since it is
+        near; the static world may fill most of the surface, since it is far. A map is only begun where one motion does
+        both: at least AGREED of the surface and most of the pixels follow it. Without a common motion, as in images
+        without texture, it is begun unless most of the view moved when the camera was lost. Nothing is examined where
+        images are not compared (``dynamics.start_seconds`` = 0).
+        """
+        if self.config.dynamics.method != "em" or self.config.dynamics.start_seconds == 0:
+            return True
+        motion = None
+        if before is not None:
+            motion = dominant_motion(before.pyramid, view.pyramid, (before.segmentation(), view.segmentation()))
+        if motion is None:
+            return not self._crowded
+        return motion.share >= AGREED and not is_majority_dynamic(motion.moving_after, view.labelled)

@@ -1,0 +1,80 @@
+"""Result of processing one frame."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.dynamics.masks import Labels
+from dudmap.core.frames.stream_check import Repeats
+from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.tracking.tracker import TrackingResult
+
+
+@dataclass(frozen=True, eq=False)
+class FrameResult:
+    """Result of processing one frame.
+
+    Attributes:
+        timestamp: Time of the depth image, seconds; on the clock of the first frames, if it was set back since.
+        state: "tracked", "lost", or "repeated" for a frame whose images, or whose depth image, are those of the frame
+            before.
+        lost_reason: Sentence on the check that failed; empty for a tracked frame.
+        rejected: Kind of fault of the stream for which a lost frame was not used at all (``frames/stream_check.py``);
+            else empty.
+        T_world_camera: Camera pose (4, 4); None if lost. That of a frame that repeats the one before is the same; where
+            only depth repeats it is predicted, and in the trajectory interpolated once the next frame is tracked.
+        fused: Whether the frame changed the map.
+        skipped_similar: Whether the frame was not fused because it is a redundant view.
+        dynamic_mask: (H, W) bool, dynamic pixels in the image as it was recorded.
+        dynamic_share: Share of the depth readings that lie in the mask.
+        residuals: (h, w) float32 signed distances of the readings to the map, metres, at the resolution of the labels;
+            NaN off the map.
+        labels: Full result of the labelling; None where it did not run.
+        tracking: Full result of the registration; None for the first frame of a map.
+        timings: Milliseconds per stage.
+        relocalized: Whether the pose comes from a recognised place after tracking was lost.
+        find_movers: Finds the moving objects; None where there are none to be found.
+        submap: Number of the submap that the pose belongs to, 0 the first.
+        corrected: Whether a loop was closed with this frame, which changed all poses of the submap so far.
+        blind: Whether the image was textureless: its pose rests on the distances alone, and it is not fused.
+        calibrated: Whether a new calibration of the colour camera, ``Slam.calibration``, is used after this frame.
+        uncertain: Sentence on why pose and labels of a tracked frame may be wrong, which is not fused then; else empty.
+        unobservable: (k, 6) twists, camera axes, along which the view determines no motion: there the pose follows the
+            predicted one; see ``core/tracking/observability.py``. The frame is ``uncertain`` then.
+        repeats: What is bit for bit that of the frame before: the whole ``frame``, its ``depth`` or its ``color``. A
+            frame whose colour repeats is tracked by its distances alone (``blind``).
+        checks: Figures of all checks of the frame (``tracking/checks.py``), NaN where one is not known; empty for a
+            frame that was not registered.
+    """
+
+    timestamp: float
+    state: Literal["tracked", "lost", "repeated"]
+    lost_reason: str
+    T_world_camera: NDArray[np.float64] | None
+    fused: bool
+    skipped_similar: bool
+    dynamic_mask: NDArray[np.bool_]
+    dynamic_share: float
+    residuals: NDArray[np.float32]
+    labels: Labels | None
+    tracking: TrackingResult | None
+    timings: dict[str, float] = field(default_factory=dict)
+    relocalized: bool = False
+    find_movers: Callable[[], tuple[Mover, ...]] | None = None
+    submap: int = 0
+    corrected: bool = False
+    blind: bool = False
+    uncertain: str = ""
+    calibrated: bool = False
+    rejected: str = ""
+    repeats: Repeats = ""
+    checks: Mapping[str, float] = field(default_factory=dict)
+    unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+
+    @property
+    def movers(self) -> tuple[Mover, ...]:
+        """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""
+        return () if self.find_movers is None else self.find_movers()

@@ -1,0 +1,428 @@
+"""The algorithm: register a frame to the map, label what moves, fuse the rest (thesis algorithm 4)."""
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Unpack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.backends.device import make_backend, resolve
+from dudmap.core.bootstrap import Bootstrap
+from dudmap.core.calibration.depth_model import DepthModel
+from dudmap.core.color_calibration import ColorCalibration
+from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.masks import full_mask
+from dudmap.core.frames.depth_correction import DepthCorrection
+from dudmap.core.frames.frame import Frame, FrameArrays
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.frames.stream_check import Rejection, StreamCheck
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.adaptive_volume import make_volume
+from dudmap.core.map.memory_limit import MemoryLimit
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.mapper import Mapper
+from dudmap.core.objects.moving_objects import MovingObjects
+from dudmap.core.objects.object_tracker import Mover
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.loop_closing import LoopCloser
+from dudmap.core.places.loop_verification import LoopQuery
+from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.places.redundancy import RedundantViews
+from dudmap.core.places.relocalizer import Relocalizer
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.result import FrameResult
+from dudmap.core.slam_results import SlamResults
+from dudmap.core.stage_timer import StageTimer
+from dudmap.core.tracking.checks import MAX_DRIFT
+from dudmap.core.tracking.color_motion import ColorMotion
+from dudmap.core.tracking.depth_noise import INTERVAL as NOISE_INTERVAL
+from dudmap.core.tracking.depth_noise import DepthNoise
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.front_end import FrontEnd
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.observability import sentence as unobserved
+from dudmap.core.tracking.pose_prediction import PosePrediction, PosePredictor
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import Tracker
+from dudmap.errors import ConfigError
+
+
+class Slam(SlamResults):
+    """Dense RGB-D SLAM in scenes where things move.
+
+    Args:
+        camera: Camera of the frames that will come.
+        config: All parameters; None for the defaults.
+        first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
+            then registered and labelled with its map and fused into a new one, which leaves out what was taken for
+            static before it moved or before it was seen through.
+        depth_model: What is known of the distortion of the depth from an earlier run with the same camera; it is
+            removed from every frame.
+        calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
+            as it is; another is where the estimation begins, with ``sensor.self_calibration``.
+        live: A calibration is used as soon as it is found, and not at a fixed frame.
+        saved_map: Map of an earlier run to go on in, which is taken over; its world frame is that of all poses. Frames
+            are lost until one is recognised in it, or a submap is started that is joined with it later.
+        localize: Only find the camera in ``saved_map``: nothing is fused, and no keyframe or submap is added.
+        max_blocks: Largest number of blocks of a map in memory, or the memory limit of the process; the others wait on
+            disk. It changes no result. None keeps all in memory.
+        timed: Whether the times of the frames are those of a clock; False where they are invented.
+    """
+
+    def __init__(
+        self,
+        camera: Camera,
+        config: Config | None = None,
+        first_pass: "Slam | None" = None,
+        depth_model: DepthModel | None = None,
+        calibration: Calibration | None = None,
+        live: bool = False,
+        saved_map: SavedMap | None = None,
+        localize: bool = False,
+        max_blocks: int | MemoryLimit | None = None,
+        *,
+        timed: bool = True,
+    ) -> None:
+        self.max_blocks = max_blocks
+        self.config = config = config or Config()
+        start = calibration if first_pass is None else first_pass.calibration
+        given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
+        voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
+        adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
+        self.device = resolve(config.device, adaptive=adaptive)
+        backend = make_backend(self.device)
+        self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
+        self.camera = self.preprocess.camera
+        self.first_camera = camera
+        self.prior_map = None if first_pass is None else first_pass.as_prior_map()
+        self.stream = StreamCheck(config.tracker.max_speed)
+        self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
+        self.motion = MotionModel(config.tracker, timed=timed)
+        self.color_motion = ColorMotion(self.motion, given)
+        self.detector = DynamicDetector(config.dynamics, config.sensor)
+        self.monitor = QualityMonitor(config, self.motion)
+        self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
+        known_poses = {}
+        keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
+        if self.prior_map is None:
+            frame_store = None if localize else FrameStore.of(config, self.camera)
+        else:
+            known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
+            submap = self.prior_map.submap
+            self.detector.import_from(self.prior_map.detector, known_poses)
+        self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
+        self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
+        self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
+        self.bootstrap = Bootstrap()
+        self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
+        self.redundancy = RedundantViews(config)
+        self._last: FrameResult | None = None  # of the last frame, for one that repeats it
+        self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
+        self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
+        self.loops = LoopCloser(config, self.atlas, self.tracker)
+        self.objects = MovingObjects(config)
+        self.localize = localize
+        self.mapper = Mapper(
+            config, self.camera, self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy,
+            localize=localize,
+        )  # fmt: skip
+        if saved_map is not None:
+            self.atlas.go_on_in(saved_map, self.camera, max_blocks)
+            self.monitor.restore(saved_map.registrations)
+            self.relocalizer.start_in_saved_map()
+
+    @property
+    def reference(self) -> TsdfVolume:
+        """Map that frames are registered to: the current one, or in a second pass that of the first."""
+        return self.atlas.volume if self.prior_map is None else self.prior_map.volume
+
+    def prepare(self, frame: Frame | FrameView, dynamic_mask: NDArray[np.bool_] | None = None) -> FrameView:
+        """The part of the work on a frame that needs no other frame, as input of ``process``.
+
+        May run in another thread while an earlier frame is processed; one frame at a time.
+
+        Args:
+            frame: Depth and colour; a frame that is prepared already only gets the mask.
+            dynamic_mask: As for ``process``.
+
+        Raises:
+            DatasetError: The images do not fit the camera or each other.
+        """
+        if isinstance(frame, Frame):
+            start = time.perf_counter()
+            observation = self._known_distortion.observation(self.preprocess(frame))
+            pyramid = Pyramid.of(observation, self.camera, self.config)
+            if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
+                _ = pyramid.corners  # cached there for the comparison with other images
+            segmentation = self.detector.segment(pyramid.labelled, self.config.volume.voxel_size)
+            timer = StageTimer({"preprocess": 1000 * (time.perf_counter() - start)})
+            frame = FrameView(observation, pyramid, segmentation, timer)
+        if dynamic_mask is not None:
+            frame = replace(frame, known_dynamic=self.preprocess.mask(dynamic_mask))
+        return frame
+
+    def process(
+        self,
+        frame: Frame | FrameView | None = None,
+        dynamic_mask: NDArray[np.bool_] | None = None,
+        **arrays: Unpack[FrameArrays],
+    ) -> FrameResult:
+        """Register a frame to the map, label its dynamic pixels, fuse the static ones.
+
+        Args:
+            frame: Depth and colour, in the order of arrival; prepared or not, the result is the same. A frame whose
+                stamp or images cannot be right is lost and changes nothing (``FrameResult.rejected``).
+            dynamic_mask: (H, W) bool, pixels known to be dynamic, e.g. from a segmentation network; they are left out
+                from the first registration on.
+            arrays: Instead of a frame ``depth`` (H, W), float32 in metres, or uint16 with ``camera.depth_scale`` units
+                per metre (1000 unless set: millimetres), 0 = no reading; ``rgb`` (H, W, 3) uint8; ``timestamp`` in s.
+
+        Raises:
+            ConfigError: Neither a frame nor all three of ``depth``, ``rgb`` and ``timestamp`` are given, or both.
+            DatasetError: The arrays have another shape or type.
+            FrameError: The images do not fit the camera or each other; the frame changed nothing.
+        """
+        view = self.prepare(self._given(frame, arrays), dynamic_mask)
+        with view.timer("check"):
+            rejection = self.stream.rejection(view.observation)
+        if rejection:
+            return self._reject(view, rejection)
+        view = self._resumed(view)
+        if self.stream.repeats in ("frame", "depth") and self._last is not None:
+            return self._repeat(view, self._last)
+        view = self.color_motion.predicted(view)
+        if self.reference.is_empty:
+            return self._start_map(view)
+        view = replace(view, blind=self._is_blind(view))
+        self._continue_rebuilding(view)
+        prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
+        self.mapper.revise_start(view, prediction)
+        estimate = self.front_end.register(self.reference, view, prediction)
+        verdict = self.monitor.judge(view, estimate, prediction.image_pose)
+        reason = self.relocalizer.reason or verdict.reason
+        relocalized = self._relocalize(view, prediction) if reason else None
+        estimate = relocalized or estimate
+        if reason and not relocalized:
+            return replace(self._lose(view, estimate, reason), checks=verdict.figures)
+        view = self.color_motion.registered(estimate.view or view, estimate.T_world_camera)
+        self.mapper.recolor_first_frame(view, estimate)
+        self._accept(view, estimate)
+        uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
+        with view.timer("similarity"):
+            fuse = not (view.blind or uncertain or self.localize)
+            fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
+        mask = self._dynamic_mask(view, estimate)
+        self._learn_noise(view, estimate, mask)
+        find_movers = self.objects.update(view, estimate)
+        self.mapper.extend(view, estimate, mask, fuse=fuse)
+        T_world_camera, corrected = self._close_loop(view, estimate, mask)
+        calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
+        return self._result(
+            view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
+            corrected=corrected, find_movers=find_movers, uncertain=uncertain, calibrated=calibrated,
+            checks=verdict.figures,
+        )  # fmt: skip
+
+    # -- steps of process ---------------------------------------------------------------------------------------------
+
+    def _given(self, frame: Frame | FrameView | None, arrays: FrameArrays) -> Frame | FrameView:
+        """The frame as it was given, or made of arrays."""
+        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
+
+    def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
+        """Report a frame that the stream has spoilt."""
+        mask = np.zeros(view.observation.depth.shape, dtype=bool)
+        return self._result(view, None, mask, reason=rejection.reason, rejected=rejection.kind)
+
+    def _repeat(self, view: FrameView, last: FrameResult) -> FrameResult:
+        """Result of a frame that repeats the one before, or its depth.
+
+        It has the pose of the frame it repeats. With new colours the camera may have moved: the pose is the predicted
+        one, and in the trajectory interpolated once the next frame is tracked. Neither is believed for longer than a
+        prediction can be trusted.
+        """
+        repeats, time = self.stream.repeats, view.timestamp
+        result = replace(last, timestamp=time, repeats=repeats, timings=view.timer.timings)
+        if last.T_world_camera is not None and self.motion.drift(time) > MAX_DRIFT:
+            what = "the depth image has" if repeats == "depth" else "both images have"
+            reason = f"{what} repeated for {time - self.motion.timestamp:.2f} s: the sensor hangs"
+            result = replace(result, state="lost", lost_reason=reason, T_world_camera=None)
+        elif last.T_world_camera is not None:
+            T_world_camera = self.motion.predict(time) if repeats == "depth" else last.T_world_camera
+            result = replace(result, state="repeated", T_world_camera=T_world_camera)
+            self.atlas.add_pose(time, T_world_camera, "depth" if "depth" in (repeats, last.repeats) else "frame")
+        self._last = result
+        return result
+
+    def _resumed(self, view: FrameView) -> FrameView:
+        """The frame on the clock of the first ones; after a pause the velocity is not known any more, and the camera
+        may be elsewhere."""
+        view = replace(view, observation=self.stream.restamped(view.observation))
+        if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
+            self.front_end.lose(view.timestamp)
+        return view
+
+    def _continue_rebuilding(self, view: FrameView) -> None:
+        """Go on with the maps that are being rebuilt since a loop was closed or submaps were joined."""
+        if self.atlas.rebuildings:
+            with view.timer("rebuild"):
+                self.atlas.continue_rebuilding()
+
+    def _is_blind(self, view: FrameView) -> bool:
+        """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
+        return (view.textureless or self.stream.repeats == "color") and not self.bootstrap.textureless
+
+    def _start_map(self, view: FrameView) -> FrameResult:
+        """Make a map of a single frame, whose camera frame becomes the world frame."""
+        mask = view.known_dynamic
+        mask = np.zeros(view.observation.depth.shape, dtype=bool) if mask is None else mask
+        self.bootstrap.textureless = view.textureless
+        if reason := self.bootstrap.rejection_reason(view, mask):
+            return self._result(view, None, mask, reason=reason)
+        estimate = PoseEstimate.at_origin()
+        self.motion.restart(view.timestamp, estimate.T_world_camera)
+        view = self.color_motion.registered(view, estimate.T_world_camera)
+        self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
+        self.mapper.extend(view, estimate, mask, fuse=True)
+        self.bootstrap.start(view, mask)
+        self.color_motion.start(view)
+        if self.config.dynamics.method == "em":
+            self.predictor.start(view)
+            self.detector.start(view.timestamp, view.labelled, estimate.T_world_camera)
+        self.predictor.update(view, estimate)
+        self.monitor.images.update(view, estimate)
+        return self._result(view, None, mask, T_world_camera=estimate.T_world_camera, fused=True)
+
+    def _relocalize(self, view: FrameView, prediction: PosePrediction) -> PoseEstimate | None:
+        """Pose of a frame whose registration failed, from the keyframes; the atlas and the motion follow it."""
+        self.monitor.lose()
+        view = self.color_motion.registered(view, prediction.T_world_camera)
+        found = self.relocalizer.recover(
+            view,
+            lambda volume, T_init: self.front_end.register_from(volume, view, prediction, T_init),
+            lambda tracking: not self.monitor.reason_to_doubt(tracking),
+        )
+        if found is None:
+            return None
+        self.atlas.switch_to(found.submap)
+        self.bootstrap.abandon()
+        self.motion.restart(view.timestamp, found.estimate.T_world_camera)
+        return found.estimate
+
+    def _lose(self, view: FrameView, estimate: PoseEstimate, reason: str) -> FrameResult:
+        """Report a lost frame, or start a new submap with it after a while."""
+        self.relocalizer.lost(view.timestamp, crowded=self.predictor.is_crowded(view, self.front_end.last_dynamic))
+        self.front_end.lose(view.timestamp)
+        self.color_calibration.interrupt()
+        if self.relocalizer.wants_new_submap(view):
+            self.atlas.start_submap()
+            self.monitor.reset()
+            self.relocalizer.found()
+            self.redundancy.reset()
+            return self._start_map(replace(view, blind=False))
+        return self._result(view, estimate, self._dynamic_mask(view, estimate), reason=reason)
+
+    def _accept(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Take over the pose and the labels of a frame."""
+        self.front_end.update(view, estimate)
+        self.relocalizer.found()
+        self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
+        self.predictor.update(view, estimate)
+
+    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
+        """Compare the static readings of some frames with the map for the noise of the sensor, which is reported."""
+        if len(self.atlas.poses) % NOISE_INTERVAL == 0:
+            with view.timer("noise"):
+                self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
+
+    def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
+        """Dynamic pixels (H, W) of a frame."""
+        with view.timer("label"):
+            if estimate.labels is None:
+                mask = np.zeros(view.observation.depth.shape, dtype=bool)
+            else:
+                mask = full_mask(estimate.labels, view.labelled, view.observation.depth)
+            return mask if view.known_dynamic is None else mask | view.known_dynamic
+
+    def _close_loop(
+        self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], bool]:
+        """Pose of the frame after a loop closure, and whether there was one."""
+        T_world_camera = estimate.T_world_camera
+        if self.atlas.history is None or view.blind:
+            return T_world_camera, False
+        with view.timer("loops"):
+            levels = view.pyramid.tracked
+            weights = estimate.static_weights(levels)
+            query = LoopQuery(view.observation, levels, weights, ~dynamic_mask, estimate.tracking)
+            correction = self.loops.close(query, self.monitor)
+        if correction is None:
+            return T_world_camera, False
+        self.bootstrap.abandon()  # frames held back have poses of before
+        self.motion.apply_correction(correction)
+        self.redundancy.apply_correction(correction)
+        return correction @ T_world_camera, True
+
+    def _calibrate(
+        self, view: FrameView, T_world_camera: NDArray[np.float64], dynamic_mask: NDArray[np.bool_], *, corrected: bool
+    ) -> bool:
+        """Learn the calibration of the colour camera; returns whether a new one is in use from the next frame on."""
+        calibrated = self.color_calibration.update(view, T_world_camera, dynamic_mask, corrected=corrected)
+        if calibrated:  # the pose of the last image is that of colours elsewhere
+            self.monitor.images.reset()
+        return calibrated
+
+    def _result(
+        self,
+        view: FrameView,
+        estimate: PoseEstimate | None,
+        dynamic_mask: NDArray[np.bool_],
+        *,
+        reason: str = "",
+        T_world_camera: NDArray[np.float64] | None = None,
+        fused: bool = False,
+        relocalized: bool = False,
+        corrected: bool = False,
+        find_movers: Callable[[], tuple[Mover, ...]] | None = None,
+        uncertain: str = "",
+        calibrated: bool = False,
+        checks: Mapping[str, float] | None = None,
+        rejected: str = "",
+    ) -> FrameResult:
+        """The result of a frame; the mask is given in the image as it was recorded, with the lens' distortion."""
+        labels = None if estimate is None else estimate.labels
+        readings = view.observation.depth > 0
+        result = FrameResult(
+            timestamp=view.timestamp, state="lost" if reason else "tracked", lost_reason=reason,
+            T_world_camera=T_world_camera, fused=fused,
+            skipped_similar=not (fused or reason or uncertain or view.blind or self.localize),
+            dynamic_mask=self.preprocess.distorted(dynamic_mask),
+            dynamic_share=float(np.count_nonzero(dynamic_mask & readings) / max(np.count_nonzero(readings), 1)),
+            residuals=np.full((1, 1), np.nan, np.float32) if labels is None else labels.sample.distance,
+            labels=labels, tracking=None if estimate is None else estimate.tracking, timings=view.timer.timings,
+            relocalized=relocalized, find_movers=find_movers, submap=self.atlas.current, corrected=corrected,
+            blind=view.blind, uncertain=uncertain, calibrated=calibrated,
+            unobservable=np.empty((0, 6)) if estimate is None else estimate.tracking.unobservable, checks=checks or {},
+            repeats=self.stream.repeats, rejected=rejected,
+        )  # fmt: skip
+        if not rejected:
+            self._last = replace(
+                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False,
+                find_movers=None, corrected=False, blind=False, calibrated=False, uncertain="", checks={},
+            )  # fmt: skip
+        return result
+
+    def _make_volume(self) -> TsdfVolume:
+        config, backend = self.config, make_backend(self.device)
+        return make_volume(
+            self.camera, config.volume, config.sensor, config.preprocess.depth_max, backend, self.max_blocks
+        )

@@ -1,0 +1,102 @@
+"""What a system has found so far: maps, trajectories and calibration."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dudmap.config import Config
+from dudmap.core.calibration.depth_model import DepthModel
+from dudmap.core.color_calibration import ColorCalibration
+from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.objects.moving_objects import MovingObjects
+from dudmap.core.objects.object_map import RigidObject
+from dudmap.core.places.atlas import Atlas
+from dudmap.core.places.prior_map import PriorMap
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.errors import ConfigError
+
+
+class SlamResults:
+    """The read-only side of ``Slam``; a map that is being rebuilt after a correction is completed before it is given.
+
+    Attributes:
+        config, camera: Of the system; the camera is that of the images without lens distortion.
+        atlas: Submaps, keyframes, stored frames and poses.
+        monitor: How well frames fit the map.
+        color_calibration: Calibration of the colour camera.
+        objects: The moving objects.
+        detector: Knows what has moved.
+    """
+
+    config: Config
+    camera: Camera
+    atlas: Atlas
+    monitor: QualityMonitor
+    color_calibration: ColorCalibration
+    objects: MovingObjects
+    detector: DynamicDetector
+
+    @property
+    def volume(self) -> TsdfVolume:
+        """Map of the current submap, complete: where it is being rebuilt after a correction, that is done first.
+
+        Another object after a new submap was started or two were joined. ``atlas.volume`` is the map as it is.
+        """
+        self.atlas.complete()
+        return self.atlas.volume
+
+    @property
+    def trajectory(self) -> Trajectory:
+        """Poses of all frames tracked so far in the submap with the most frames, after all corrections."""
+        return self.atlas.trajectory(self.atlas.by_size()[0])
+
+    @property
+    def maps(self) -> list[tuple[Trajectory, TsdfVolume]]:
+        """Trajectory and complete map of each submap, that with the most frames first; each has its own world."""
+        self.atlas.complete()
+        return [(self.atlas.trajectory(number), self.atlas.volumes[number]) for number in self.atlas.by_size()]
+
+    @property
+    def saved_map(self) -> SavedMap:
+        """The main map as a later run goes on in it."""
+        return replace(self.atlas.as_saved_map(), registrations=self.monitor.history)
+
+    @property
+    def calibration(self) -> Calibration:
+        """Calibration of the colour camera in use."""
+        return self.color_calibration.current
+
+    @property
+    def rigid_objects(self) -> list[RigidObject]:
+        """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
+        return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
+
+    def learnt_depth_model(self) -> DepthModel:
+        """Distortion of the depth, beyond the given model, that the frames kept for the rebuilding of the map show.
+
+        Raises:
+            ConfigError: No frames are kept, since ``relocalization``, or both ``loops`` and ``submaps`` are off.
+        """
+        from dudmap.core.calibration.depth_estimator import DepthView, estimate_distortion
+
+        store = self.atlas.history
+        if store is None:
+            raise ConfigError("the depth model is learnt from kept frames; enable relocalization, and loops or submaps")
+        main = self.atlas.by_size()[0]
+        views = [
+            DepthView.of(np.where(kept.static, kept.frame.depth, np.float32(0)), self.camera, kept.T_world_camera)
+            for kept, submap in zip(store, store.submaps, strict=True) if submap == main
+        ]  # fmt: skip
+        return estimate_distortion(views, self.camera, self.config.sensor)
+
+    def as_prior_map(self) -> PriorMap:
+        """The largest submap and what else a second pass over the same recording needs."""
+        self.atlas.complete()
+        main = self.atlas.by_size()[0]
+        poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
+        return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)

@@ -1,0 +1,162 @@
+"""Registration of the colour image with the camera's motion between depth and colour."""
+
+from dataclasses import replace
+from functools import cache, cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.backend import CpuBackend
+from dudmap.core.backends.spec import Backend
+from dudmap.core.dynamics.segments import Segmentation, intensity_gradient
+from dudmap.core.frames.color_registration import color_projection, recorded_intensity, register_color
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level, Observation
+from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME, MotionModel
+
+
+class RegisteredLevel(Level):
+    """A level whose intensities are registered when they are first asked for, since few frames need all levels.
+
+    The intensities follow from the other attributes, so that they are no part of the state of a system.
+
+    Attributes:
+        observation: The frame.
+        calibration: Of the colour camera.
+        velocity: (6,) twist of the camera per second.
+        backend: Compute device.
+    """
+
+    observation: Observation
+    calibration: Calibration
+    velocity: NDArray[np.float64]
+    backend: Backend
+
+    def __init__(self, level: Level, **attributes: object) -> None:
+        self.__dict__.update(camera=level.camera, depth=level.depth, **attributes)
+
+    @cached_property
+    def intensity(self) -> NDArray[np.float32]:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """Registered intensities (h, w)."""
+        halvings = round(np.log2(self.observation.camera.width / self.camera.width))
+        scaled = replace(self.calibration, camera=self.calibration.camera.scaled(halvings))
+        projection = color_projection(scaled, self.velocity, self.observation.color_offset)
+        recorded = recorded_intensity(self.observation, halvings)
+        return register_color(recorded, self.depth, self.camera, projection, self.backend)
+
+
+class ColorMotion:
+    """Registers colour to depth with the calibration in use, which may change while the camera moves.
+
+    A colour image taken at tau after the depth image of a camera at x with the velocity v shows what is seen from
+    y = x + tau v. Registered with the velocity v + d it asks for the pose x - tau d; if colour has the share k of the
+    registration, the velocity that follows from the found pose is v - k (tau / dt) d, where dt is the time since the
+    last frame. For tau > dt / 2 and k = 1, errors would grow from frame to frame if that velocity were used for the
+    next. Going the part a = 1 / (1 + tau / dt) of the way from the assumed velocity to the found one leaves
+    d (1 - a (1 + k tau / dt)): nothing where colour decides, and where it does not the pose is not concerned.
+
+    The velocity of the first frame of a map is not known. Its colours are taken as they are, and so are those of the
+    second frame, whose motion since the first is then right; with it the first frame is fused anew.
+
+    Args:
+        motion: Velocity of the camera.
+        given: Calibration with which frames are prepared; None for colour that is registered to depth.
+
+    Attributes:
+        calibration: In use; None for images that are taken as they are.
+    """
+
+    def __init__(self, motion: MotionModel, given: Calibration | None) -> None:
+        self.motion = motion
+        self.given = given
+        self.calibration = given
+        self._first: FrameView | None = None
+        self._backend = CpuBackend()  # of its own: frames are prepared in another thread
+
+    def start(self, view: FrameView) -> None:
+        """Remember the frame that a map was made of, until its velocity is known."""
+        self._first = None if self.is_prepared(view.observation) else view
+
+    def first_frame(self, timestamp: float, T_world_camera: NDArray[np.float64]) -> FrameView | None:
+        """The first frame of a map with its colours registered, once the pose (4, 4) of the next is known.
+
+        None where the map is right as it is, or where too much time has passed for the velocity to be known.
+        """
+        first, self._first = self._first, None
+        if first is None or self.motion.elapsed(timestamp) > VELOCITY_LIFETIME:
+            return None
+        return self._with_colors(first, self.motion.velocity_to(timestamp, T_world_camera))
+
+    def predicted(self, view: FrameView) -> FrameView:
+        """The frame with the intensities of its pyramid registered by the velocity so far."""
+        return self._with_levels(view, self.motion.velocity)
+
+    def refined(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The same with the velocity to a first estimate of the frame's pose (4, 4)."""
+        if self._first is not None:
+            return view
+        return self._with_levels(view, self._velocity(view, T_world_camera))
+
+    def registered(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> FrameView:
+        """The frame with its colours registered, once its pose (4, 4) is known."""
+        return self._with_colors(view, self._velocity(view, T_world_camera))
+
+    def frame_with_colors(self, frame: Frame, camera: Camera, velocity: NDArray[np.float64]) -> Frame:
+        """A frame with its recorded colour registered to the depth.
+
+        Args:
+            frame: Preprocessed depth, and colour as it was recorded.
+            camera: Of the depth image, without distortion.
+            velocity: (6,) twist of the camera per second, its own axes.
+        """
+        if self.calibration is None:
+            return frame
+        offset = 0.0 if frame.color_timestamp is None else frame.color_timestamp - frame.timestamp
+        projection = color_projection(self.calibration, velocity, offset)
+        return replace(frame, color=register_color(frame.color, frame.depth, camera, projection, self._backend))
+
+    def is_prepared(self, observation: Observation) -> bool:
+        """Whether the frame was prepared with all that is known."""
+        calibration = self.calibration
+        return calibration is None or (calibration is self.given and calibration.is_instant(observation.color_offset))
+
+    def _with_colors(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        observation = view.observation
+        if self.is_prepared(observation):
+            return view
+        with view.timer("color"):
+            recorded = observation.as_recorded
+            rgb = self.frame_with_colors(recorded, observation.camera, velocity).color
+            return replace(view, observation=replace(observation, rgb=rgb, recorded_rgb=recorded.color))
+
+    def _velocity(self, view: FrameView, T_world_camera: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Twist per second (6,) after a frame was registered with that of the motion model."""
+        if self.calibration is None:
+            return view.color_velocity
+        assumed, found = view.color_velocity, self.motion.velocity_to(view.timestamp, T_world_camera)
+        if self._first is not None:
+            return found
+        ratio = (self.calibration.delay + view.observation.color_offset) / self.motion.elapsed(view.timestamp)
+        return assumed + 1 / (1 + max(ratio, 0.0)) * (found - assumed)
+
+    def _with_levels(self, view: FrameView, velocity: NDArray[np.float64]) -> FrameView:
+        calibration = self.calibration
+        if calibration is None or self.is_prepared(view.observation):
+            return view
+        pyramid = view.pyramid
+        given = {"observation": view.observation, "calibration": calibration, "velocity": velocity}
+        levels = {
+            level: RegisteredLevel(level, **given, backend=self._backend)
+            for level in (*pyramid.tracked, pyramid.labelled)
+        }
+        pyramid = Pyramid([levels[level] for level in pyramid.tracked], levels[pyramid.labelled])
+
+        @cache
+        def segmentation() -> Segmentation:
+            return replace(view.segmentation(), gradient=intensity_gradient(pyramid.labelled))
+
+        return replace(view, pyramid=pyramid, segmentation=segmentation, color_velocity=velocity)

@@ -1,0 +1,172 @@
+"""Registration and labelling of a frame, each of which needs the other (thesis algorithm 4)."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.dynamics.detector import DynamicDetector
+from dudmap.core.dynamics.masks import Labels
+from dudmap.core.frames.pyramid import reduced
+from dudmap.core.geometry.alignment import agree
+from dudmap.core.map.volume import SURFACE, TsdfVolume
+from dudmap.core.tracking.color_motion import ColorMotion
+from dudmap.core.tracking.color_noise import motion_discount
+from dudmap.core.tracking.estimate import PoseEstimate, initial_weights, static_weights
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.pose_prediction import CLEARLY_BETTER, PosePrediction
+from dudmap.core.tracking.quality_monitor import QualityMonitor
+from dudmap.core.tracking.tracker import Minimum, Tracker, TrackingResult
+
+UNCHANGED_SHARE = 0.02
+"""Share of the pixels on the map whose labels may differ from those of the previous frame for the registration to go
+on at the finest level alone."""
+SAME_POSE = 0.01, 0.25
+"""Initial poses nearer to each other than this (m, deg) lead to the same registration."""
+
+
+class FrontEnd:
+    """Registers frames to a map and labels their dynamic pixels.
+
+    Args:
+        config: All parameters.
+        tracker: Registers an image pyramid.
+        detector: Labels the pixels of a registered image.
+        motion: Velocity of the camera.
+        monitor: Knows the residuals of the previous frames.
+        color_motion: Registers the colours of a frame with the camera's motion.
+
+    Attributes:
+        last_dynamic: (h, w) bool, dynamic pixels of the last accepted frame; None if there were none.
+    """
+
+    def __init__(
+        self,
+        config: Config,
+        tracker: Tracker,
+        detector: DynamicDetector,
+        motion: MotionModel,
+        monitor: QualityMonitor,
+        color_motion: ColorMotion,
+    ) -> None:
+        self.config = config
+        self.tracker = tracker
+        distances_only = config.tracker.model_copy(update={"color_weight": 0.0, "exposure": False})
+        self.blind_tracker = Tracker(distances_only, config.sensor, config.preprocess.smoothing_px)
+        self.detector = detector
+        self.motion = motion
+        self.monitor = monitor
+        self.color_motion = color_motion
+        self.last_dynamic: NDArray[np.bool_] | None = None
+
+    def register(self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction) -> PoseEstimate:
+        """Pose and labels of a frame, from its predicted pose on.
+
+        A registration that fits unusually badly, or that did not settle and moved far from its prediction, is repeated
+        from the pose that the ego-motion between the last two images gives; the one that fits better is returned.
+        """
+        estimate = self.register_from(volume, view, prediction, prediction.T_world_camera)
+        tracking = estimate.tracking
+        arrived = tracking.settled or agree(prediction.T_world_camera, tracking.T_world_camera, *SAME_POSE)
+        if arrived and not self.monitor.is_unusual(tracking):
+            return estimate
+        T_image = prediction.image_pose()
+        if T_image is None or agree(T_image, tracking.T_world_camera, *SAME_POSE):
+            return estimate
+        other = self.register_from(volume, view, prediction, T_image)
+        misfit, other_misfit = (sum(self.monitor.relative_misfit(e.tracking)) for e in (estimate, other))
+        better = other.tracking.converged and (not tracking.converged or other_misfit < CLEARLY_BETTER * misfit)
+        return other if better else estimate
+
+    def register_from(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, T_init: NDArray[np.float64]
+    ) -> PoseEstimate:
+        """Pose and labels of a frame from one initial pose (4, 4) on.
+
+        The coarse levels bring the pose near enough to label the frame; the fine levels are registered with the static
+        weights that follow from the labels.
+        """
+        levels, unverified = view.pyramid.tracked, prediction.unverified_mask
+        tracker = self.blind_tracker if view.blind else self.tracker
+        excluded = [m for m in (view.known_dynamic, prediction.moving, unverified) if m is not None]
+        if self.config.dynamics.method == "none" or not self.config.tracker.second_pass:
+            with view.timer("track"):
+                tracking = tracker.align(volume, levels, T_init, initial_weights(levels, None, excluded))
+            labelled = self.config.dynamics.method != "none"
+            labels = self._label(volume, view, prediction, tracking) if labelled else None
+            return PoseEstimate(tracking, labels, unverified)
+        split = max(1, len(levels) - 1)
+        with view.timer("track"):
+            coarse, weights = levels[:split], initial_weights(levels[:split], self.last_dynamic, excluded)
+            found = tracker.minimize(volume, coarse, T_init, weights)
+        view = self.color_motion.refined(view, found.T_world_camera)
+        levels = view.pyramid.tracked
+        labels = self._label(volume, view, prediction, found)
+        with view.timer("track_again"):
+            finest_suffices = split < len(levels) and found.settled and self._labels_unchanged(labels)
+            first = split if finest_suffices else split - 1
+            weights = static_weights(labels, levels[first:], unverified)
+            pose, exposure = found.T_world_camera, found.exposure
+            color_weight = tracker.config.color_weight * self._motion_discount(volume, view, pose)
+            tracking = tracker.align(volume, levels[first:], pose, weights, first, exposure, color_weight)
+        if view.blind:
+            tracking = replace(tracking, color_residual=np.nan)
+        return PoseEstimate(tracking, labels, unverified, view)
+
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Accept the pose and labels of a frame: velocity and the memory of the detector follow them."""
+        tracking, labels = estimate.tracking, estimate.labels
+        observed = len(tracking.unobservable) == 0
+        self.motion.update(view.timestamp, tracking.T_world_camera, observed=observed)
+        self.last_dynamic = labels.dynamic if labels is not None and labels.dynamic.any() else None
+        self.monitor.accept(tracking)
+        with view.timer("check"):
+            self.monitor.images.update(view, estimate)
+        if labels is None or view.blind:
+            return
+        with view.timer("label"):
+            self.detector.update(view.timestamp, view.labelled, tracking.T_world_camera, tracking.exposure, labels)
+
+    def lose(self, timestamp: float) -> None:
+        """A frame was not tracked; after some time what the previous frames showed is no longer used."""
+        self.monitor.lose()
+        if self.motion.lost(timestamp):
+            self.detector.reset()
+            self.last_dynamic = None
+
+    def _motion_discount(self, volume: TsdfVolume, view: FrameView, T_world_camera: NDArray[np.float64]) -> float:
+        """Factor of the weight of the intensities at the velocity that leads to a pose (4, 4)."""
+        velocity = self.motion.velocity_to(view.timestamp, T_world_camera)
+        time_sigma = self.config.sensor.color_time_sigma
+        return motion_discount(view.pyramid.fine, velocity, time_sigma, volume.voxel_size)
+
+    def _labels_unchanged(self, labels: Labels) -> bool:
+        """Whether so few pixels on the map changed their label since the previous frame that the coarser level need not
+        be registered again."""
+        changed = labels.dynamic if self.last_dynamic is None else labels.dynamic != self.last_dynamic
+        on_map = labels.sample.occupancy == SURFACE
+        return bool(np.count_nonzero(changed & on_map) <= UNCHANGED_SHARE * np.count_nonzero(on_map))
+
+    def _label(
+        self, volume: TsdfVolume, view: FrameView, prediction: PosePrediction, tracking: TrackingResult | Minimum
+    ) -> Labels:
+        """Labels of a registered frame."""
+        with view.timer("label"):
+            labels = self.detector.detect(
+                volume,
+                view.labelled,
+                tracking.T_world_camera,
+                view.timestamp,
+                view.segmentation,
+                prediction.moving,
+                tracking.exposure,
+            )
+            if view.blind:
+                labels = replace(labels, hidden=None)
+            if view.known_dynamic is None:
+                return labels
+            known = reduced(view.known_dynamic, view.labelled)
+            static_probability = np.where(known, np.float32(0), labels.static_probability)
+            return replace(labels, dynamic=labels.dynamic | known, static_probability=static_probability)

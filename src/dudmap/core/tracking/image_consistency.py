@@ -1,0 +1,159 @@
+"""Comparison of a registered frame with the last one, whatever the map is and whatever the registration weighs.
+
+A camera that jumps may converge to a wrong pose that fits the map. The last image, seen from there, then shows
+something else. Shape alone does not tell: walls and desks resemble each other, their texture does not.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.backends.cpu.reprojection import ReprojectionTarget, reproject
+from dudmap.core.backends.median import median
+from dudmap.core.dynamics.detector import depth_tolerance, distance_sigma
+from dudmap.core.frames.exposure import LARGE_GAIN, fit_exposure
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.pyramid import reduced
+from dudmap.core.geometry import se3
+from dudmap.core.tracking.checks import CONFIRMED_OF_SEEN, CONFIRMED_SHARE, MAX_IMAGE_SHIFT
+from dudmap.core.tracking.estimate import PoseEstimate
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.motion_model import MotionModel
+
+ImagePose = Callable[[], NDArray[np.float64] | None]
+"""Pose (4, 4) that the ego-motion between two images predicts; None if it is not known."""
+CLEARLY_LESS = 0.5
+"""Another motion explains two images clearly better if its misregistration is below this share of the other: both are
+known up to what noise and blur add to them, half a pixel in the median frame of a hand-held camera."""
+MIN_PIXELS = 100
+"""Pixels of the coarsest level that must show the same static surface in both images."""
+AGREEING_SIGMAS = 3 * np.sqrt(2)
+"""Difference of two readings of one surface that noise explains, in standard deviations of one of them."""
+MIN_CORNERS = 60
+"""Corners of an image from which on a motion that most of them follow would be found: four times those it needs."""
+
+
+@dataclass(frozen=True)
+class ImageComparison:
+    """The last tracked frame, seen from the pose of this one.
+
+    Attributes:
+        shift: Distance by which the static pixels of the last image lie beside those of this one, pixels of the
+            coarsest level; NaN where too few are common, or an image carries no information.
+        share: Share of the readings, static and dynamic, whose depth agrees with that of the last frame.
+        share_of_seen: The same share of those at whose place the last frame has a reading.
+    """
+
+    shift: float = np.nan
+    share: float = np.nan
+    share_of_seen: float = np.nan
+
+    @property
+    def confirms(self) -> bool:
+        """Whether both frames show the same surface: their depths agree."""
+        return self.share >= CONFIRMED_SHARE and self.share_of_seen >= CONFIRMED_OF_SEEN
+
+    @property
+    def is_same_view(self) -> bool:
+        """Whether depths and images agree. In a corridor the depths do wherever the camera is."""
+        return self.confirms and self.shift <= MAX_IMAGE_SHIFT
+
+
+class ImageConsistency:
+    """Measures how well the motion since the last tracked frame explains both frames.
+
+    Args:
+        config: Noise of the sensor. Without ``dynamics.start_seconds`` images are never compared, nor are they here.
+        motion: Knows the pose of the last tracked frame.
+    """
+
+    def __init__(self, config: Config, motion: MotionModel) -> None:
+        self.sensor = config.sensor
+        self._enabled = config.dynamics.method == "em" and config.dynamics.start_seconds > 0
+        self.motion = motion
+        self._last: tuple[Level, NDArray[np.uint8], bool] | None = None  # coarsest level, dynamic pixels, blind
+        self._gain = 1.0  # of the exposure of the last frame
+
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Compare the next frame with this one, whose pose is accepted."""
+        level = view.pyramid.coarse
+        if self._enabled:
+            self._last = level, _dynamic(estimate, level).astype(np.uint8), view.blind
+        self._gain = estimate.exposure[0]
+
+    def reset(self) -> None:
+        """Forget the last frame: a new map begins."""
+        self._last = None
+
+    def supported(self, view: FrameView, estimate: PoseEstimate, seen: ImageComparison, image_pose: ImagePose) -> bool:
+        """Whether the images are compatible with the pose of a frame.
+
+        They are not if the last one lies more than MAX_IMAGE_SHIFT beside this one, and the corners of the two follow
+        no common motion, or one that explains the images clearly better. Where the depths confirm the pose and not that
+        motion, colour and depth were taken at different times, and the pose is that of the depth. Blur alone moves
+        corners and images alike. That corners are not found again where the exposure has changed suddenly says nothing.
+
+        Args:
+            view: The frame.
+            estimate: Its pose and labels.
+            seen: Its comparison with the last frame.
+            image_pose: Computes the pose (4, 4) that the corners predict; None if they follow no common motion.
+        """
+        if not seen.shift > MAX_IMAGE_SHIFT:
+            return True
+        T_image = image_pose()
+        if T_image is None:
+            change = estimate.exposure[0] / self._gain
+            return len(view.pyramid.corners) < MIN_CORNERS or max(change, 1 / change) > LARGE_GAIN
+        other = self.compare(view, estimate, T_image)
+        return not other.shift < CLEARLY_LESS * seen.shift or (seen.confirms and not other.confirms)
+
+    def compare(
+        self, view: FrameView, estimate: PoseEstimate, T_world_camera: NDArray[np.float64] | None = None
+    ) -> ImageComparison:
+        """Comparison of a frame with the last tracked one.
+
+        A shift by d pixels in a random direction changes intensities by the mean square d^2 |grad I|^2 / 2, so
+
+            d = sqrt(2) median |I_last - I| / median |grad I|
+
+        over pixels that show the same surface in both images, after the best gain and offset. What does not resemble at
+        all gives the correlation length of the texture, a few pixels. Two depths agree within three standard deviations
+        of their difference.
+
+        Args:
+            view: This frame.
+            estimate: Its pose and labels.
+            T_world_camera: (4, 4) another pose of this frame; None for that of the estimate.
+
+        Returns:
+            Of NaN where the last frame is not known.
+        """
+        if self._last is None:
+            return ImageComparison()
+        level, (last, marks, blind) = view.pyramid.coarse, self._last
+        T_world_camera = estimate.T_world_camera if T_world_camera is None else T_world_camera
+        T_last_camera = se3.inverse(self.motion.T_world_camera) @ T_world_camera
+        target = ReprojectionTarget(T_last_camera, last.depth, last.intensity, marks)
+        seen = reproject(level.depth, level.intensity, level.camera.intrinsics, [target])[0]
+        static = (seen.marks == 0) & ~_dynamic(estimate, level)
+        agreeing = np.count_nonzero(np.abs(seen.gap) < AGREEING_SIGMAS * self.sensor.sigma(level.depth))
+        shares = [agreeing / max(np.count_nonzero(of), 1) for of in (level.depth, np.isfinite(seen.gap))]
+        tolerance = depth_tolerance(distance_sigma(self.sensor, level.depth, 0.0), level)
+        common = static & (np.abs(seen.gap) < tolerance)
+        if view.blind or blind or np.count_nonzero(common) < MIN_PIXELS:
+            return ImageComparison(np.nan, *shares)
+        gain, offset = fit_exposure(level.intensity, seen.difference, common.astype(np.float32))
+        difference = seen.difference + np.float32(1 - gain) * level.intensity - np.float32(offset)
+        down, across = np.gradient(level.intensity)
+        contrast = float(median(np.sqrt(down**2 + across**2)[common]))
+        shift = float(np.sqrt(2) * median(np.abs(difference[common])) / contrast) if contrast > 0 else np.nan
+        return ImageComparison(shift, *shares)
+
+
+def _dynamic(estimate: PoseEstimate, level: Level) -> NDArray[np.bool_]:
+    """Dynamic pixels (h, w) of a frame at the size of a level."""
+    return np.zeros(level.depth.shape, bool) if estimate.labels is None else reduced(estimate.labels.dynamic, level)

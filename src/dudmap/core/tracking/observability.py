@@ -1,0 +1,181 @@
+"""Directions of motion that a view does not determine, found from H (Zhang, Kaess and Singh 2016, On degeneracy of
+optimization-based state estimation problems)."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.backends.cpu.gradient_noise import NUM_MOMENTS, NUM_SUMS, isotropic, noise_sums
+from dudmap.core.backends.parameters import ImageStack, RegistrationParameters, single
+from dudmap.core.frames.observation import Level
+
+INTENSITY_SIGMA = 1 / 255
+"""Standard deviation of the intensity of a voxel: one grey level, in which voxels store it."""
+SAMPLES_ACROSS, MIN_SAMPLES = 40, 10
+"""Readings across the image from which the noise of H is computed, and how many of all must lie on the map."""
+INTERPOLATED = 2 * (2 / 3) ** 2
+"""Variance of a component of the gradient of the trilinear interpolation of independent values of variance 1, per cell:
+a difference of two means over four edges, each of whose weights a (1 - a) squares to (2/3)^2 over the cell."""
+STEEPEST = 9.5
+"""Tangent of the angle of incidence, 84 degrees, beyond which sensors give no reading."""
+REGULAR = 1e-6
+"""Share by which the diagonal of the noise is raised."""
+AXES = "sideways", "up and down", "forwards", "nodding", "turning", "rolling"
+"""Motion along and about the camera's x, y and z."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    """Which directions of a twist (v, omega) about the camera's centre a registration determines.
+
+    Attributes:
+        observable: (6, m) basis of the determined directions, world axes.
+        unobservable: (6 - m, 6) the others, camera axes; each of unit length if one radian counts as the mean depth.
+    """
+
+    observable: NDArray[np.float64]
+    unobservable: NDArray[np.float64]
+
+    @property
+    def is_complete(self) -> bool:
+        """Whether every direction is determined."""
+        return len(self.unobservable) == 0
+
+    def with_shown(self, shown: NDArray[np.bool_], R_world_camera: NDArray[np.float64]) -> "Observability":
+        """The same with those of the k unobservable directions that are ``shown`` (k,) among the observable ones."""
+        if shown.all():
+            return COMPLETE
+        more = np.kron(np.eye(2), R_world_camera) @ self.unobservable[shown].T
+        return Observability(np.hstack([self.observable, more]), self.unobservable[~shown])
+
+
+COMPLETE = Observability(np.eye(6), np.empty((0, 6)))
+"""Every direction is determined."""
+
+
+@dataclass(frozen=True, eq=False)
+class GradientNoise:
+    """Information that noise of the gradients alone contributes to H.
+
+    Attributes:
+        distances, intensities: (6, 6) of the two terms, world axes.
+        variances: Mean variances of the gradients of the two terms.
+        depth: Mean depth, metres.
+    """
+
+    distances: NDArray[np.float64]
+    intensities: NDArray[np.float64]
+    variances: tuple[float, float]
+    depth: float
+
+    def is_exceeded(self, H: NDArray[np.float64], least: float) -> bool:
+        """Whether H has more than ``least`` times the information of the noise on every direction: whether their
+        difference is positive definite. Then one of its two terms has."""
+        try:
+            np.linalg.cholesky(H - least * (self.distances + self.intensities))
+        except np.linalg.LinAlgError:
+            return False
+        return True
+
+    def observability(
+        self,
+        H_distances: NDArray[np.float64],
+        H: NDArray[np.float64],
+        R_world_camera: NDArray[np.float64],
+        least: float,
+    ) -> Observability:
+        """Directions on which the information of both terms, each in units of its own noise, exceeds it.
+
+        Gradients e + n of a term with noise n give E[H] = H_true + N: where a view says nothing, H is not zero but N,
+        and the registration settles wherever the noise fits best. A term of precise gradients and one of poor ones
+        count by their variances s^2: the generalised eigenvalues of
+
+            (H_d / s_d^2 + H_c / s_c^2) v = mu (N_d / s_d^2 + N_c / s_c^2) v
+
+        are 1 where there is only noise, whatever the units of translation and rotation.
+
+        Args:
+            H_distances: (6, 6) normal equations of the distances alone, world axes.
+            H: (6, 6) of both terms.
+            R_world_camera: (3, 3).
+            least: Smallest eigenvalue of a direction that is determined.
+        """
+        s_d, s_c = self.variances
+        information, noise = H_distances / s_d, self.distances / s_d
+        if s_c > 0:
+            information, noise = information + (H - H_distances) / s_c, noise + self.intensities / s_c
+        ratios, directions = _eigenvalues(information, noise)
+        if ratios[0] >= least:
+            return COMPLETE
+        free = np.kron(np.eye(2), R_world_camera.T) @ directions[:, ratios < least]
+        lengths = np.sqrt(np.sum(free[:3] ** 2, axis=0) + self.depth**2 * np.sum(free[3:] ** 2, axis=0))
+        return Observability(directions[:, ratios >= least], (free / lengths).T)
+
+
+def _eigenvalues(H: NDArray[np.float64], noise: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Generalised eigenvalues (6,) of ``H v = mu noise v``, ascending, and eigenvectors in the columns of (6, 6)."""
+    factor = np.linalg.inv(np.linalg.cholesky(noise))
+    ratios, vectors = np.linalg.eigh(factor @ H @ factor.T)
+    return ratios, np.asarray(factor.T @ vectors, dtype=np.float64)
+
+
+def gradient_noise(
+    level: Level,
+    residuals: ImageStack,
+    weights: NDArray[np.float32],
+    R_world_camera: NDArray[np.float64],
+    voxel_size: float,
+    map_width: int,
+    filter_px: float,
+    parameters: RegistrationParameters,
+) -> GradientNoise | None:
+    """What noise of the gradients contributes to H in a view.
+
+    Noise of standard deviation sigma per pixel of size a, smoothed by a Gaussian of width s, has the gradient variance
+    sigma^2 a^2 / (8 pi s^4) (variance sigma^2 a^2 / (4 pi s^2) over 2 s^2); s is that of the filter and of half a voxel
+    together. A voxel takes the reading of the nearest pixel, which on a slanted surface is wrong by a uniform share of
+    the step g between two pixels, in each voxel by another: the trilinear interpolation of distances of variance
+    g^2 / 12 has the gradient variance 2 (2/3)^2 g^2 / 12 / voxel^2. Intensities of neighbouring voxels are independent:
+    2 (2/3)^2 sigma_I^2 / voxel^2. The noise is isotropic, so that a reading at p from the camera's centre contributes
+    its variance times J' J with J = [I, -hat(p)].
+
+    Args:
+        level: The image.
+        residuals: (2, h, w) of the linearisation, NaN off the map.
+        weights: (h, w) static weights.
+        R_world_camera: (3, 3).
+        voxel_size: Metres.
+        map_width: Width of the images that the map was made of, pixels.
+        filter_px: Spatial standard deviation of their depth filter, pixels.
+        parameters: The weights of the residuals.
+
+    Returns:
+        None without enough readings on the map, or where the pixels of the map's images are wider than its voxels: then
+        neighbouring voxels take the same reading, and the noise is another one.
+    """
+    camera, stride = level.camera, max(1, level.camera.width // SAMPLES_ACROSS)
+    scale = camera.width / map_width
+    sums, numbers = np.zeros(NUM_SUMS), (filter_px * scale, scale, voxel_size, INTERPOLATED, STEEPEST)
+    noise_sums(
+        stride, level.depth, (residuals[0], residuals[1]), weights, camera.intrinsics, single(parameters),
+        *numbers, sums,
+    )  # fmt: skip
+    count, depth, weight = sums[:3]
+    if count < MIN_SAMPLES or depth / count / camera.fx * scale > voxel_size:
+        return None
+    s_d = sums[3] / max(weight, 1e-12)
+    s_c = INTERPOLATED * (INTENSITY_SIGMA / voxel_size) ** 2 if parameters.color_weight > 0 else 0.0
+    noise = np.empty((2, 6, 6))
+    for moments, share, out in zip((sums[3:-NUM_MOMENTS], sums[-NUM_MOMENTS:]), (1.0, s_c), noise, strict=True):
+        isotropic(moments, R_world_camera, stride**2 * share, REGULAR, out)
+    return GradientNoise(noise[0], noise[1], (max(s_d, 1e-12), s_c), depth / count)
+
+
+def sentence(unobservable: NDArray[np.float64]) -> str:
+    """Sentence on the directions (k, 6) that a view does not determine, empty if there are none."""
+    if len(unobservable) == 0:
+        return ""
+    strongest = np.abs(unobservable).max(axis=0)
+    named = [name for name, share in zip(AXES, strongest, strict=True) if share > 0.5 * strongest.max()]
+    return f"the view does not show how the camera moves in {len(unobservable)} direction(s): {', '.join(named)}"

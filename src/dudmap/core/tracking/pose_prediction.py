@@ -1,0 +1,193 @@
+"""Prediction of the camera pose, by constant velocity or by the ego-motion between two images."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.dynamics.dominant_motion import DominantMotion, exceeds_noise_share
+from dudmap.core.dynamics.ego_motion import EgoMotionSegmenter, SlowMotion
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.pyramid import is_majority_dynamic
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import FREE, UNKNOWN, TsdfVolume
+from dudmap.core.tracking.estimate import PoseEstimate, initial_weights
+from dudmap.core.tracking.frame_view import FrameView
+from dudmap.core.tracking.image_consistency import ImagePose
+from dudmap.core.tracking.motion_model import MotionModel
+from dudmap.core.tracking.tracker import Tracker
+
+CLEARLY_BETTER = 0.95
+"""A pose explains an image clearly better than another one if its cost is below this share of the other cost."""
+
+
+@dataclass(frozen=True, eq=False)
+class PosePrediction:
+    """Initial pose of a registration and what two images alone tell of the scene's motion.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        image_pose: Computes the pose (4, 4) that the ego-motion since the previous image predicts; None if unknown.
+        moving: (h, w) bool, label resolution, pixels that do not follow the ego-motion; None if not computed.
+        moving_before: (h, w) bool, the same for the first image of the map where it is compared with that; else None.
+        unverified_mask: (h, w) bool, pixels not verified as static while most of the view moves; else None.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    image_pose: ImagePose
+    moving: NDArray[np.bool_] | None = None
+    moving_before: NDArray[np.bool_] | None = None
+    unverified_mask: NDArray[np.bool_] | None = None
+
+
+class PosePredictor:
+    """Predicts by constant velocity, and by ego-motion while the map is young or most of the view is dynamic.
+
+    Args:
+        config: All parameters.
+        motion: Velocity of the camera.
+        tracker: Evaluates the cost of a pose.
+        known_poses: Poses (4, 4) by timestamp from a first pass over the recording.
+    """
+
+    def __init__(
+        self, config: Config, motion: MotionModel, tracker: Tracker, known_poses: Mapping[float, NDArray[np.float64]]
+    ) -> None:
+        self.motion = motion
+        self.tracker = tracker
+        self.ego_motion = EgoMotionSegmenter(config.dynamics.start_seconds if config.dynamics.method == "em" else 0.0)
+        self._known_poses = known_poses
+        self._single_frame_map = False  # the map holds one frame, whose dynamic pixels are not known yet
+        self._crowded_start = False  # most of the view has moved in every frame so far
+
+    def start(self, view: FrameView) -> None:
+        """A map has been made of this frame."""
+        self.ego_motion.start(view.timestamp)
+        self._single_frame_map = self._crowded_start = True
+
+    def is_crowded(self, view: FrameView, last_dynamic: NDArray[np.bool_] | None) -> bool:
+        """Whether most of the view has moved since the map was begun, or in the last tracked frame, whose dynamic
+        pixels (h, w) are given; None for none."""
+        return self._crowded_start or (last_dynamic is not None and is_majority_dynamic(last_dynamic, view.labelled))
+
+    def doubt(self, view: FrameView, prediction: PosePrediction, estimate: PoseEstimate) -> str:
+        """Sentence on why the labels of a tracked frame cannot be trusted yet, empty if they can.
+
+        In the first moments of a map motion of less than MOVES_PX from image to image cannot be told from that of the
+        camera. If something moves in view, more of it may move, more slowly, and drag the camera along. Where most of
+        the view is seen to move, the rest has been verified to be static corner by corner (``unverified_mask``).
+        """
+        if not self.ego_motion.slow_motion_is_hidden(view.timestamp):
+            return ""
+        moving = np.zeros(view.labelled.depth.shape, bool)
+        for mask in (prediction.moving, None if estimate.labels is None else estimate.labels.dynamic):
+            moving = moving if mask is None else moving | mask
+        if not exceeds_noise_share(moving, view.labelled) or prediction.unverified_mask is not None:
+            return ""
+        return "something moves in view, and the map is too young to show what else does"
+
+    def predict(
+        self, volume: TsdfVolume, view: FrameView, previously_dynamic: NDArray[np.bool_] | None
+    ) -> PosePrediction:
+        """Initial pose for the registration of a frame to a map.
+
+        Args:
+            volume: The map.
+            view: The frame.
+            previously_dynamic: (h, w) bool, dynamic pixels of the previous frame; None for none.
+        """
+        timestamp, pyramid = view.timestamp, view.pyramid
+        if self._known_poses and not self.ego_motion.started:
+            self.ego_motion.start(timestamp)
+        T_expected = self._known_poses.get(timestamp, self.motion.predict(timestamp))
+        by_velocity = PosePrediction(T_expected, lambda: self._image_pose(self._ego_motion(view)))
+        if not self.ego_motion.active:
+            return by_velocity
+        with view.timer("parallax"):
+            motion = self._ego_motion(view)
+            T_image = self._image_pose(motion)
+            if motion is None or T_image is None:
+                return by_velocity
+            slow = self._slow_motion(view, T_image, motion.moving_after)
+            if timestamp in self._known_poses:
+                T_image = T_expected
+            elif slow is not None:
+                T_image = slow.T_world_camera
+            elif not self._single_frame_map and self.fits_better(
+                volume, T_expected, T_image, pyramid.coarse, previously_dynamic
+            ):
+                return by_velocity  # the dominant motion is that of the dynamic objects
+            moving_before = motion.moving_before if self._single_frame_map else None
+            self._single_frame_map = False
+            moving = motion.moving_after
+            if slow is not None:
+                moving, moving_before = moving | slow.moving, slow.moving_first
+            young = self.ego_motion.map_is_young(timestamp)
+            self._crowded_start = self._crowded_start and young and is_majority_dynamic(moving, view.labelled)
+            unverified = ~motion.static_after if self._crowded_start else None
+            if not young:  # where the map is known, it labels better than two images
+                moving = moving & (_occupancy(volume, view.labelled, T_image) == UNKNOWN)
+        return PosePrediction(T_image, by_velocity.image_pose, moving, moving_before, unverified)
+
+    def update(self, view: FrameView, estimate: PoseEstimate) -> None:
+        """Set the image that the next one is compared with: a frame whose pose is accepted."""
+        if self.ego_motion.seconds == 0:
+            return
+        if view.blind:
+            self.ego_motion.reset()
+            return
+        with view.timer("parallax"):
+            dynamic = None if estimate.labels is None or not estimate.labels.dynamic.any() else estimate.labels.dynamic
+            T = estimate.T_world_camera
+            self.ego_motion.update(view.timestamp, T, view.pyramid, view.segmentation(), dynamic)
+
+    def _slow_motion(
+        self, view: FrameView, T_world_camera: NDArray[np.float64], moving: NDArray[np.bool_]
+    ) -> SlowMotion | None:
+        """Comparison with an older image, where that shows more to move than the last one does.
+
+        Motion below MOVES_PX from image to image is taken for that of the static world, and drags the pose along. Where
+        most of the view is seen to move anyway, few corners would be found again after a longer time.
+
+        Args:
+            view: The frame.
+            T_world_camera: (4, 4) its pose by the last image.
+            moving: (h, w) bool, what moves by the last image.
+        """
+        if is_majority_dynamic(moving, view.labelled):
+            return None
+        slow = self.ego_motion.slow_motion(view.timestamp, T_world_camera, view.pyramid, view.segmentation())
+        return slow if slow is not None and exceeds_noise_share(slow.moving & ~moving, view.labelled) else None
+
+    def _ego_motion(self, view: FrameView) -> DominantMotion | None:
+        """Motion of the static world from the previous image to this one."""
+        if self.ego_motion.seconds == 0:
+            return None
+        with view.timer("parallax"):
+            T_expected = se3.inverse(self.motion.predict(view.timestamp)) @ self.motion.T_world_camera
+            return self.ego_motion.compare(view.timestamp, view.pyramid, view.segmentation(), T_expected)
+
+    def _image_pose(self, motion: DominantMotion | None) -> NDArray[np.float64] | None:
+        return None if motion is None else self.motion.T_world_camera @ se3.inverse(motion.T_after_before)
+
+    def fits_better(
+        self,
+        volume: TsdfVolume,
+        T: NDArray[np.float64],
+        T_other: NDArray[np.float64],
+        level: Level,
+        previously_dynamic: NDArray[np.bool_] | None,
+    ) -> bool:
+        """Whether a pose explains the image clearly better than another one, not counting readings in free space."""
+        weights = initial_weights([level], previously_dynamic, []) or [np.ones_like(level.depth)]
+        static = np.where(_occupancy(volume, level, T) == FREE, np.float32(0), weights[0])
+        cost, other = (self.tracker.linearize(volume, level, pose, static).cost for pose in (T, T_other))
+        return cost < CLEARLY_BETTER * other
+
+
+def _occupancy(volume: TsdfVolume, level: Level, T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Occupancy (h, w) that the map gives the points of an image: UNKNOWN, SURFACE or FREE."""
+    volume.look_at(T_world_camera)
+    return volume.sample(level.depth, level.intensity, level.camera, T_world_camera).occupancy

@@ -1,0 +1,318 @@
+"""Direct registration of a frame to the distances and intensities of the map (thesis section 4.4, algorithm 2)."""
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
+from dudmap.core.backends.descent import SHORT_STEP, Descent, DescentRules
+from dudmap.core.backends.median import median
+from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.core.formulas.residual import residual_weights
+from dudmap.core.frames.exposure import chained, exposed, fit_exposure
+from dudmap.core.frames.observation import Level
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.checks import REGISTRATION, Limits, first_failure
+from dudmap.core.tracking.gradient_agreement import SHOWN, GradientAgreement
+from dudmap.core.tracking.observability import COMPLETE, Observability, gradient_noise
+
+FINEST_DAMPING = 1e-4
+"""Largest initial damping of the finest level, relative to the diagonal of J^T J: well below the eigenvalues of weak
+directions, along which more damping shortens the steps until they are taken for convergence."""
+EXPOSURE_NOISE = 0.01
+"""A change of gain and offset below this in total is noise of the fit and is not applied."""
+MEDIAN_STRIDE = 4
+"""Every so many pixels, across and down, enter the median intensity difference."""
+
+
+@dataclass(frozen=True, eq=False)
+class TrackingResult:
+    """Result of one registration.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that map the frame's intensities to those of the map.
+        converged: Whether all checks passed.
+        reason: The failed check, empty if none.
+        inlier_share: Share of the static readings that lie on the map.
+        residual: Root mean square of the distance residuals scaled by sigma(1 m) / sigma(z), metres at 1 m depth.
+        condition: Ratio of the smallest to the largest eigenvalue of the scaled H; near 0 a direction of motion is not
+            constrained.
+        iterations: Number of linearisations over all levels.
+        color_residual: Median absolute intensity difference (0..1) to the map at the static readings, after the best
+            gain and offset; NaN for a textureless image.
+        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
+        unobservable: (k, 6) twists, camera axes, along which the view determines no motion and the initial pose was
+            kept (``core/tracking/observability.py``).
+        readings: Number of static readings on the map, weighted.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    converged: bool
+    reason: str
+    inlier_share: float
+    residual: float
+    condition: float
+    iterations: int
+    color_residual: float = 0.0
+    settled: bool = True
+    unobservable: NDArray[np.float64] = field(default_factory=lambda: COMPLETE.unobservable)
+    readings: float = np.inf
+
+    @property
+    def figures(self) -> dict[str, float]:
+        """Figures of ``checks.REGISTRATION`` and ``checks.RELATIVE``; directions that are known not to be determined do
+        not count as badly conditioned, as long as others remain."""
+        missing = len(self.unobservable)
+        return {
+            "readings": self.readings,
+            "overlap": self.inlier_share,
+            "residual_mm": 1000 * self.residual,
+            "condition": self.condition if missing == 0 else np.nan if missing < 6 else 0.0,
+            "color_residual": self.color_residual,
+        }
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where a registration has ended.
+
+    Attributes:
+        T_world_camera: (4, 4).
+        exposure: Gain and offset that map the frame's intensities to those of the map.
+        equations: Normal equations there.
+        level: The finest image, in the exposure of the map, and its ``weights`` (h, w).
+        iterations: Number of linearisations over all levels.
+        settled: Whether the last level ended by a stop criterion and not at the iteration limit.
+        seen: Directions of motion that the view determines.
+    """
+
+    T_world_camera: NDArray[np.float64]
+    exposure: tuple[float, float]
+    equations: NormalEquations
+    level: Level
+    weights: NDArray[np.float32]
+    iterations: int
+    settled: bool
+    seen: Observability
+
+
+class Tracker:
+    """Coarse-to-fine registration of a frame to the map by Levenberg-Marquardt.
+
+    Args:
+        config: Residual weights, iterations, stop criteria, checks.
+        sensor: Noise of the depth readings.
+        filter_px: Spatial standard deviation of the filter of the depth images, pixels.
+    """
+
+    def __init__(
+        self, config: TrackerConfig, sensor: SensorConfig, filter_px: float = PreprocessConfig().smoothing_px
+    ) -> None:
+        self.config = config
+        self.sensor = sensor
+        self.filter_px = filter_px
+
+    def align(
+        self,
+        volume: TsdfVolume,
+        levels: list[Level],
+        T_init: NDArray[np.float64],
+        static_weights: list[NDArray[np.float32]] | None = None,
+        first_level: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
+        color_weight: float | None = None,
+    ) -> TrackingResult:
+        """Pose that minimises the distances and intensity differences of a frame to the map, and whether it can be
+        trusted; arguments as of ``minimize``."""
+        found = self.minimize(volume, levels, T_init, static_weights, first_level, exposure, color_weight)
+        T = found.T_world_camera.copy()
+        T[:3, :3] = se3.nearest_rotation(T[:3, :3])
+        return self._judge(replace(found, T_world_camera=T))
+
+    def minimize(
+        self,
+        volume: TsdfVolume,
+        levels: list[Level],
+        T_init: NDArray[np.float64],
+        static_weights: list[NDArray[np.float32]] | None = None,
+        first_level: int = 0,
+        exposure: tuple[float, float] = (1.0, 0.0),
+        color_weight: float | None = None,
+    ) -> Minimum:
+        """Minimum of the distances and intensity differences of a frame to the map (eq. 4.32).
+
+        Args:
+            volume: The map.
+            levels: Image pyramid, coarse to fine.
+            T_init: (4, 4) initial T_world_camera.
+            static_weights: Per level (h, w) float32 in [0, 1]; None weighs every pixel 1.
+            first_level: Index of the first of these levels in the configuration.
+            exposure: Initial gain and offset; fitted if the first of these levels is the coarsest one.
+            color_weight: Weight of the intensity term; None takes that of the configuration.
+        """
+        volume.look_at(T_init)
+        T, iterations, system, settled, seen = T_init, 0, None, True, None
+        lit, weights = levels[-1], np.ones_like(levels[-1].depth)
+        for index, level in enumerate(levels):
+            limit = self.config.iterations[first_level + index]
+            if limit == 0:
+                continue
+            weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
+            lit = exposed(level, exposure)
+            system = self.linearize(volume, lit, T, weights, color_weight)
+            iterations += 1
+            if self.config.exposure and index == 0 and first_level == 0:
+                change = fit_exposure(lit.intensity, system.residuals[1], weights)
+                if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
+                    exposure = chained(exposure, change)
+                    lit = exposed(level, exposure)
+                    system = self.linearize(volume, lit, T, weights, color_weight)
+                    iterations += 1
+            finest = first_level + index == len(self.config.iterations) - 1
+            if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
+                seen = self._observability(volume, lit, T, weights, system, color_weight)
+            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, seen), color_weight)
+            T, system, settled = found.T_world_camera, found.equations, found.settled
+            iterations += found.iterations
+        if system is None:  # all levels are skipped: the initial pose is judged
+            system = self.linearize(volume, lit, T, weights, color_weight)
+        return Minimum(T, exposure, system, lit, weights, iterations, settled, seen or COMPLETE)
+
+    def _observability(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: NormalEquations,
+        color_weight: float | None,
+    ) -> Observability:
+        """Directions that a level determines at a pose; all of them where too little is on the map to tell."""
+        least, R = self.config.min_information, T_world_camera[:3, :3]
+        if least == 0:
+            return COMPLETE
+        parameters = self.parameters(volume.band, color_weight)
+        noise = gradient_noise(
+            level, system.residuals, weights, R, volume.voxel_size, volume.camera.width, self.filter_px,
+            parameters,
+        )  # fmt: skip
+        if noise is None or noise.is_exceeded(system.H, least):
+            return COMPLETE
+        distances = self.linearize(volume, level, T_world_camera, weights, color_weight=0.0)
+        seen = noise.observability(distances.H, system.H, R, least)
+        if seen.is_complete:
+            return COMPLETE
+        agreement = GradientAgreement(level, system.residuals, weights, R, parameters)
+        step, shown = volume.voxel_size, []
+        for twist in seen.unobservable @ np.kron(np.eye(2), R).T:
+            forth, back = (
+                self.linearize(volume, level, se3.retract(T_world_camera, way * twist), weights, color_weight).residuals
+                for way in (step, -step)
+            )
+            shown.append(agreement.along(twist, forth, back, step) >= SHOWN)
+        return seen.with_shown(np.array(shown), R)
+
+    def _descend(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        system: NormalEquations,
+        rules: DescentRules,
+        color_weight: float | None,
+    ) -> Descent:
+        """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds."""
+        return volume.backend.register(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
+            self.parameters(volume.band, color_weight),
+        )  # fmt: skip
+
+    def _rules(self, limit: int, finest: bool, seen: Observability) -> DescentRules:
+        """Rules of the steps of a level, which move only along the directions that are ``seen``.
+
+        A reading that enters or leaves the map changes the cost by a constant, all of them together by half a percent,
+        and short steps change it by less. On the finest level they are taken by the gradient alone: else roundings
+        decide which are, and where the registration ends.
+        """
+        config, basis = self.config, seen.observable
+        if finest:
+            damping = min(config.damping, FINEST_DAMPING)
+            return DescentRules(basis, damping, limit, config.stop, stop_gain=0.0, taken=SHORT_STEP * config.stop)
+        return DescentRules(basis, config.damping, limit, config.stop_coarse, config.stop_gain, taken=0.0)
+
+    def linearize(
+        self,
+        volume: TsdfVolume,
+        level: Level,
+        T_world_camera: NDArray[np.float64],
+        weights: NDArray[np.float32],
+        color_weight: float | None = None,
+    ) -> NormalEquations:
+        """Normal equations (eq. 4.43 with the weights of 4.46) of a level at a pose.
+
+        Args:
+            volume: The map; its window must cover the view.
+            level: The image.
+            T_world_camera: (4, 4).
+            weights: (h, w) float32 static weights in [0, 1].
+            color_weight: Weight of the intensity term; None takes that of the configuration.
+        """
+        return volume.backend.linearize(
+            volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics,
+            volume.T_grid_camera(T_world_camera), self.parameters(volume.band, color_weight),
+        )  # fmt: skip
+
+    def parameters(self, band: TruncationBand, color_weight: float | None = None) -> RegistrationParameters:
+        """Parameters of the cost in a map with this truncation band; ``color_weight`` None: as configured."""
+        config, sensor = self.config, self.sensor
+        return RegistrationParameters(
+            band=band,
+            huber=config.huber,
+            tukey=config.tukey if config.robust == "tukey" else 0.0,
+            color_weight=config.color_weight if color_weight is None else color_weight,
+            color_huber=config.color_huber,
+            sigma_at_one_metre=sensor.sigma(1.0),
+            noise_weighting=float(config.noise_weighting),
+        )
+
+    def _judge(self, found: Minimum) -> TrackingResult:
+        """Result of a registration with the first check it fails.
+
+        The figures are comparable between configurations: distances are judged in units of the sensor's noise even if
+        the registration does not weigh by it, and intensities after the best gain and offset even if the registration
+        does not apply them.
+        """
+        config, system, level, weights = self.config, found.equations, found.level, found.weights
+        share = system.weight / max(system.readings, 1.0)
+        chi_square = system.chi_square if config.noise_weighting else self._chi_square(system, level, weights)
+        residual = float(np.sqrt(chi_square / max(system.weight, 1e-9)))
+        scale = 1 / np.sqrt(np.maximum(np.diag(system.H), 1e-30))
+        eigenvalues = np.linalg.eigvalsh(system.H * np.outer(scale, scale))
+        condition = float(max(eigenvalues[0], 0) / max(eigenvalues[-1], 1e-30))
+        differences = system.residuals[1]
+        if not config.exposure:
+            gain, offset = fit_exposure(level.intensity, differences, weights)
+            differences = differences + np.float32(1 - gain) * level.intensity - np.float32(offset)
+        difference = differences[::MEDIAN_STRIDE, ::MEDIAN_STRIDE][weights[::MEDIAN_STRIDE, ::MEDIAN_STRIDE] > 0.5]
+        difference = np.abs(difference[np.isfinite(difference)])
+        color_residual = float(median(difference)) if len(difference) else 0.0
+        result = TrackingResult(
+            found.T_world_camera, found.exposure, True, "", share, residual, condition, found.iterations,
+            color_residual, found.settled, found.seen.unobservable, system.weight,
+        )  # fmt: skip
+        reason = first_failure(REGISTRATION, result.figures, Limits(config, self.sensor))
+        return replace(result, converged=not reason, reason=reason)
+
+    def _chi_square(self, system: NormalEquations, level: Level, weights: NDArray[np.float32]) -> float:
+        """Robustly weighted sum of squared distances scaled by sigma(1 m) / sigma(z), m^2: what the linearisation
+        computes with ``noise_weighting``."""
+        noise = SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale)
+        everywhere = TruncationBand(np.inf, np.inf, 0.0, np.inf, noise)  # other residuals are NaN
+        parameters = self.parameters(everywhere)._replace(noise_weighting=1.0)
+        squares = residual_weights(level.depth, system.residuals, weights, parameters)[2]
+        return float(np.sum(squares, dtype=np.float64))

@@ -1,0 +1,156 @@
+"""Agreement of two maps at a relative pose: how much of the surface of one the other confirms, denies, or never saw."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.fleet.map_samples import EMPTY, IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
+
+CELL = 0.25
+"""Edge of the cells in which the mean colours of the surfaces are compared, metres."""
+MIN_CELL_POINTS = 8
+"""Points of a cell from which its mean colour is compared."""
+MIN_COLORED = 200
+"""Points with colours in both maps from which their colours can be compared at all."""
+MAX_COLOR_DIFFERENCE = 20.0
+"""Largest difference of the mean colours of a cell that agree, in each channel, after the gain of that channel."""
+
+MIN_AREA, MIN_OVERLAP = 1.0, 0.1
+"""Surface that both maps must hold: square metres, and share of the surface of the smaller one."""
+CLEAR_DISTANCE = 0.1
+"""Surface denied by free space must be farther than this from all surface of the other map, metres: drift, noise and a
+bent map shift surface by centimetres, what is another place by decimetres."""
+MAX_DENIED = 0.01
+"""Largest share of the compared surface that free space may deny. Runs of one place have up to 0.0014 (a real desk, two
+parts of one recording) or 0 to 0.006 (rendered); rendered rooms and corridors with moved furniture have 0.0185 to 0.12,
+floors of a building with other plants and boxes 0.006 to 0.024."""
+MIN_CORRELATION, MIN_COLOR_SHARE = 0.7, 0.9
+"""Smallest correlation of the intensities and share of the cells whose colours agree. Two maps of one rendered room
+have 0.995 and 1.0; with other textures of the small things 0.86 and 0.80, with others on all walls 0.48 and 0.44."""
+MAX_OTHER_COLOR, MAX_OTHER_SHARE = 0.1, 0.003
+"""Largest surface whose colours may disagree, square metres, for pairs among many runs, most of which do not show one
+place; or this share of the common surface, if that is more. Look-alikes differ by single things, a picture of
+30 x 30 cm, however much else is the same: a share alone lets them pass where much is seen. Floors of a rendered
+building with the same walls and doors and other pictures have 0.35 m2 and more, maps of one floor up to 0.05 m2."""
+
+
+@dataclass(frozen=True, eq=False)
+class Agreement:
+    """What two maps say about each other's surface.
+
+    Attributes:
+        area: Surface that both maps hold at the same place, square metres (mean of both directions).
+        overlap: That surface over all surface of the smaller map.
+        denied: Share of the compared surface that lies in known free space of the other map, larger of both directions,
+            counted where a camera came near enough for that to be certain.
+        color_correlation: Correlation of the intensities of the common surface.
+        color_share: Share of the cells of the common surface whose mean colours agree.
+        other_color: Common surface in the other cells, square metres.
+    """
+
+    area: float
+    overlap: float
+    denied: float
+    color_correlation: float
+    color_share: float
+    other_color: float
+
+    @property
+    def enough(self) -> bool:
+        """Whether both maps hold enough of one surface to be compared."""
+        return self.area >= MIN_AREA and self.overlap >= MIN_OVERLAP
+
+    def rejection_reason(self, many: bool = False) -> str:
+        """Sentence on the first check that fails, empty if the maps can be joined; ``many``: a pair among many runs."""
+        if not self.enough:
+            return f"they share only {self.area:.1f} m2 of surface, {self.overlap:.0%} of the smaller map"
+        if self.denied > MAX_DENIED:
+            return f"{self.denied:.1%} of the surface of one lies in free space of the other: the geometry disagrees"
+        return self.color_reason(many)
+
+    def color_reason(self, many: bool) -> str:
+        """Sentence on how the colours disagree, empty if they agree."""
+        if self.color_correlation < MIN_CORRELATION or self.color_share < MIN_COLOR_SHARE:
+            return (
+                f"the colours disagree: their correlation is {self.color_correlation:.2f}, and "
+                f"{self.color_share:.1%} of the common surface has the same colour"
+            )
+        if many and self.other_color > max(MAX_OTHER_COLOR, MAX_OTHER_SHARE * self.area):
+            return f"the colours disagree: {self.other_color:.2f} of {self.area:.1f} m2 have another colour"
+        return ""
+
+
+def agreement(
+    a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
+) -> Agreement:
+    """Compare two maps at a relative pose ``T_a_b`` (4, 4).
+
+    Args:
+        a, b: The maps.
+        of_a, of_b: Points on their surfaces.
+        T_a_b: World of b to world of a.
+    """
+    common_b, denied_b, color_a = _compared(a, of_a, of_b, T_a_b)
+    common_a, denied_a, color_b = _compared(b, of_b, of_a, se3.inverse(T_a_b))
+    area = (common_b.sum() * of_b.area_each + common_a.sum() * of_a.area_each) / 2
+    smaller = min(len(of_a) * of_a.area_each, len(of_b) * of_b.area_each)
+    denied = max(_share(denied_a & of_a.near, common_a & of_a.near), _share(denied_b & of_b.near, common_b & of_b.near))
+    points = np.concatenate([transformed(T_a_b, of_b.points[common_b]), of_a.points[common_a]])
+    colors_a = np.concatenate([color_a, of_a.color[common_a]]).astype(np.float64)
+    colors_b = np.concatenate([of_b.color[common_b], color_b]).astype(np.float64)
+    areas = np.repeat([of_b.area_each / 2, of_a.area_each / 2], [common_b.sum(), common_a.sum()])
+    colors = _color_agreement(points, colors_a, colors_b, areas)
+    return Agreement(float(area), float(area / max(smaller, 1e-9)), float(denied), *colors)
+
+
+def _share(denied: NDArray[np.bool_], common: NDArray[np.bool_]) -> float:
+    return denied.sum() / max(denied.sum() + common.sum(), 1)
+
+
+def _compared(
+    volume: TsdfVolume, own: SurfacePoints, surface: SurfacePoints, T: NDArray[np.float64]
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_], NDArray[np.float32]]:
+    """Which points (n,) of a surface a map, with a surface of its own, confirms and which it denies, and its colours
+    (m, 3) at those it confirms.
+
+    A point behind the surface of the map is neither: both sides of a thin plate cannot be in one map.
+    """
+    points = transformed(T, surface.points)
+    samples = sample_map(volume, points)
+    known = samples.state == OBSERVED
+    common = known & (np.abs(samples.sdf) < volume.truncation / 2)
+    denied = (samples.state == EMPTY) | (known & (samples.sdf >= IN_BAND * volume.truncation))
+    denied[denied] = KDTree(own.points).query(points[denied])[0] > CLEAR_DISTANCE
+    return common, denied, samples.color[common]
+
+
+def _color_agreement(
+    points: NDArray[np.float64],
+    colors_a: NDArray[np.float64],
+    colors_b: NDArray[np.float64],
+    areas: NDArray[np.float64],
+) -> tuple[float, float, float]:
+    """Correlation of the intensities of points (n, 3), share of their cells with agreeing mean colours, and area of the
+    points in the others."""
+    known = (colors_a.max(axis=1) > 0) & (colors_b.max(axis=1) > 0)
+    if np.count_nonzero(known) < MIN_COLORED:
+        return 0.0, 0.0, 0.0
+    points, colors_a, colors_b, areas = points[known], colors_a[known], colors_b[known], areas[known]
+    grey_a, grey_b = colors_a.mean(axis=1), colors_b.mean(axis=1)
+    plain = min(grey_a.std(), grey_b.std()) < 1e-6
+    correlation = 0.0 if plain else float(np.corrcoef(grey_a, grey_b)[0, 1])
+    gain = np.median(colors_a, axis=0) / np.maximum(np.median(colors_b, axis=0), 1)
+    cells = np.floor(points / CELL).astype(np.int64)
+    _, cell, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    cell = cell.reshape(-1)
+    enough = counts >= MIN_CELL_POINTS
+    if not enough.any():
+        return correlation, 0.0, 0.0
+    sums = np.stack([np.bincount(cell, channel) for channel in (colors_a - gain * colors_b).T], axis=1)
+    agreeing = np.abs(sums[enough] / counts[enough, None]).max(axis=1) < MAX_COLOR_DIFFERENCE
+    other = np.bincount(cell, areas)[enough][~agreeing].sum()
+    return correlation, float(np.mean(agreeing)), float(other)

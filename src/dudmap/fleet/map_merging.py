@@ -1,0 +1,132 @@
+"""Joining two saved maps: relative pose, refinement, checks, fusion."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.places.saved_map import SavedMap
+from dudmap.fleet.agreement import Agreement, agreement
+from dudmap.fleet.map_fusion import fuse_maps
+from dudmap.fleet.map_samples import SurfacePoints, surface_points
+from dudmap.fleet.relative_pose import Hypothesis, relative_poses
+from dudmap.fleet.sdf_alignment import MIN_STIFFNESS, SdfAlignment, align_maps
+
+SURFACE_POINTS = 20_000
+"""Points of each map's surface that the alignment and the checks use."""
+MIN_KEYFRAMES, MIN_FEATURES = 2, 40
+"""Keyframes of one map that must be recognised in the other at the same relative pose; a single one needs this many
+features that agree. Below, the maps are not even aligned; look-alikes reach 200 and are left to the checks."""
+NOT_RECOGNISED = "too few places of one were recognised in the other at the same relative pose"
+MAX_CORRECTION, MAX_CORRECTION_DEG = 0.06, 3.0
+"""Largest change of the relative pose of the features by the distances, metres at the middle of the common surface and
+degrees: that of a relocalised frame (``relocalization.max_distance``)."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapPair:
+    """What was found about two maps.
+
+    Attributes:
+        T_a_b: (4, 4) world of b to world of a, None if they are not to be joined.
+        reason: Sentence on why not; empty if they are.
+        hypothesis, alignment, agreement: Of the accepted relative pose, or of the first one that was tried.
+    """
+
+    T_a_b: NDArray[np.float64] | None
+    reason: str
+    hypothesis: Hypothesis | None = None
+    alignment: SdfAlignment | None = None
+    agreement: Agreement | None = None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether the surfaces lie on each other and have other colours, as two places of many that look alike.
+
+        Free space alone does not count: somebody who stayed in one map, or a bent map, also makes it disagree.
+        """
+        found = self.agreement
+        return self.T_a_b is None and found is not None and found.enough and bool(found.color_reason(many=True))
+
+    def tree(self) -> dict[str, Any]:
+        """The figures, for a JSON file."""
+        out: dict[str, Any] = {"reason": self.reason or None}
+        if self.T_a_b is not None:
+            out["T_a_b"] = self.T_a_b.tolist()
+        if self.hypothesis is not None:
+            out |= {"keyframes": self.hypothesis.num_keyframes, "features": self.hypothesis.num_inliers}
+        if self.alignment is not None:
+            out |= {"residual_m": round(self.alignment.residual, 6), "stiffness": round(self.alignment.stiffness, 6)}
+        if self.agreement is not None:
+            out |= {key: round(value, 4) for key, value in asdict(self.agreement).items()}
+        return out
+
+
+@dataclass(frozen=True, eq=False)
+class MapSurface:
+    """A map with points on its surface, to be compared with others."""
+
+    volume: TsdfVolume
+    points: SurfacePoints
+
+    @classmethod
+    def of(cls, saved: SavedMap) -> "MapSurface":
+        """That of a saved map.
+
+        Raises:
+            MapError: The map has no surface.
+        """
+        positions = np.array([keyframe.T_world_camera[:3, 3] for keyframe in saved.keyframes]).reshape(-1, 3)
+        return cls(saved.volume, surface_points(saved.volume, positions, SURFACE_POINTS))
+
+
+def compare_maps(a: SavedMap, b: SavedMap) -> MapPair:
+    """Find the relative pose of two maps, whose voxels have one size, and decide whether they show the same place.
+
+    Raises:
+        MapError: A map has no surface.
+    """
+    found = relative_poses(a.keyframes, b.keyframes, a.volume.camera, sensor=a.volume.sensor)
+    found = [one for one in found if one.num_keyframes >= MIN_KEYFRAMES or one.num_inliers >= MIN_FEATURES]
+    if not found:
+        return MapPair(None, NOT_RECOGNISED)
+    return decided(MapSurface.of(a), MapSurface.of(b), found)
+
+
+def decided(a: MapSurface, b: MapSurface, found: Sequence[Hypothesis], many: bool = False) -> MapPair:
+    """Refine and check suggested relative poses (at least one) one after the other; the first that passes all checks
+    is taken. ``many``: The maps are two of many, most of which do not show one place."""
+    first = MapPair(None, "")
+    for hypothesis in found:
+        pair = _checked(a, b, hypothesis, many)
+        if pair.T_a_b is not None:
+            return pair
+        first = first if first.reason else pair
+    return first
+
+
+def merged_map(a: SavedMap, b: SavedMap, T_a_b: NDArray[np.float64]) -> SavedMap:
+    """Fuse two maps into one in the world of a, with the keyframes of both."""
+    moved = [replace(keyframe, T_world_camera=T_a_b @ keyframe.T_world_camera) for keyframe in b.keyframes]
+    return SavedMap(fuse_maps([a.volume, b.volume], [np.eye(4), T_a_b]), [*a.keyframes, *moved], a.registrations)
+
+
+def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -> MapPair:
+    """Refine a relative pose and check what follows from it."""
+    aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
+    if not aligned.converged:
+        return MapPair(None, "their surfaces do not settle on each other", hypothesis, aligned)
+    if aligned.stiffness < MIN_STIFFNESS:
+        return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
+    correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b
+    middle = b.points.points.mean(axis=0)
+    moved = np.linalg.norm(correction[:3, :3] @ middle + correction[:3, 3] - middle)
+    if moved > MAX_CORRECTION or np.degrees(se3.rotation_angle(correction)) > MAX_CORRECTION_DEG:
+        return MapPair(None, "features and surfaces suggest different relative poses", hypothesis, aligned)
+    checked = agreement(a.volume, b.volume, a.points, b.points, aligned.T_a_b)
+    reason = checked.rejection_reason(many)
+    return MapPair(None if reason else aligned.T_a_b, reason, hypothesis, aligned, checked)

@@ -1,0 +1,112 @@
+"""Samples of a map at any points of its world: distance, intensity, colour, and what is known there."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial import KDTree
+
+from dudmap.core.backends.cpu.points import EMPTY, INTENSITY, OBSERVED, RED, SDF, UNSEEN, WEIGHT, sample_points
+from dudmap.core.map.volume import TsdfVolume
+
+__all__ = ["EMPTY", "OBSERVED", "UNSEEN", "MapSamples", "SurfacePoints", "sample_map", "surface_points"]
+
+IN_BAND = 0.9
+"""Share of the truncation distance within which a voxel holds a distance to a surface; beyond, it is in free space
+(``SURFACE_SHARE`` in ``core/formulas/voxel.py``)."""
+NOISE_IN_BAND = 2.0
+"""Standard deviations of a reading that fit into the truncation distance where a surface is reliable enough to be
+contradicted by free space: 95 % of its readings were not farther off."""
+
+
+@dataclass(frozen=True, eq=False)
+class MapSamples:
+    """A map at n points.
+
+    Attributes:
+        state: (n,) uint8, UNSEEN, OBSERVED, or EMPTY in a block of free space.
+        sdf: (n,) float32, distance to the surface, metres; the truncation distance in free space.
+        sdf_gradient: (n, 3) float32, metres per metre.
+        weight: (n,) float32, smallest weight of the voxels around the point.
+        intensity: (n,) float32, 0..1; 0 = unknown.
+        intensity_gradient: (n, 3) float32, per metre.
+        color: (n, 3) float32, red green blue, 0..255; 0 = unknown.
+    """
+
+    state: NDArray[np.uint8]
+    sdf: NDArray[np.float32]
+    sdf_gradient: NDArray[np.float32]
+    weight: NDArray[np.float32]
+    intensity: NDArray[np.float32]
+    intensity_gradient: NDArray[np.float32]
+    color: NDArray[np.float32]
+
+
+def sample_map(volume: TsdfVolume, points: NDArray[np.float64]) -> MapSamples:
+    """Trilinear samples of a map at points (n, 3) of its world, metres."""
+    blocks, size = volume.blocks, volume.voxel_size
+    rows, states = sample_points(
+        blocks.table, blocks.coords, blocks.slot_of, blocks.free_count, blocks.geometry, blocks.colors,
+        np.ascontiguousarray(points, dtype=np.float64) / size, np.eye(4)[:3],
+        volume.truncation / volume.sdf_unit, float(volume.config.carve_rate),
+    )  # fmt: skip
+    metres, shade = np.float32(volume.sdf_unit), np.float32(1 / 255)
+    return MapSamples(
+        states,
+        rows[:, SDF] * metres,
+        rows[:, SDF + 1 : SDF + 4] * np.float32(volume.sdf_unit / size),
+        rows[:, WEIGHT],
+        rows[:, INTENSITY] * shade,
+        rows[:, INTENSITY + 1 : INTENSITY + 4] * np.float32(1 / 255 / size),
+        rows[:, RED : RED + 3] / np.float32(4),
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class SurfacePoints:
+    """Points on the surface of a map.
+
+    Attributes:
+        points: (n, 3) float64, metres, world frame of the map.
+        intensity: (n,) float32, 0..1, 0 = unknown.
+        color: (n, 3) float32, red green blue, 0..255.
+        near: (n,) bool, whether a camera came so near that its noise lies within the truncation band.
+        area_each: Surface that a point stands for, square metres.
+    """
+
+    points: NDArray[np.float64]
+    intensity: NDArray[np.float32]
+    color: NDArray[np.float32]
+    near: NDArray[np.bool_]
+    area_each: float
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def surface_points(volume: TsdfVolume, cameras: NDArray[np.float64], count: int, seed: int = 1) -> SurfacePoints:
+    """At most ``count`` random vertices of the mesh of a map, which lie about evenly on its surface.
+
+    Args:
+        volume: The map.
+        cameras: (k, 3) positions of its keyframes, metres.
+        count: Largest number of points.
+        seed: Of the choice.
+
+    Raises:
+        MapError: The map is empty.
+    """
+    mesh = volume.extract_mesh()
+    chosen = np.arange(len(mesh.vertices))
+    if len(chosen) > count:
+        chosen = np.sort(np.random.default_rng(seed).choice(len(chosen), count, replace=False))
+    points = mesh.vertices[chosen].astype(np.float64)
+    samples = sample_map(volume, points)
+    distances = KDTree(cameras).query(points)[0] if len(cameras) else np.full(len(points), np.inf)
+    near = NOISE_IN_BAND * volume.sensor.sigma(distances) < volume.truncation
+    return SurfacePoints(points, samples.intensity, samples.color, near, mesh.area() / max(len(chosen), 1))
+
+
+def transformed(T: NDArray[np.float64], points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Points (n, 3) after a rigid motion (4, 4)."""
+    return points @ T[:3, :3].T + T[:3, 3]

@@ -1,0 +1,171 @@
+"""Refinement of the relative pose of two maps: the surface of each is registered to the distances of the other.
+
+Points to a signed distance field (Canelhas, Stoyanov and Lilienthal, SDF Tracker, 2013), with the intensities of the
+surfaces as in the tracker (thesis eq. 4.32), in both directions, so that neither map is preferred.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.fleet.map_samples import IN_BAND, OBSERVED, SurfacePoints, sample_map, transformed
+
+MAX_ITERATIONS = 40
+STOP = 1e-5
+"""Norm of the twist update (m, rad) that ends the refinement: a hundredth of a millimetre."""
+COLOR_WEIGHT = 0.1325
+"""Weight of the squared intensity difference (0..1) against the squared distance (m): thesis table 6.2."""
+COLOR_HUBER = 0.07
+"""Huber threshold of the intensity difference, as in the tracker."""
+SCALE = 0.5
+"""Residual at which the Geman-McClure weight of a distance has fallen to a quarter, voxels: about the standard
+deviation of a surface. What only one of the maps has seen from the front lies up to a truncation distance off."""
+SHRINKING = 0.5
+"""Factor by which that residual becomes smaller from step to step, from the truncation distance on."""
+MIN_POINTS = 500
+"""Points on the other map's surface below which the pose is not determined."""
+MIN_STIFFNESS = 0.02
+"""Smallest share of the points that must oppose a motion in every direction: the smallest eigenvalue of the normal
+matrix per point, with angles scaled by the extent of the points, in units of its largest. A plain wall has 0."""
+
+
+@dataclass(frozen=True, eq=False)
+class SdfAlignment:
+    """Result of a refinement.
+
+    Attributes:
+        T_a_b: (4, 4) world of b to world of a.
+        converged: Whether the last step was short and enough points lie on the surface of the other map.
+        residual: Root mean square distance of the points, weighted as in the refinement, metres.
+        stiffness: Least opposed direction over most opposed one, 0..1; see ``MIN_STIFFNESS``.
+        exposure: Gain and offset that bring the intensities of b to those of a.
+        center: (3,) middle of the common surface in the world of a, metres.
+    """
+
+    T_a_b: NDArray[np.float64]
+    converged: bool
+    residual: float
+    stiffness: float
+    exposure: tuple[float, float]
+    center: NDArray[np.float64]
+
+
+def align_maps(
+    a: TsdfVolume, b: TsdfVolume, of_a: SurfacePoints, of_b: SurfacePoints, T_a_b: NDArray[np.float64]
+) -> SdfAlignment:
+    """Refine a relative pose ``T_a_b`` (4, 4) by Gauss-Newton steps on distances and intensities.
+
+    Distances have Geman-McClure weights ``(1 + (r / c)^2)^-2`` with a scale ``c`` that shrinks from step to step (as in
+    graduated non-convexity, Yang et al. 2020), intensities Huber weights.
+
+    Args:
+        a, b: The maps.
+        of_a, of_b: Points on their surfaces.
+        T_a_b: Initial pose, closer than the truncation distance.
+    """
+    exposure, stiffness, residual, converged = (1.0, 0.0), 0.0, np.inf, False
+    center, scale = np.zeros(3), a.truncation
+    for _ in range(MAX_ITERATIONS):
+        rows = _rows_in_a(a, of_b, T_a_b, exposure).joined(_rows_in_b(b, of_a, T_a_b, exposure))
+        if len(rows.distance) < MIN_POINTS:
+            return SdfAlignment(T_a_b, False, residual, 0.0, exposure, center)
+        scale = max(SCALE * a.voxel_size, SHRINKING * scale)
+        weights = 1 / np.square(1 + np.square(rows.distance / scale))
+        H, g = _normal_equations(rows.J_distance, rows.distance, weights)
+        lit = COLOR_WEIGHT * np.minimum(1.0, COLOR_HUBER / np.maximum(np.abs(rows.shade), 1e-12))
+        H_c, g_c = _normal_equations(rows.J_shade, rows.shade, lit)
+        center = rows.points.mean(axis=0)
+        stiffness = _stiffness(H + H_c, center, rows.points)
+        residual = float(np.sqrt(np.average(np.square(rows.distance), weights=weights)))
+        H += H_c + 1e-9 * np.trace(H) * np.eye(6)
+        step = -np.linalg.solve(H, g + g_c)
+        T_a_b = se3.exp(step) @ T_a_b
+        T_a_b[:3, :3] = se3.nearest_rotation(T_a_b[:3, :3])
+        exposure = _exposure(rows.shade_a, rows.shade_b)
+        at_points = np.linalg.norm(step[:3] + np.cross(step[3:], center))
+        if scale <= SCALE * a.voxel_size and at_points < STOP and np.linalg.norm(step[3:]) < STOP:
+            converged = True
+            break
+    return SdfAlignment(T_a_b, converged, residual, stiffness, exposure, center)
+
+
+@dataclass(frozen=True, eq=False)
+class _Rows:
+    """Residuals and their derivatives by a left twist of T_a_b; points in the world of a."""
+
+    points: NDArray[np.float64]
+    distance: NDArray[np.float64]
+    J_distance: NDArray[np.float64]
+    shade: NDArray[np.float64]
+    J_shade: NDArray[np.float64]
+    shade_a: NDArray[np.float64]
+    shade_b: NDArray[np.float64]
+
+    def joined(self, other: "_Rows") -> "_Rows":
+        names = self.__dataclass_fields__
+        return _Rows(*(np.concatenate([getattr(self, name), getattr(other, name)]) for name in names))
+
+
+def _rows_in_a(a: TsdfVolume, of_b: SurfacePoints, T_a_b: NDArray[np.float64], exposure: tuple[float, float]) -> _Rows:
+    """Residuals of the surface of b in map a: ``p_a = T_a_b p_b`` moves by ``v + omega x p_a``."""
+    points = transformed(T_a_b, of_b.points)
+    near, lit, sdf, slope, shade_a, shade_slope = _near(a, of_b, points)
+    shade_b = of_b.intensity[lit].astype(np.float64)
+    shade = shade_a - exposure[0] * shade_b - exposure[1]
+    J, J_shade = _twist_rows(points[near], slope), _twist_rows(points[lit], shade_slope)
+    return _Rows(points[near], sdf, J, shade, J_shade, shade_a, shade_b)
+
+
+def _rows_in_b(b: TsdfVolume, of_a: SurfacePoints, T_a_b: NDArray[np.float64], exposure: tuple[float, float]) -> _Rows:
+    """Residuals of the surface of a in map b: ``p_b = T_a_b^-1 p_a`` moves by ``-R_b_a (v + omega x p_a)``."""
+    points = of_a.points
+    near, lit, sdf, slope, shade_b, shade_slope = _near(b, of_a, transformed(se3.inverse(T_a_b), points))
+    shade_a = of_a.intensity[lit].astype(np.float64)
+    shade = exposure[0] * shade_b + exposure[1] - shade_a
+    R_a_b = T_a_b[:3, :3]
+    J, J_shade = -_twist_rows(points[near], slope @ R_a_b.T), -_twist_rows(points[lit], shade_slope @ R_a_b.T)
+    return _Rows(points[near], sdf, J, shade, exposure[0] * J_shade, shade_a, shade_b)
+
+
+def _near(volume: TsdfVolume, surface: SurfacePoints, points: NDArray[np.float64]) -> tuple[NDArray, ...]:
+    """Which points (n,) lie near the surface of a map, and which of them have intensities in both; distance and its
+    gradient of the former, intensity and its gradient of the latter."""
+    samples = sample_map(volume, points)
+    near = (samples.state == OBSERVED) & (np.abs(samples.sdf) < IN_BAND * volume.truncation)
+    lit = near & (samples.intensity > 0) & (surface.intensity > 0)
+    values = samples.sdf[near], samples.sdf_gradient[near], samples.intensity[lit], samples.intensity_gradient[lit]
+    return near, lit, *(value.astype(np.float64) for value in values)
+
+
+def _twist_rows(points: NDArray[np.float64], gradients: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Derivatives (n, 6) of values with gradients (n, 3) at points (n, 3) that move with a left twist (v, omega)."""
+    return np.hstack([gradients, np.cross(points, gradients)])
+
+
+def _normal_equations(
+    J: NDArray[np.float64], residual: NDArray[np.float64], weights: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Matrix (6, 6) and gradient (6,) of the weighted squares of residuals (n,) with derivatives (n, 6)."""
+    weighted = J * weights[:, None]
+    return weighted.T @ J, weighted.T @ residual
+
+
+def _stiffness(H: NDArray[np.float64], center: NDArray[np.float64], points: NDArray[np.float64]) -> float:
+    """Smallest over largest eigenvalue of a normal matrix, about the centre of the points, angles scaled by extent."""
+    extent = max(float(np.sqrt(np.mean(np.sum(np.square(points - center), axis=1)))), 1e-6)
+    shift = np.eye(6)
+    shift[:3, 3:] = se3.hat(center)  # a rotation about the centre is one about the origin and a translation
+    scale = np.diag([1.0, 1.0, 1.0, 1 / extent, 1 / extent, 1 / extent])
+    values = np.linalg.eigvalsh(scale @ shift.T @ H @ shift @ scale)
+    return float(max(values[0], 0.0) / max(values[-1], 1e-300))
+
+
+def _exposure(shade_a: NDArray[np.float64], shade_b: NDArray[np.float64]) -> tuple[float, float]:
+    """Gain and offset from the intensities of b to those of a, which give them the same mean and spread."""
+    if len(shade_a) < MIN_POINTS:
+        return 1.0, 0.0
+    gain = float(np.clip(shade_a.std() / max(shade_b.std(), 1e-6), 0.5, 2.0))
+    return gain, float(shade_a.mean() - gain * shade_b.mean())

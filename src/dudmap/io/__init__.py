@@ -1,0 +1,1 @@
+"""Recordings and cameras in, files for other programs out."""

@@ -1,0 +1,118 @@
+"""Live cameras: one small class per driver, all with the interface ``LiveCamera``."""
+
+from abc import ABC, abstractmethod
+from importlib import import_module
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+from dudmap.errors import CameraError, FrameError, MissingExtraError
+from dudmap.extras import extra
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.geometry.camera import Camera
+
+__all__ = ["CAMERAS", "CameraFrame", "LiveCamera", "driver", "open_camera"]
+
+CAMERAS = {
+    "realsense": "realsense:RealSenseCamera",
+    "oak": "oak:OakCamera",
+    "orbbec": "orbbec:OrbbecCamera",
+    "iphone": "iphone:IPhoneCamera",
+    "openni": "openni:OpenNiCamera",
+    "replay": "replay:ReplayCamera",
+}
+"""Module and class of every camera by its name; without a name the first of them that is connected is taken."""
+
+
+class CameraFrame(NamedTuple):
+    """One frame of a camera.
+
+    Attributes:
+        number: Number of the frame in the stream; a gap tells that the camera or its driver lost frames.
+        frame: The frame, or why it cannot be read.
+        time: When it arrived, seconds of ``time.perf_counter``.
+    """
+
+    number: int
+    frame: "Frame | FrameError"
+    time: float
+
+
+class LiveCamera(ABC):
+    """A camera that delivers frames until it is closed.
+
+    Attributes:
+        name: Short name, usable as a folder name.
+        camera: Intrinsics of the depth images.
+        calibration: Of the colour camera; None for colour that is registered to depth.
+        ground_truth: None; a camera knows no true poses.
+        length: Number of frames in the stream, None where it has no end.
+        timed: Whether the times of the frames are those of a clock.
+    """
+
+    name: str
+    camera: "Camera"
+    calibration: "Calibration | None" = None
+    ground_truth: None = None
+    length: int | None = None
+    timed: bool = True
+
+    @abstractmethod
+    def read(self) -> CameraFrame | None:
+        """Next frame; waits for it. None at the end of the stream.
+
+        Raises:
+            CameraError: The camera stopped to deliver frames.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Stop the camera; ``read`` in another thread returns soon."""
+
+    def preview(self, count: int) -> "list[Frame]":
+        """Some frames before the stream begins, with which the kernels are loaded; fewer if the stream ends."""
+        frames = []
+        while len(frames) < count and (arrived := self.read()) is not None:
+            if not isinstance(arrived.frame, FrameError):
+                frames.append(arrived.frame)
+        return frames
+
+
+def open_camera(text: str | None = None) -> LiveCamera:
+    """Open a camera by ``name`` or ``name:argument``; None takes the first that is connected.
+
+    Raises:
+        CameraError: There is no such name, no such camera is connected, or its driver is missing.
+    """
+    if text is None:
+        return _first_connected()
+    name, _, argument = text.partition(":")
+    if name not in CAMERAS:
+        raise CameraError(f"there is no camera {name!r}; expected one of {', '.join(CAMERAS)}")
+    if name == "replay" and not argument:
+        raise CameraError("which recording is to be replayed? expected --camera replay:PATH")
+    module, class_name = CAMERAS[name].split(":")
+    kind = getattr(import_module(f"dudmap.io.cameras.{module}"), class_name)
+    return kind(argument) if argument else kind()
+
+
+def _first_connected() -> LiveCamera:
+    reasons = []
+    for name in CAMERAS:
+        if name != "replay":
+            try:
+                return open_camera(name)
+            except (CameraError, MissingExtraError) as error:
+                reasons.append(f"{name}: {error}")
+    raise CameraError("no camera was found; " + "; ".join(reasons))
+
+
+def driver(module: str, extra_name: str) -> Any:  # noqa: ANN401 - an optional package
+    """The module of a driver.
+
+    Raises:
+        MissingExtraError: It is not installed, or a system library that it needs is missing.
+    """
+    with extra(extra_name, f"a camera of the kind {extra_name}"):
+        return import_module(module)

@@ -1,0 +1,70 @@
+"""A recording as if it were a live camera: its frames arrive at the rate of the sensor."""
+
+import time
+from threading import Event
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from dudmap.errors import FrameError
+from dudmap.io.cameras import CameraFrame, LiveCamera
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.io.sequences import Sequence
+
+
+class ReplayCamera(LiveCamera):
+    """Delivers the frames of a recording at their times; the first one when it is first asked for.
+
+    Of the frames that become due while an earlier one is read from disk, only the newest is read, as a camera would
+    lose the others.
+
+    Args:
+        recording: Path of a recording in any format that is read, or the opened sequence.
+
+    Raises:
+        DatasetError: The recording cannot be opened.
+    """
+
+    def __init__(self, recording: "str | Sequence") -> None:
+        from dudmap.io.sequences import is_timed, open_sequence
+
+        self._sequence = open_sequence(recording) if isinstance(recording, str) else recording
+        self.name = self._sequence.name
+        self.camera, self.calibration = self._sequence.camera, self._sequence.calibration
+        self.length = len(self._sequence)
+        self.timed = is_timed(self._sequence)
+        self._times = self._sequence.timestamps - self._sequence.timestamps[0]
+        self._start: float | None = None
+        self._next = 0
+        self._closed = Event()
+
+    def read(self) -> CameraFrame | None:
+        """Next frame when it is due, None at the end."""
+        if self._start is None:
+            self._start = time.perf_counter()
+        if self._next >= len(self._times):
+            return None
+        early = self._start + self._times[self._next] - time.perf_counter()
+        if self._closed.wait(max(0.0, early)):
+            return None
+        elapsed = time.perf_counter() - self._start
+        number = max(self._next, int(np.searchsorted(self._times, elapsed, side="right")) - 1)
+        self._next = number + 1
+        return CameraFrame(number, self._frame(number), self._start + float(self._times[number]))
+
+    def preview(self, count: int) -> "list[Frame]":
+        """First frames; the replay begins later."""
+        frames = [self._frame(number) for number in range(min(count, len(self._times)))]
+        return [frame for frame in frames if not isinstance(frame, FrameError)]
+
+    def close(self) -> None:
+        """End the replay."""
+        self._closed.set()
+
+    def _frame(self, number: int) -> "Frame | FrameError":
+        try:
+            return self._sequence[number]
+        except FrameError as error:
+            return error

@@ -1,0 +1,85 @@
+"""The table of exporters: the ending of the target, or its whole name, tells the format."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from importlib import import_module
+from pathlib import Path
+
+from dudmap.errors import ConfigError
+from dudmap.io.exporting.options import MESH_OPTIONS, ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+
+
+@dataclass(frozen=True)
+class Exporter:
+    """A format that results can be written in.
+
+    Attributes:
+        summary: What the file holds, for the help page.
+        target: ``module:function`` of a function ``write(run, path, options) -> None``, imported when it is needed.
+        options: Names of the fields of ``ExportOptions`` that it takes.
+    """
+
+    summary: str
+    target: str
+    options: tuple[str, ...] = ()
+
+    @property
+    def write(self) -> Callable[[RunContent, Path, ExportOptions], None]:
+        """Writes the results of a run."""
+        module, _, name = self.target.partition(":")
+        return getattr(import_module(f"dudmap.io.exporting.{module}"), name)
+
+
+_GRID = ("crop", "drop_pieces_below", "up", "resolution")
+_VIEWS = ("crop", "drop_pieces_below", "sequence", "camera", "every")
+EXPORTERS: dict[str, Exporter] = {
+    ".ply": Exporter("mesh", "mesh_files:write_ply", MESH_OPTIONS),
+    ".obj": Exporter("mesh", "mesh_files:write_obj", MESH_OPTIONS),
+    ".stl": Exporter("mesh without colours", "mesh_files:write_stl", MESH_OPTIONS),
+    ".glb": Exporter("mesh for browsers and Blender, y up", "gltf:write", (*MESH_OPTIONS, "up")),
+    ".usdz": Exporter("mesh for USD programs, y up", "usd:write", (*MESH_OPTIONS, "up")),
+    ".points.ply": Exporter("point cloud", "point_clouds:write_ply", _GRID[:2]),
+    ".pcd": Exporter("point cloud of PCL", "point_clouds:write_pcd", _GRID[:2]),
+    ".laz": Exporter("point cloud, compressed LAS 1.4", "point_clouds:write_laz", _GRID[:2]),
+    ".e57": Exporter("point cloud, ASTM E57", "point_clouds:write_e57", _GRID[:2]),
+    ".npz": Exporter("occupancy and distance grids (ESDF), z up", "grids:write_npz", _GRID),
+    "map.yaml": Exporter("2D occupancy map for nav2, with map.pgm", "grids:write_nav2", (*_GRID, "heights")),
+    "transforms.json": Exporter("folder for nerfstudio", "view_synthesis:write_nerfstudio", _VIEWS),
+    "cameras.txt": Exporter("folder in COLMAP's text format", "view_synthesis:write_colmap", _VIEWS),
+    ".tum": Exporter("trajectory, TUM", "trajectories:write_tum"),
+    ".kitti": Exporter("trajectory, KITTI", "trajectories:write_kitti"),
+    ".csv": Exporter("trajectory, EuRoC", "trajectories:write_euroc"),
+    ".mcap": Exporter("ROS 2 messages (tf, odometry, path, points, mesh, movers), for Foxglove", "mcap:write"),
+}
+"""Exporters by the name of the file, or its ending."""
+
+
+def find_exporter(name: str) -> Exporter:
+    """Exporter for a file name.
+
+    Raises:
+        ConfigError: The ending is unknown.
+    """
+    found = [key for key in EXPORTERS if (name.lower().endswith(key) if key.startswith(".") else name == key)]
+    if not found:
+        raise ConfigError(f"cannot export to {name!r}; the ending or name must be one of {', '.join(EXPORTERS)}")
+    return EXPORTERS[max(found, key=len)]
+
+
+def export_run(folder: str | Path, to: str | Path, options: ExportOptions | None = None) -> Path:
+    """Write the results of a run folder in the format that the name of ``to`` tells; returns the path.
+
+    Raises:
+        ConfigError: The ending is unknown, an option does not fit, or the format needs a library that is not installed.
+        DatasetError: The folder is no run folder, is incomplete, or was written by a newer version.
+        MapError: The map or the mesh cannot be read, or is empty.
+        OSError: The file cannot be written.
+    """
+    to, options = Path(to), options or ExportOptions()
+    exporter = find_exporter(to.name)
+    options.check(exporter.options, to.name)
+    run = RunContent.load(folder)
+    to.parent.mkdir(parents=True, exist_ok=True)
+    exporter.write(run, to, options)
+    return to

@@ -1,0 +1,101 @@
+"""Binary glTF 2.0 files, which browsers and Blender open.
+
+Written here and not by trimesh, since glTF wants linear vertex colours with a material that says that they are not to
+be lit again: sRGB bytes look pale, and without a material a viewer takes metal.
+"""
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.atomic_file import atomic_file
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.io.exporting.gravity import up_of, y_up
+from dudmap.io.exporting.mesh_editing import edited
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+
+FLOAT, UINT16, UINT32 = 5126, 5123, 5125
+"""Component types of accessors."""
+VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
+MATERIAL = {
+    "name": "recorded colours",
+    "doubleSided": True,
+    "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+    "extensions": {"KHR_materials_unlit": {}},
+}
+"""Colours hold the light of the recording already; a program without the extension sees a matt surface."""
+
+
+def write(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the mesh of a run. Vertices keep the map's axes; the node turns them to y up.
+
+    Raises:
+        MapError: There is no mesh.
+        ConfigError: An option is invalid.
+        OSError: The file cannot be written.
+    """
+    mesh = edited(run.surface, options)
+    T = np.eye(4)
+    T[:3, :3] = y_up(up_of(run, options))
+    with atomic_file(path) as file:
+        file.write(encoded(mesh, T))
+
+
+def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64]) -> bytes:
+    """Content of a GLB file (glTF 2.0, sections 3 and 4.4).
+
+    Args:
+        mesh: The mesh.
+        T_gltf_mesh: (4, 4) motion of its node.
+    """
+    from dudmap import __version__
+
+    low, high = mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()
+    parts: list[tuple[NDArray, int, dict[str, Any]]] = [
+        (mesh.vertices.astype("<f4"), VERTEX_BUFFER, {"componentType": FLOAT, "type": "VEC3", "min": low, "max": high}),
+        (mesh.normals.astype("<f4"), VERTEX_BUFFER, {"componentType": FLOAT, "type": "VEC3"}),
+        (_linear(mesh.colors), VERTEX_BUFFER, {"componentType": UINT16, "type": "VEC4", "normalized": True}),
+        (mesh.faces.reshape(-1).astype("<u4"), INDEX_BUFFER, {"componentType": UINT32, "type": "SCALAR"}),
+    ]
+    accessors, views, start = [], [], 0
+    for number, (array, target, accessor) in enumerate(parts):
+        views.append({"buffer": 0, "byteOffset": start, "byteLength": array.nbytes, "target": target})
+        accessors.append(accessor | {"bufferView": number, "count": len(array)})
+        start += array.nbytes  # all are multiples of 4 bytes
+    attributes = {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2}
+    tree = {
+        "asset": {"version": "2.0", "generator": f"dudmap {__version__}"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"name": "map", "mesh": 0, "matrix": T_gltf_mesh.T.reshape(-1).tolist()}],
+        "meshes": [{"name": "map", "primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
+        "materials": [MATERIAL],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": start}],
+    }
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    total = 12 + 8 + len(text) + 8 + start
+    head = struct.pack("<4sII", b"glTF", 2, total) + struct.pack("<I4s", len(text), b"JSON") + text
+    return b"".join([head, struct.pack("<I4s", start, b"BIN\0"), *(array.tobytes() for array, _, _ in parts)])
+
+
+def linear_light(values: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Linear intensities in 0..1 of sRGB bytes (IEC 61966-2-1)."""
+    table = np.arange(256) / 255
+    table = np.where(table <= 0.04045, table / 12.92, ((table + 0.055) / 1.055) ** 2.4)
+    return table[values]
+
+
+def _linear(colors: NDArray[np.uint8]) -> NDArray[np.uint16]:
+    """Linear colours (V, 4) with full opacity."""
+    out = np.full((len(colors), 4), 65535, "<u2")
+    out[:, :3] = np.rint(65535 * linear_light(np.arange(256, dtype=np.uint8))).astype(np.uint16)[colors]
+    return out

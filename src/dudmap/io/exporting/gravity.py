@@ -1,0 +1,155 @@
+"""Where up is in a map, and at which height its floor lies."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.errors import ConfigError
+from dudmap.io.exporting.mesh_editing import face_vectors
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+
+CONE = np.cos(np.radians(45))
+"""The floor's normal is looked for within 45 degrees of the mean direction that the cameras held up."""
+PARALLEL = np.cos(np.radians(5))
+"""Normals within 5 degrees belong to one direction: the noise of a plane's triangles at 1 cm voxels."""
+CANDIDATES = 500
+"""Directions that are tried, spread evenly over the surface."""
+LEAST_SHARE = 0.02
+"""Least share of the whole surface that must face up."""
+LAYER = 0.05
+"""Half the thickness of the layer that counts as one height, metres."""
+FLOOR_SHARE = 0.1
+"""The floor is the lowest layer that has at least this share of all surface that faces up."""
+
+
+class Floor(NamedTuple):
+    """The floor of a map.
+
+    Attributes:
+        up: (3,) unit vector against gravity, world frame.
+        height: Of the floor along ``up``, metres.
+    """
+
+    up: NDArray[np.float64]
+    height: float
+
+
+def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
+    """Unit vector (3,) against gravity: the given one, else the normal of level surfaces, else what cameras held up."""
+    if options.up is not None:
+        return _unit(options.up)
+    held = mean_camera_up(run)
+    found = level_normal(run.surface, held)
+    height = None if found is None else floor_height(run.surface, found)
+    return held if found is None or height is None else fitted(run.surface, Floor(found, height)).up
+
+
+def find_floor(run: RunContent, options: ExportOptions) -> Floor:
+    """The floor of a map.
+
+    Raises:
+        ConfigError: No level surface was seen.
+    """
+    up = _unit(options.up) if options.up is not None else level_normal(run.surface, mean_camera_up(run))
+    height = None if up is None else floor_height(run.surface, up)
+    if up is None or height is None:
+        raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
+    return Floor(up, height) if options.up is not None else fitted(run.surface, Floor(up, height))
+
+
+def mean_camera_up(run: RunContent) -> NDArray[np.float64]:
+    """Mean direction (3,) of the upper edge of the images."""
+    return _unit(-run.trajectory.Ts_world_camera[:, :3, 1].mean(axis=0))
+
+
+def level_normal(mesh: Mesh, held: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """The most frequent normal (3,) of the surface near a direction (3,), None if little of it has any one."""
+    vectors = face_vectors(mesh)
+    areas = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
+    normals = vectors / areas[:, None]
+    near = np.flatnonzero(normals @ held > CONE)
+    if len(near) == 0:
+        return None
+    normals, sizes = normals[near], areas[near]
+    sums = np.cumsum(sizes)
+    steps = np.searchsorted(sums, np.linspace(0, sums[-1], CANDIDATES, endpoint=False))
+    tried = normals[np.minimum(steps, len(normals) - 1)]
+    shares = [float(sizes[normals @ direction > PARALLEL].sum()) for direction in tried]
+    best = tried[int(np.argmax(shares))]
+    if max(shares) < LEAST_SHARE * areas.sum():
+        return None
+    for _ in range(3):
+        around = normals @ best > PARALLEL
+        best = _unit((normals[around] * sizes[around, None]).sum(axis=0))
+    return best
+
+
+def floor_height(mesh: Mesh, up: NDArray[np.float64]) -> float | None:
+    """Height of the floor along ``up`` (3,), metres; None if no surface faces up."""
+    vectors = face_vectors(mesh)
+    areas = np.maximum(np.linalg.norm(vectors, axis=1), 1e-12)
+    level = vectors @ up > np.cos(np.radians(15)) * areas
+    if not level.any():
+        return None
+    heights, sizes = mesh.vertices[mesh.faces[level]].mean(axis=1) @ up, areas[level]
+    order = np.argsort(heights)
+    heights, sums = heights[order], np.concatenate([[0.0], np.cumsum(sizes[order])])
+    layer = sums[np.searchsorted(heights, heights + LAYER, "right")] - sums[np.searchsorted(heights, heights - LAYER)]
+    lowest = heights[np.argmax(layer >= FLOOR_SHARE * sums[-1])]
+    inside = (heights >= lowest - LAYER) & (heights <= lowest + 2 * LAYER)
+    return float(np.median(heights[inside]))
+
+
+def fitted(mesh: Mesh, floor: Floor) -> Floor:
+    """The plane through the vertices of the floor by least squares, in layers that get thinner to leave out what
+    stands on it: the mean of normals leans towards clutter."""
+    for half in (2 * LAYER, LAYER, LAYER / 2, LAYER / 2):
+        facing = mesh.normals @ floor.up > np.cos(np.radians(15))
+        points = mesh.vertices[facing & (np.abs(mesh.vertices @ floor.up - floor.height) < half)].astype(np.float64)
+        if len(points) < 10:
+            return floor
+        centre = points.mean(axis=0)
+        normal = np.linalg.eigh((points - centre).T @ (points - centre))[1][:, 0]
+        normal = normal if normal @ floor.up > 0 else -normal
+        floor = Floor(normal, float(centre @ normal))
+    return floor
+
+
+def y_up(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotation (3, 3) from the world to axes with y up and the first camera's view direction towards -z."""
+    back = -_across(up)
+    return np.stack([np.cross(up, back), up, back])
+
+
+def z_up(floor: Floor) -> NDArray[np.float64]:
+    """Motion (4, 4) from the world to axes with z up from the floor, x along the first camera's view, and the origin
+    below it (REP 103)."""
+    forward = _across(floor.up)
+    T = np.eye(4)
+    T[:3, :3] = np.stack([forward, np.cross(floor.up, forward), floor.up])
+    T[2, 3] = -floor.height
+    return T
+
+
+def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The first camera's view direction (0, 0, 1) without its part along ``up``, or its x axis if nothing is left."""
+    forward = np.array([0.0, 0.0, 1.0]) - up[2] * up
+    if np.linalg.norm(forward) < 0.1:
+        forward = np.array([1.0, 0.0, 0.0]) - up[0] * up
+    return _unit(forward)
+
+
+def _unit(vector: tuple[float, ...] | NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vector of length 1.
+
+    Raises:
+        ConfigError: It has no direction.
+    """
+    values = np.asarray(vector, np.float64)
+    length = float(np.linalg.norm(values))
+    if not np.isfinite(length) or length < 1e-9:
+        raise ConfigError(f"found the direction {tuple(vector)}; expected three numbers that are not all zero")
+    return values / length

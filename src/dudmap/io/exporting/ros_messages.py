@@ -1,0 +1,284 @@
+"""ROS 2 messages from and to arrays, without ROS: message classes come from the caller (rosbags or rclpy).
+
+Frames follow REP 105 with the optical camera axes of REP 103: ``map`` is the world of the map and ``camera`` has x
+right, y down and z forward.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.errors import DatasetError
+
+MAP_FRAME, CAMERA_FRAME = "map", "camera"
+POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
+"""A point of a cloud: metres, and colour as 0x00RRGGBB, which RViz and Foxglove read from a field ``rgb``."""
+FLOAT32 = 7
+"""``sensor_msgs/PointField.FLOAT32``, the type that by convention also the packed colour has."""
+TRIANGLE_LIST, CUBE, ADD, DELETE_ALL = 11, 1, 0, 3
+"""Constants of ``visualization_msgs/Marker``."""
+COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "mono8": "m", "8UC1": "m",
+                  "8UC3": "bgr"}  # fmt: skip
+"""Channels of the 8-bit encodings that are read."""
+DEPTH_TYPES = {"16UC1": (np.uint16, 0.001), "mono16": (np.uint16, 0.001), "32FC1": (np.float32, 1.0)}
+"""Type and metres per unit of the depth encodings (REP 118)."""
+
+
+@dataclass(frozen=True)
+class MessageTypes:
+    """Where message classes come from.
+
+    Attributes:
+        find: Class of a type such as ``nav_msgs/msg/Path``, which takes its fields as keywords.
+        octets: Bytes of an array in the form that a field ``uint8[]`` takes.
+    """
+
+    find: Callable[[str], Any]
+    octets: Callable[[NDArray], Any] = lambda array: np.frombuffer(array.tobytes(), np.uint8)
+
+    def make(self, kind: str, /, **fields: Any) -> Any:  # noqa: ANN401
+        """Message of a type."""
+        return self.find(kind)(**fields)
+
+
+# -- to messages -------------------------------------------------------------------------------------------------------
+
+
+def time_message(types: MessageTypes, seconds: float, name: str = "Time") -> Any:  # noqa: ANN401
+    """``builtin_interfaces/Time`` (or ``Duration``) of seconds."""
+    nanoseconds = round(seconds * 1e9)
+    return types.make(f"builtin_interfaces/msg/{name}", sec=nanoseconds // 10**9, nanosec=nanoseconds % 10**9)
+
+
+def header(types: MessageTypes, seconds: float, frame: str) -> Any:  # noqa: ANN401
+    """``std_msgs/Header``."""
+    return types.make("std_msgs/msg/Header", stamp=time_message(types, seconds), frame_id=frame)
+
+
+def vector(types: MessageTypes, xyz: Sequence[float] | NDArray, name: str = "Vector3") -> Any:  # noqa: ANN401
+    """``geometry_msgs/Vector3`` (or ``Point``)."""
+    x, y, z = (float(value) for value in xyz)
+    return types.make(f"geometry_msgs/msg/{name}", x=x, y=y, z=z)
+
+
+def rotation(types: MessageTypes, R: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    """``geometry_msgs/Quaternion`` of a rotation (3, 3)."""
+    x, y, z, w = (float(value) for value in se3.rotation_to_quat_xyzw(R))
+    return types.make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
+
+
+def pose(types: MessageTypes, T: NDArray[np.float64]) -> Any:  # noqa: ANN401
+    """``geometry_msgs/Pose`` of a rigid motion (4, 4)."""
+    return types.make(
+        "geometry_msgs/msg/Pose", position=vector(types, T[:3, 3], "Point"), orientation=rotation(types, T[:3, :3])
+    )
+
+
+def transform(types: MessageTypes, seconds: float, T_parent_child: NDArray[np.float64], parent: str, child: str) -> Any:  # noqa: ANN401
+    """``geometry_msgs/TransformStamped``: the pose (4, 4) of ``child`` in ``parent``."""
+    T = T_parent_child
+    motion = types.make(
+        "geometry_msgs/msg/Transform", translation=vector(types, T[:3, 3]), rotation=rotation(types, T[:3, :3])
+    )
+    return types.make(
+        "geometry_msgs/msg/TransformStamped",
+        header=header(types, seconds, parent), child_frame_id=child, transform=motion,
+    )  # fmt: skip
+
+
+def transforms(types: MessageTypes, stamped: Sequence[Any]) -> Any:  # noqa: ANN401
+    """``tf2_msgs/TFMessage`` of stamped transforms."""
+    return types.make("tf2_msgs/msg/TFMessage", transforms=list(stamped))
+
+
+def odometry(
+    types: MessageTypes, seconds: float, T: NDArray[np.float64], velocity: NDArray[np.float64], parent: str, child: str
+) -> Any:  # noqa: ANN401
+    """``nav_msgs/Odometry`` of a pose (4, 4) and a twist (6,) per second in camera axes; covariances 0 = unknown."""
+    twist = types.make(
+        "geometry_msgs/msg/Twist", linear=vector(types, velocity[:3]), angular=vector(types, velocity[3:])
+    )
+    unknown = np.zeros(36)
+    return types.make(
+        "nav_msgs/msg/Odometry",
+        header=header(types, seconds, parent),
+        child_frame_id=child,
+        pose=types.make("geometry_msgs/msg/PoseWithCovariance", pose=pose(types, T), covariance=unknown),
+        twist=types.make("geometry_msgs/msg/TwistWithCovariance", twist=twist, covariance=unknown),
+    )
+
+
+def path(types: MessageTypes, seconds: float, stamps: Sequence[float] | NDArray, Ts: NDArray, frame: str) -> Any:  # noqa: ANN401
+    """``nav_msgs/Path`` of poses (n, 4, 4) at times (n,)."""
+    poses = [
+        types.make("geometry_msgs/msg/PoseStamped", header=header(types, float(stamp), frame), pose=pose(types, T))
+        for stamp, T in zip(stamps, Ts, strict=True)
+    ]
+    return types.make("nav_msgs/msg/Path", header=header(types, seconds, frame), poses=poses)
+
+
+def cloud(types: MessageTypes, seconds: float, points: NDArray, colors: NDArray[np.uint8], frame: str) -> Any:  # noqa: ANN401
+    """``sensor_msgs/PointCloud2`` of points (n, 3), metres, with colours (n, 3)."""
+    rows = np.zeros(len(points), POINT)
+    for axis, name in enumerate("xyz"):
+        rows[name] = points[:, axis]
+    red, green, blue = colors.astype(np.uint32).T
+    rows["rgb"] = (red << 16) | (green << 8) | blue
+    fields = [
+        types.make("sensor_msgs/msg/PointField", name=name, offset=4 * number, datatype=FLOAT32, count=1)
+        for number, name in enumerate(("x", "y", "z", "rgb"))
+    ]
+    return types.make(
+        "sensor_msgs/msg/PointCloud2",
+        header=header(types, seconds, frame), height=1, width=len(points), fields=fields, is_bigendian=False,
+        point_step=POINT.itemsize, row_step=POINT.itemsize * len(points), data=types.octets(rows), is_dense=True,
+    )  # fmt: skip
+
+
+def image(types: MessageTypes, seconds: float, pixels: NDArray, encoding: str, frame: str) -> Any:  # noqa: ANN401
+    """``sensor_msgs/Image`` of an array (H, W) or (H, W, 3) whose bytes are those of the encoding."""
+    height, width = pixels.shape[:2]
+    return types.make(
+        "sensor_msgs/msg/Image",
+        header=header(types, seconds, frame), height=height, width=width, encoding=encoding, is_bigendian=0,
+        step=pixels.nbytes // height, data=types.octets(pixels),
+    )  # fmt: skip
+
+
+def mesh_marker(types: MessageTypes, seconds: float, mesh: Mesh, frame: str) -> Any:  # noqa: ANN401
+    """``visualization_msgs/Marker`` with the triangles of a mesh, coloured by vertex."""
+    corners = mesh.faces.reshape(-1)
+    find_point, find_color = types.find("geometry_msgs/msg/Point"), types.find("std_msgs/msg/ColorRGBA")
+    points = [find_point(x=x, y=y, z=z) for x, y, z in mesh.vertices[corners].astype(float).tolist()]
+    shades = (mesh.colors[corners] / 255).tolist()
+    colors = [find_color(r=r, g=g, b=b, a=1.0) for r, g, b in shades]
+    return _marker(types, seconds, frame, "mesh", 0, TRIANGLE_LIST, points=points, colors=colors)
+
+
+def mover_markers(types: MessageTypes, seconds: float, movers: Sequence[Mapping[str, Any]], frame: str) -> Any:  # noqa: ANN401
+    """``visualization_msgs/MarkerArray`` with the box of every moving object; older boxes are removed.
+
+    Args:
+        types: Message classes.
+        seconds: Time.
+        movers: Objects with ``id`` and ``box`` (lower and upper corner, metres), as in movers.jsonl.
+        frame: Frame of the boxes.
+    """
+    markers = [_marker(types, seconds, frame, "movers", 0, CUBE, action=DELETE_ALL)]
+    for mover in movers:
+        low, high = np.asarray(mover["box"], float)
+        T = np.eye(4)
+        T[:3, 3] = (low + high) / 2
+        scale = vector(types, np.maximum(high - low, 0.01))
+        markers.append(_marker(types, seconds, frame, "movers", int(mover["id"]), CUBE, T=T, scale=scale, alpha=0.4))
+    return types.make("visualization_msgs/msg/MarkerArray", markers=markers)
+
+
+def _marker(
+    types: MessageTypes,
+    seconds: float,
+    frame: str,
+    namespace: str,
+    number: int,
+    kind: int,
+    *,
+    T: NDArray[np.float64] | None = None,
+    alpha: float = 1.0,
+    **fields: Any,  # noqa: ANN401
+) -> Any:  # noqa: ANN401
+    """``visualization_msgs/Marker`` with all its fields."""
+    empty = types.octets(np.zeros(0, np.uint8))
+    common: dict[str, Any] = {
+        "header": header(types, seconds, frame), "ns": namespace, "id": number, "type": kind, "action": ADD,
+        "pose": pose(types, np.eye(4) if T is None else T), "scale": vector(types, (1, 1, 1)),
+        "color": types.make("std_msgs/msg/ColorRGBA", r=1.0, g=0.3, b=0.1, a=alpha),
+        "lifetime": time_message(types, 0.0, "Duration"), "frame_locked": False, "points": [], "colors": [],
+        "texture_resource": "", "uv_coordinates": [], "text": "", "mesh_resource": "",
+        "texture": types.make(
+            "sensor_msgs/msg/CompressedImage", header=header(types, seconds, frame), format="", data=empty
+        ),
+        "mesh_file": types.make("visualization_msgs/msg/MeshFile", filename="", data=empty),
+        "mesh_use_embedded_materials": False,
+    }  # fmt: skip
+    return types.make("visualization_msgs/msg/Marker", **(common | fields))
+
+
+# -- from messages -----------------------------------------------------------------------------------------------------
+
+
+def seconds_of(message: Any) -> float:  # noqa: ANN401
+    """Time of a message's header, seconds."""
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def color_of(message: Any) -> NDArray[np.uint8]:  # noqa: ANN401
+    """Colour (H, W, 3) of a ``sensor_msgs/Image``.
+
+    Raises:
+        DatasetError: The encoding is no 8-bit colour, or the message is too short.
+    """
+    channels = COLOR_CHANNELS.get(message.encoding)
+    if channels is None:
+        known = ", ".join(COLOR_CHANNELS)
+        raise DatasetError(f"colour of encoding {message.encoding!r} is not read; expected one of {known}")
+    pixels = _rows(message, np.dtype(np.uint8), len(channels))
+    if channels == "m":
+        return np.repeat(pixels, 3, axis=2)
+    return np.ascontiguousarray(pixels[..., [channels.index(name) for name in "rgb"]])
+
+
+def depth_of(message: Any) -> NDArray[np.float32]:  # noqa: ANN401
+    """Depth (H, W) in metres of a ``sensor_msgs/Image`` (REP 118), 0 = no reading.
+
+    Raises:
+        DatasetError: The encoding is no depth, or the message is too short.
+    """
+    kind = DEPTH_TYPES.get(message.encoding)
+    if kind is None:
+        raise DatasetError(
+            f"depth of encoding {message.encoding!r} is not read; expected one of {', '.join(DEPTH_TYPES)}"
+        )
+    order = ">" if message.is_bigendian else "<"
+    depth = _rows(message, np.dtype(kind[0]).newbyteorder(order), 1)[..., 0].astype(np.float32) * np.float32(kind[1])
+    depth[~np.isfinite(depth)] = 0
+    return depth
+
+
+def camera_of(message: Any) -> Camera:  # noqa: ANN401
+    """Camera of a ``sensor_msgs/CameraInfo``.
+
+    Raises:
+        DatasetError: It is not calibrated, or its distortion model is unknown.
+    """
+    k = [float(value) for value in message.k]
+    d = tuple(float(value) for value in message.d)
+    if k[0] <= 0 or k[4] <= 0:
+        raise DatasetError(
+            "the camera_info has no focal length; calibrate the camera or set its intrinsics in the driver"
+        )
+    if any(d) and (message.distortion_model not in ("plumb_bob", "rational_polynomial") or any(d[5:])):
+        raise DatasetError(
+            f"the distortion model {message.distortion_model!r} is not supported; rectify the images first"
+        )
+    distortion = d[:5] if any(d) else ()
+    return Camera(k[0], k[4], k[2], k[5], int(message.width), int(message.height), distortion=distortion)
+
+
+def _rows(message: Any, kind: np.dtype, channels: int) -> NDArray:  # noqa: ANN401
+    """Pixels (H, W, channels) of an image message, without the padding at the ends of its rows."""
+    height, width, step = int(message.height), int(message.width), int(message.step)
+    used = width * channels * kind.itemsize
+    octets = np.frombuffer(bytes(message.data), np.uint8)
+    if step < used or len(octets) < step * height:
+        raise DatasetError(
+            f"an image of {width}x{height} in {message.encoding} needs {used * height} bytes, but the message has "
+            f"{len(octets)}"
+        )
+    rows = octets[: step * height].reshape(height, step)[:, :used]
+    return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)

@@ -1,0 +1,163 @@
+"""The results in a run folder, as exporters take them."""
+
+import re
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap import __version__
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, MapError
+from dudmap.input_files import DAMAGE, parse_json, read_json, read_text
+
+if TYPE_CHECKING:
+    from dudmap.core.map.volume import TsdfVolume
+
+
+@dataclass(frozen=True, eq=False)
+class RunContent:
+    """Results of a run; each file is read when it is first asked for.
+
+    Attributes:
+        folder: The run folder.
+    """
+
+    folder: Path
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "RunContent":
+        """Open a run folder.
+
+        Raises:
+            DatasetError: The folder is no run folder, or was written by a newer version of dudmap.
+        """
+        folder = Path(folder)
+        if not (folder / "trajectory.txt").is_file():
+            raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
+        versions = _metrics(folder).get("versions")
+        written = str(versions.get("dudmap", "0")) if isinstance(versions, dict) else "0"
+        if _numbers(written) > _numbers(__version__):
+            raise DatasetError(f"{folder} was written by dudmap {written} and this is {__version__}; update dudmap")
+        return cls(folder)
+
+    @property
+    def recording(self) -> dict[str, Any]:
+        """Arguments of ``open_sequence`` for the recording of the run; empty if the run does not name it."""
+        found = _metrics(self.folder).get("recording")
+        return found if isinstance(found, dict) else {}
+
+    @cached_property
+    def trajectory(self) -> Trajectory:
+        """Poses of the tracked frames.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        return Trajectory.load(self.folder / "trajectory.txt")
+
+    @cached_property
+    def mesh(self) -> Mesh | None:
+        """The static surface, None if there is none (a run that only localised).
+
+        Raises:
+            MapError: The file is damaged.
+        """
+        path = self.folder / "mesh.ply"
+        return Mesh.load(path) if path.is_file() else None
+
+    @property
+    def surface(self) -> Mesh:
+        """The static surface.
+
+        Raises:
+            MapError: There is none, or it has no triangles.
+        """
+        if self.mesh is None:
+            raise MapError(f"{self.folder} holds no mesh.ply (a run that only localised, or that was cut off)")
+        if len(self.mesh.faces) == 0:
+            raise MapError(f"the mesh of {self.folder} has no triangles, so there is nothing to export")
+        return self.mesh
+
+    @cached_property
+    def volume(self) -> "TsdfVolume":
+        """The map.
+
+        Raises:
+            MapError: The file is missing, damaged or of a newer version.
+        """
+        from dudmap.core.map.volume import TsdfVolume
+
+        if not (self.folder / "map.npz").is_file():
+            raise MapError(f"{self.folder} holds no map.npz, which this needs; repeat the run without --localize")
+        return TsdfVolume.load(self.folder / "map.npz")
+
+    @cached_property
+    def movers(self) -> list[dict[str, Any]]:
+        """Moving objects by frame, as in movers.jsonl; none if there is no file.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        path = self.folder / "movers.jsonl"
+        if not path.is_file():
+            return []
+        try:
+            return [parse_json(line) for line in read_text(path).splitlines() if line.strip()]
+        except DAMAGE as error:
+            raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
+
+    @cached_property
+    def calibration(self) -> Calibration | None:
+        """Calibration of the colour camera that the run used, None if the folder holds none.
+
+        Raises:
+            DatasetError: The file is damaged.
+        """
+        path = self.folder / "calibration.toml"
+        return Calibration.load(path) if path.is_file() else None
+
+    def color_pose(self, timestamp: float) -> NDArray[np.float64]:
+        """Pose (4, 4) of the colour camera for an image with this time stamp; a second camera and its delay are
+        those of the calibration. Before the first and after the last pose it is that pose."""
+        calibration, stamps = self.calibration, self.trajectory.timestamps
+        delay = 0.0 if calibration is None else calibration.delay
+        T = self.trajectory.interpolate(float(np.clip(timestamp + delay, stamps[0], stamps[-1])))
+        return T if calibration is None else T @ np.linalg.inv(calibration.T_color_depth)
+
+    def mask_files(self) -> dict[float, Path]:
+        """Masks of what moves by time stamp of the depth image.
+
+        Raises:
+            DatasetError: The run saved no masks.
+        """
+        from dudmap.io.sequences.masks import stamped_masks
+
+        folder = self.folder / "masks"
+        masks = dict(stamped_masks(folder)) if folder.is_dir() else {}
+        if not masks:
+            raise DatasetError(f"{self.folder} holds no masks of what moves; repeat the run with --save-masks")
+        return masks
+
+
+def _metrics(folder: Path) -> dict[str, Any]:
+    """Content of metrics.json; empty without this file.
+
+    Raises:
+        DatasetError: It is damaged.
+    """
+    path = folder / "metrics.json"
+    try:
+        return dict(read_json(path)) if path.is_file() else {}
+    except DAMAGE as error:
+        raise DatasetError(f"{path} is damaged: {error}; repeat the run") from error
+
+
+def _numbers(version: str) -> list[int]:
+    """Major and minor number of a version."""
+    return [int(number) for number in re.findall(r"\d+", version)[:2]]

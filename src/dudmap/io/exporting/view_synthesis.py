@@ -1,0 +1,210 @@
+"""Posed images with masks, for view synthesis: folders of nerfstudio and of COLMAP."""
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.atomic_file import write_bytes, write_text
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.lens import Lens
+from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.other_view import OtherView
+from dudmap.errors import ConfigError, DatasetError
+from dudmap.input_files import damaged
+from dudmap.io.exporting.mesh_editing import edited
+from dudmap.io.exporting.options import ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+from dudmap.io.sequences.images import read_mask
+
+if TYPE_CHECKING:
+    from dudmap.io.sequences import Sequence
+
+NEAR = 0.001
+"""Largest difference between the time stamp of a frame and those of its pose and mask, seconds."""
+CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
+"""From OpenGL's camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward)."""
+PIXEL = 0.5
+"""These programs put the corner of the first pixel at the origin, dudmap its centre."""
+
+
+class View(NamedTuple):
+    """A posed image.
+
+    Attributes:
+        name: File name without its ending.
+        color: (h, w, 3) uint8, as recorded.
+        depth: (h, w) float32, metres, seen from the colour camera; of a camera beside the depth camera with gaps.
+        moving: (h, w) bool, what moves in the colour image.
+        T_world_color: (4, 4) pose of the colour image.
+    """
+
+    name: str
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    moving: NDArray[np.bool_]
+    T_world_color: NDArray[np.float64]
+
+
+def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write ``transforms.json`` and beside it images/, depth/ (16 bit, millimetres), masks/ (0 = moves, left out of
+    training) and the seed points points.ply. Poses are camera to world with OpenGL's camera axes.
+
+    Raises:
+        ConfigError: The recording is not named.
+        DatasetError: The recording or the masks cannot be read, or do not belong to the run.
+        MapError: There is no mesh.
+        OSError: A file cannot be written.
+    """
+    sequence, seeds = _open(run, options), _seeds(run, options)
+    folders = [path.parent / name for name in ("images", "depth", "masks")]
+    for folder in folders:
+        folder.mkdir(exist_ok=True)
+    seeds.save(path.parent / "points.ply")
+    frames = []
+    for view in _views(run, sequence, options.every):
+        name = f"{view.name}.png"
+        millimetres = np.rint(1000 * view.depth)
+        depth = np.where(millimetres > 65535, 0, millimetres).astype(np.uint16)
+        for folder, image in zip(folders, (view.color, depth, _kept(view)), strict=True):
+            _save(folder / name, image)
+        frames.append(
+            {
+                "file_path": f"images/{name}", "depth_file_path": f"depth/{name}", "mask_path": f"masks/{name}",
+                "transform_matrix": (view.T_world_color @ CV_GL).tolist(),
+            }
+        )  # fmt: skip
+    camera = _color_camera(run, sequence)
+    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), (*camera.distortion, *(0.0,) * 5), strict=False))
+    tree = {
+        "camera_model": "OPENCV", "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + PIXEL,
+        "cy": camera.cy + PIXEL, "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 0.001,
+        "ply_file_path": "points.ply", "frames": frames,
+    }  # fmt: skip
+    write_text(path, json.dumps(tree, indent=2) + "\n")
+
+
+def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` (points without tracks), and beside them images/ and
+    masks/ (``NAME.png.png``, 0 = moves, as COLMAP's ``ImageReader.mask_path`` wants them).
+
+    Raises:
+        ConfigError: The recording is not named.
+        DatasetError: The recording or the masks cannot be read, or do not belong to the run.
+        MapError: There is no mesh.
+        OSError: A file cannot be written.
+    """
+    sequence, seeds = _open(run, options), _seeds(run, options)
+    folder, camera = path.parent, _color_camera(run, sequence)
+    for name in ("images", "masks"):
+        (folder / name).mkdir(exist_ok=True)
+    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
+    for number, view in enumerate(_views(run, sequence, options.every), start=1):
+        name = f"{view.name}.png"
+        _save(folder / "images" / name, view.color)
+        _save(folder / "masks" / f"{name}.png", _kept(view))
+        T = se3.inverse(view.T_world_color)
+        x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
+        numbers = " ".join(f"{value:.9f}" for value in (w, x, y, z, *T[:3, 3]))
+        images += [f"{number} {numbers} 1 {name}", ""]
+    write_text(folder / "images.txt", "\n".join(images) + "\n")
+    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+    for number, (xyz, rgb) in enumerate(zip(seeds.vertices.tolist(), seeds.colors.tolist(), strict=True), start=1):
+        points.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
+    write_text(folder / "points3D.txt", "\n".join(points) + "\n")
+    write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n")
+
+
+def _colmap_camera(camera: Camera) -> str:
+    """Model, size and parameters: PINHOLE fx fy cx cy, OPENCV with k1 k2 p1 p2, FULL_OPENCV with k3 to k6."""
+    numbers = [camera.fx, camera.fy, camera.cx + PIXEL, camera.cy + PIXEL, *camera.distortion]
+    model = {0: "PINHOLE", 4: "OPENCV", 5: "FULL_OPENCV"}[len(camera.distortion)]
+    numbers += [0.0] * 3 if model == "FULL_OPENCV" else []
+    return f"{model} {camera.width} {camera.height} " + " ".join(f"{number:.9g}" for number in numbers)
+
+
+def index_at(stamps: NDArray[np.float64], timestamp: float) -> int | None:
+    """Number of the time in (N,) increasing ones that belongs to a frame's, None if there is none."""
+    nearest = int(np.argmin(np.abs(stamps - timestamp)))
+    return nearest if abs(float(stamps[nearest]) - timestamp) <= NEAR else None
+
+
+def _open(run: RunContent, options: ExportOptions) -> "Sequence":
+    given = {"path": options.sequence, "camera": options.camera}
+    opened = run.recording | {name: value for name, value in given.items() if value is not None}
+    if "path" not in opened:
+        raise ConfigError("the images come from the recording, which the run does not name; name it by --sequence")
+    if options.every < 1:
+        raise ConfigError(f"found --every {options.every}; expected 1 or more")
+    run.mask_files()
+    from dudmap.io.sequences import open_sequence
+
+    try:
+        with damaged(DatasetError, f"{run.folder}/metrics.json"):
+            sequence = open_sequence(**opened)
+    except DatasetError as error:
+        if options.sequence is not None:
+            raise
+        raise DatasetError(
+            f"the recording that the run names cannot be read; name it by --sequence: {error}"
+        ) from error
+    if sequence.calibration is not None and run.calibration is None:
+        raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
+    return sequence
+
+
+def _color_camera(run: RunContent, sequence: "Sequence") -> Camera:
+    """Camera of the recorded colour images: that of depth if they are registered to it."""
+    return sequence.camera if sequence.calibration is None or run.calibration is None else run.calibration.camera
+
+
+def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
+    return replace(edited(run.surface, options), faces=np.empty((0, 3), np.int32))
+
+
+def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
+    """The frames that have a pose and a mask.
+
+    Raises:
+        DatasetError: There are none.
+    """
+    masks, count = run.mask_files(), 0
+    stamps = np.array(sorted(masks))
+    other = None
+    if sequence.calibration is not None:
+        other = OtherView(Lens(sequence.camera), Lens(_color_camera(run, sequence)))
+    for index in range(0, len(sequence), every):
+        moment = float(sequence.timestamps[index])
+        pose, mask = index_at(run.trajectory.timestamps, moment), index_at(stamps, moment)
+        if pose is None or mask is None:
+            continue
+        frame, moving = sequence[index], read_mask(masks[float(stamps[mask])])
+        if moving.shape != frame.depth.shape:
+            raise DatasetError(f"the masks of {run.folder} do not have the size of the images of {sequence.name}")
+        taken = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
+        depth, T_world_color = frame.depth, run.color_pose(taken)
+        if other is not None:
+            T_color_depth = se3.inverse(T_world_color) @ run.trajectory.Ts_world_camera[pose]
+            depth, moving = other.depth(depth, T_color_depth), other.mask(moving, depth, T_color_depth)
+        yield View(f"frame_{index:05d}", frame.color, depth, moving, T_world_color)
+        count += 1
+    if not count:
+        raise DatasetError(f"no frame of {sequence.name} has a pose in {run.folder}; name the recording of that run")
+
+
+def _kept(view: View) -> NDArray[np.uint8]:
+    """Mask (H, W) of these programs: 255 = use."""
+    return np.where(view.moving, 0, 255).astype(np.uint8)
+
+
+def _save(path: Path, image: NDArray) -> None:
+    """Write a PNG image, colour in RGB order."""
+    import cv2
+
+    data = cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1]
+    write_bytes(path, data.tobytes(), sync=False)

@@ -1,0 +1,296 @@
+"""Readers of recordings: one small class per format, all with the interface ``Sequence``."""
+
+from dataclasses import astuple, replace
+from functools import cache
+from importlib import import_module
+from math import isfinite
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError, printable
+from dudmap.input_files import damaged
+
+if TYPE_CHECKING:
+    from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.calibration import Calibration
+    from dudmap.core.geometry.camera import Camera
+    from dudmap.core.geometry.trajectory import Trajectory
+
+__all__ = ["Reader", "Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
+
+
+@runtime_checkable
+class Sequence(Protocol):
+    """A recording with random access to its frames.
+
+    Attributes:
+        name: Short name, usable as a folder name.
+        camera: Intrinsics of the depth images, and of the colour images where these are registered to them.
+        calibration: Of the colour camera; None for colour that is registered to depth.
+        timestamps: (N,) float64 strictly increasing timestamps of the depth images, seconds.
+        ground_truth: True camera poses if known; used for evaluation only.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+    @property
+    def camera(self) -> "Camera": ...  # noqa: D102
+    @property
+    def calibration(self) -> "Calibration | None": ...  # noqa: D102
+    @property
+    def timestamps(self) -> NDArray[np.float64]: ...  # noqa: D102
+    @property
+    def ground_truth(self) -> "Trajectory | None": ...  # noqa: D102
+
+    def __len__(self) -> int:
+        """Number of frames."""
+        ...
+
+    def __getitem__(self, index: int) -> "Frame":
+        """Frame number ``index``.
+
+        Raises:
+            FrameError: This frame cannot be read; the others may be valid.
+        """
+        ...
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame if known; used for evaluation only."""
+        ...
+
+
+@runtime_checkable
+class Recording(Sequence, Protocol):
+    """A sequence on disk.
+
+    Attributes:
+        format: Name of its format, for people.
+        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
+            that they are assumed.
+        timed: Whether the times were read or their rate was given; False where they are invented.
+        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
+    """
+
+    opened: dict[str, Any]
+
+    @property
+    def format(self) -> str: ...  # noqa: D102
+    @property
+    def sources(self) -> dict[str, str]: ...  # noqa: D102
+    @property
+    def timed(self) -> bool: ...  # noqa: D102
+
+
+class Reader(Protocol):
+    """Class of a recording: recognises its format and opens a folder or file of it.
+
+    Attributes:
+        format: Name of the format, for people.
+        options: Names of the options of ``open_sequence`` that the format has.
+    """
+
+    @property
+    def format(self) -> str: ...  # noqa: D102
+    @property
+    def options(self) -> tuple[str, ...]: ...  # noqa: D102
+
+    def __call__(self, path: Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
+        """Open a recording."""
+        ...
+
+    def recognises(self, path: Path) -> bool:
+        """Whether an existing folder or file has this format, judged by names and first bytes only."""
+        ...
+
+
+READERS = (
+    "bonn:BonnSequence",
+    "corbs:CorbsSequence",
+    "openloris:OpenLorisSequence",
+    "icl_nuim:IclNuimSequence",
+    "icl_nuim:IclNuimLoopSequence",
+    "tum:TumSequence",
+    "nerfstudio:NerfstudioSequence",
+    "frame_files:VolumeDeformSequence",
+    "frame_files:SharedFrameFiles",
+    "scannet:ScanNetSequence",
+    "replica:ReplicaSequence",
+    "arkit:StrayScannerSequence",
+    "arkit:ArkitScenesSequence",
+    "arkit:PolycamSequence",
+    "redwood:RedwoodSequence",
+    "epfl:EpflSequence",
+    "bop:BopSequence",
+    "numbered:NumberedSequence",
+    "sens:SensRecording",
+    "klg:KlgRecording",
+    "record3d:Record3DRecording",
+    "azure_kinect:AzureKinectRecording",
+    "realsense:RealSenseRecording",
+    "bag:RosBag",
+)
+"""Module and class of the reader of every format, in the order in which they are tried: particular layouts first."""
+NUMBERED = READERS.index("numbered:NumberedSequence")
+DEPTH_OF_SEARCH = 3
+"""Levels of folders below the given one in which a recording is looked for."""
+
+
+@cache
+def readers() -> tuple[Reader, ...]:
+    """Readers of all formats, in the order in which they are tried."""
+    names = (reader.split(":") for reader in READERS)
+    return tuple(getattr(import_module(f"dudmap.io.sequences.{module}"), name) for module, name in names)
+
+
+def reader_of(path: Path) -> Reader | None:
+    """The first reader that recognises an existing folder or file, None if there is none."""
+    return next((reader for reader in readers() if reader.recognises(path)), None)
+
+
+def is_recording(path: Path) -> bool:
+    """Whether a folder or file is a recording of a known format, or an archive."""
+    from dudmap.io.sequences.archive import is_archive
+
+    return path.exists() and (reader_of(path) is not None or is_archive(path))
+
+
+def is_timed(sequence: object) -> bool:
+    """Whether the times of a sequence are known: not those of a recording whose frames are only numbered."""
+    return getattr(sequence, "timed", True)
+
+
+def open_sequence(
+    path: str | Path,
+    camera: "Camera | str | None" = None,
+    fps: float | None = None,
+    depth_unit: float | None = None,
+    **options: Any,  # noqa: ANN401
+) -> Recording:
+    """Open a recording with the first reader of ``readers()`` that recognises it.
+
+    A folder that is no recording itself may contain one. An archive (.zip, .tar, .tgz, .tar.gz, .tar.bz2, .tar.xz) is
+    unpacked into a cache first; ``archive.zip/folder`` names one of several recordings in it.
+
+    Args:
+        path: Folder, file or archive.
+        camera: Intrinsics that replace those of the recording: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``
+            (default: the size of the images, and the depth scale that is usual in the format).
+        fps: Frames per second of a recording whose frames are numbered, not timed; else 30 are assumed.
+        depth_unit: Metres per unit of the 16-bit depth images, such as 0.001; replaces that of camera and recording.
+        options: Of one format, e.g. ``topics`` of bags; None stands for an option that is not given.
+
+    Raises:
+        DatasetError: There is nothing at the path, no known format, several recordings, a defect, or an option that the
+            format lacks.
+    """
+    path = Path(path)
+    with damaged(DatasetError, f"the recording {path}"):
+        patterned = path.is_dir() and (options.get("color") or options.get("depth"))
+        place, reader = (path, readers()[NUMBERED]) if patterned else _find(path)
+    given = {name: value for name, value in options.items() if value is not None}
+    numbers = {"fps": fps, "depth_unit": depth_unit}
+    for name, number in numbers.items():
+        if number is not None and not (isfinite(number) and number > 0):
+            raise DatasetError(f"found {_option(name)} {number:g}; expected a positive number")
+    asked = [*given, *(name for name, number in numbers.items() if number is not None)]
+    foreign = [_option(name) for name in asked if name not in reader.options]
+    if foreign:
+        raise DatasetError(
+            f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
+        )
+    with damaged(DatasetError, f"the recording {place}"):
+        recording: Any = reader(place, camera, **given)
+        if depth_unit is not None:
+            recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
+            recording.sources["depth unit"] = f"--depth-unit {depth_unit:g}"
+        if fps is not None:
+            recording.set_rate(fps)
+        recording.name = printable(recording.name)
+        again = camera if isinstance(camera, str | None) else ",".join(map(str, astuple(camera)[:7]))
+        recording.opened = {"path": str(path.resolve()), "camera": again, **numbers, **given}
+        return recording
+
+
+def _option(name: str) -> str:
+    return "--" + name.replace("_", "-")
+
+
+def _find(path: Path) -> tuple[Path, Reader]:
+    """The recording at a path, in it, or in the archive at it, and its reader.
+
+    Raises:
+        DatasetError: There is none, or more than one.
+    """
+    from dudmap.io.sequences.archive import split, unpack
+
+    reader = reader_of(path) if path.exists() else None
+    if reader is not None:
+        return path, reader
+    packed = split(path)
+    if packed is not None:
+        return _find(unpack(packed[0]) / packed[1])
+    if not path.exists():
+        raise DatasetError(f"there is no folder or file {path}; expected a recording")
+    if path.is_dir() and not any(path.iterdir()):
+        raise DatasetError(f"the folder {path} is empty; expected a recording")
+    found = _recordings_in(path, DEPTH_OF_SEARCH) if path.is_dir() else []
+    if len(found) > 1:
+        names = ", ".join(str(place.relative_to(path)) for place, _ in found[:10])
+        more = f" and {len(found) - 10} more" if len(found) > 10 else ""
+        raise DatasetError(f"{path} contains {len(found)} recordings; name one of {names}{more}")
+    if not found:
+        raise DatasetError(_unknown(path))
+    place, reader = found[0]
+    return (place, reader) if reader is not None else _find(place)
+
+
+def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, Reader | None]]":
+    """Recordings below a folder with their readers, and archives with None; not those inside of other recordings."""
+    from dudmap.io.sequences.archive import is_archive
+
+    found: list[tuple[Path, Reader | None]] = []
+    for place in sorted(path.iterdir()):
+        reader = reader_of(place)
+        if reader is not None:
+            found.append((place, reader))
+        elif is_archive(place):
+            found.append((place, None))
+        elif place.is_dir() and levels > 1:
+            found += _recordings_in(place, levels - 1)
+    return found
+
+
+def _unknown(path: Path) -> str:
+    """Sentence on a folder or file that no reader recognises."""
+    listed = [name for name in ("rgb.txt", "depth.txt") if (path / name).is_file()]
+    if listed:
+        other = "depth.txt" if listed == ["rgb.txt"] else "rgb.txt"
+        return f"{path} is not a recording in TUM layout: {other} not found (an associations.txt would do instead)"
+    formats = ", ".join(dict.fromkeys(reader.format for reader in readers()))
+    if path.is_dir() and (images := _images_in(path)):
+        return images
+    kind = "folder" if path.is_dir() else "file"
+    return f"{path} is a {kind} in no known format; dudmap reads {formats} (docs/formats.md says what each looks like)"
+
+
+def _images_in(path: Path) -> str:
+    """Sentence on a folder with images in it, in a layout that is not known; empty if there are none."""
+    from dudmap.io.sequences.camera_files import IMAGES, seen
+    from dudmap.io.sequences.numbered import kinds_of_images
+
+    places = [place for place in (path, *sorted(path.iterdir())) if place.is_dir()]
+    places = [place for place in places if any(file.suffix.lower() in IMAGES for file in place.iterdir())]
+    if not places:
+        return ""
+    kinds = kinds_of_images(path)
+    known = [f"{len(files)} {kind} images in {files[0].parent.name}/" for kind, files in kinds.items() if files]
+    missing = " and ".join(kind for kind, files in kinds.items() if not files)
+    there = "; ".join(f"{'.' if place == path else place.name}/ with {seen(place)}" for place in places[:5])
+    return (
+        f"{path} holds images in no known layout: recognised {' and '.join(known) or 'nothing'} by the names, missing "
+        f"numbered {missing} images; there are {there}; name the files with --color PATTERN and --depth PATTERN, such "
+        f"as --depth '{places[0].name}/*.png'"
+    )

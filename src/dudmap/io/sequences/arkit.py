@@ -1,0 +1,196 @@
+"""Recordings of iPhones and iPads with LiDAR: Stray Scanner, ARKitScenes and the raw data of Polycam.
+
+ARKit gives depth of 256x192 pixels that shows the view of the colour image, and the confidence of every reading, 0 for
+the lowest. Readings of confidence 0 are left out, as Polycam's documentation advises.
+"""
+
+import math
+import re
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.association import TimedFile
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, FrameError
+from dudmap.input_files import read_json, read_text
+from dudmap.io.sequences import images
+from dudmap.io.sequences.camera_json import values_of
+from dudmap.io.sequences.image_folder import ImageFolder, numbered_files, size
+from dudmap.io.sequences.intrinsics import KEYS, Intrinsics
+from dudmap.io.sequences.nerfstudio import OPENGL_AXES, one_view
+from dudmap.io.sequences.poses import read_matrix, rigid_trajectory
+from dudmap.io.sequences.video import Video
+
+
+class ArkitFolder(ImageFolder):
+    """Base of the formats; ``confidence`` lies beside the folder of the depth images and has their file names."""
+
+    def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
+        depth = images.read_depth(path, depth_scale)
+        file = path.parent.with_name("confidence") / path.name
+        if file.is_file():
+            confidence = images.read_gray(file)
+            if confidence.shape != depth.shape:
+                raise FrameError(f"{file} is {size(confidence)} pixels, but the depth image {path} is {size(depth)}")
+            depth[confidence == 0] = 0
+        return depth
+
+    def _view(self, cameras: list[dict[str, float]], source: str) -> Intrinsics:
+        """Intrinsics of both images from those of colour images."""
+        color, depth = self._pairs[0]
+        shapes = self._read_color(color.path).shape[:2], self._read_depth(depth.path, self.depth_scale).shape
+        return one_view(cameras, *shapes, self.depth_scale, source)
+
+
+class StrayScannerSequence(ArkitFolder):
+    """Folder of the application Stray Scanner: a video of the colour images, and depth images by frame number.
+
+    Layout: https://github.com/strayrobots/scanner/blob/main/docs/format.md. ``rgb.mp4``, ``depth/000000.png`` (mm),
+    ``confidence/000000.png``, ``camera_matrix.csv`` (3x3) and ``odometry.csv``, which gives the time of each frame;
+    its poses are estimates of ARKit and no truth.
+    """
+
+    format = "Stray Scanner"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return all((path / name).exists() for name in ("rgb.mp4", "depth", "odometry.csv"))
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        file = self.path / "odometry.csv"
+        lines = read_text(file).splitlines()
+        if not lines or lines[0].replace(" ", "").split(",")[:2] != ["timestamp", "frame"]:
+            raise DatasetError(f"{file} does not start with the header 'timestamp, frame, x, ...' of Stray Scanner")
+        rows = [line.split(",")[:2] for line in lines[1:] if line.strip()]
+        times = {float(stamp): int(number) for stamp, number in rows}
+        depths = numbered_files((self.path / "depth").iterdir(), r"(\d+)\.png")
+        pairs = [
+            (TimedFile(stamp, self.path / "rgb.mp4" / str(times[stamp])), TimedFile(stamp, depths[times[stamp]]))
+            for stamp in sorted(filter(math.isfinite, times))
+            if times[stamp] in depths
+        ]
+        if not pairs:
+            raise DatasetError(f"{self.path}: none of the {len(rows)} frames in odometry.csv has a depth image")
+        return pairs
+
+    def _find_intrinsics(self) -> Intrinsics:
+        K = read_matrix(self.path / "camera_matrix.csv", 3, 3)
+        return self._view([{"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}], "camera_matrix.csv")
+
+    @cached_property
+    def _video(self) -> Video:
+        return Video(self.path / "rgb.mp4")
+
+    def _read_color(self, path: Path) -> NDArray[np.uint8]:
+        """Frame of the video; the last part of the path is its number."""
+        return self._video[int(path.name)]
+
+
+class ArkitScenesSequence(ArkitFolder):
+    """Video of ARKitScenes (Baruch et al. 2021), raw or 3dod: images of 256x192 pixels with times in their names.
+
+    Layout: https://github.com/apple/ARKitScenes/blob/main/DATA.md. ``lowres_wide/ID_TIME.png``, ``lowres_depth``,
+    ``confidence``, ``lowres_wide_intrinsics/ID_TIME.pincam`` and ``lowres_wide.traj``, which has motions of the world
+    into the camera. Intrinsics per image are replaced by their median.
+    """
+
+    format = "ARKitScenes"
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return all((path / name).is_dir() for name in ("lowres_wide", "lowres_depth", "lowres_wide_intrinsics"))
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        colors, depths = (self._timed(kind, "png") for kind in ("lowres_wide", "lowres_depth"))
+        return self._pair_timed(colors, depths)
+
+    def _timed(self, folder: str, suffix: str) -> list[TimedFile]:
+        matches = ((re.fullmatch(rf"\d+_(\d+\.\d+)\.{suffix}", f.name), f) for f in (self.path / folder).iterdir())
+        return sorted(TimedFile(float(match[1]), file) for match, file in matches if match)
+
+    def _find_intrinsics(self) -> Intrinsics:
+        files = [file.path for file in self._timed("lowres_wide_intrinsics", "pincam")]
+        if not files:
+            raise DatasetError(
+                f"{self.path}/lowres_wide_intrinsics holds no files ID_TIME.pincam; give --camera fx,fy,cx,cy"
+            )
+        numbers = [read_matrix(file, 1, 6)[0, 2:].tolist() for file in files]  # after width and height
+        return self._view([dict(zip(KEYS[:4], row, strict=True)) for row in numbers], "lowres_wide_intrinsics")
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        file = self.path / "lowres_wide.traj"
+        if not file.is_file():
+            return None
+        rows = np.array(read_text(file).split(), np.float64).reshape(-1, 7)
+        poses = []
+        for row in rows[np.unique(rows[:, 0], return_index=True)[1]]:
+            T_camera_world = np.eye(4)
+            T_camera_world[:3, :3], T_camera_world[:3, 3] = se3.exp_rotation(row[1:4]), row[4:]
+            poses.append((float(row[0]), se3.inverse(T_camera_world)))
+        return rigid_trajectory(poses)
+
+
+class PolycamSequence(ArkitFolder):
+    """Raw data of the application Polycam: keyframes with a time in microseconds as name.
+
+    Layout: https://github.com/PolyCam/polyform#polycams-data-format. In ``keyframes`` lie ``images/TIME.jpg``,
+    ``cameras/TIME.json``, ``depth/TIME.png`` (mm) and ``confidence/TIME.png``; ``corrected_images`` and
+    ``corrected_cameras`` are taken instead of images and cameras where there are any. The corrected cameras are
+    optimised over all images and taken as truth; the others are estimates of ARKit and are not. Intrinsics per image
+    are replaced by their median.
+    """
+
+    format = "Polycam"
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        folder = Path(path)
+        super().__init__(folder / "keyframes" if (folder / "keyframes").is_dir() else folder, camera)
+        self.name = folder.resolve().name
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder has this layout, or is the ``keyframes`` of one that has it."""
+        return any(
+            (place / "depth").is_dir() and any(place.glob("*images")) and any(place.glob("*cameras/*.json"))
+            for place in (path / "keyframes", path)
+        )
+
+    @cached_property
+    def _kind(self) -> str:
+        """First part of the names of the folders of images and cameras."""
+        return "corrected_" if any(self.path.glob("corrected_images/*.jpg")) else ""
+
+    @cached_property
+    def _cameras(self) -> dict[int, dict[str, Any]]:
+        """Content of the camera files by number of the frame."""
+        files = numbered_files(self.path.glob(f"{self._kind}cameras/*"), r"(\d+)\.json")
+        return {number: read_json(file) for number, file in files.items()}
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        colors = numbered_files(self.path.glob(f"{self._kind}images/*"), r"(\d+)\.jpg")
+        depths = numbered_files(self.path.glob("depth/*"), r"(\d+)\.png")
+        return self._pair_numbered(colors, depths, per_second=1e6)
+
+    def _find_intrinsics(self) -> Intrinsics:
+        found = [values for tree in self._cameras.values() if (values := values_of(tree)) is not None]
+        if not found:
+            raise DatasetError(f"{self.path / self._kind}cameras holds no camera with fx, fy, cx and cy")
+        return self._view(found, f"{self._kind}cameras")
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        if not self._kind:
+            return None
+        poses = []
+        for number, tree in self._cameras.items():
+            T = np.eye(4)
+            T[:3] = [[float(tree[f"t_{row}{column}"]) for column in range(4)] for row in range(3)]
+            poses.append((number / 1e6, T @ OPENGL_AXES))
+        return rigid_trajectory(poses)

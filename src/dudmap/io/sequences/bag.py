@@ -1,0 +1,270 @@
+"""ROS 1 bags, ROS 2 bags (folders, sqlite and MCAP files), through the package rosbags."""
+
+import weakref
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.association import LARGEST_GAP, associate
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, FrameError
+from dudmap.input_files import GIT_LFS, foreign, open_plain
+from dudmap.io.sequences import bag_images, bag_topics, intrinsics
+from dudmap.io.sequences.bag_file import BagFile, MessageTimes
+from dudmap.io.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
+from dudmap.io.sequences.file_recording import FileRecording
+from dudmap.io.sequences.image_folder import PROBES, size
+from dudmap.io.sequences.lens import Lens
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+MAGIC = {".bag": b"#ROSBAG V2.0", ".db3": b"SQLite format 3", ".mcap": b"\x89MCAP0\r\n"}
+"""First bytes of the files by their suffix."""
+MILLIMETRES = 1000.0
+"""Units per metre of 16-bit depth images (ROS REP 118)."""
+FIRST_TRANSFORMS = 300
+"""Number of first /tf messages that tell which frames there are: some seconds of a robot that publishes at 100 Hz."""
+
+
+class RosBag(FileRecording):
+    """Recording in a ROS bag, opened through its index: neither images nor poses are read before they are asked for.
+
+    The time of a frame is that in the header of its depth message; colour is associated one to one, nearest first, at
+    most 20 ms apart. In compressed bags the times are those of recording less the median delay of the first messages.
+    Where headers hold no increasing times, the times of recording are taken. A message that was recorded at the very
+    time of another one of its topic is left out.
+
+    Intrinsics come from the camera_info beside the image topics. Depth and colour of one frame of reference and equal
+    intrinsics are registered; else ``calibration`` holds the colour camera and the motion between both from /tf_static.
+    Lenses with more than five coefficients (rational, fisheye) are rectified when an image is read. The true trajectory
+    is that of the depth camera in the frame ``world`` of /tf, if there is one.
+
+    Args:
+        path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
+        camera: Intrinsics of the depth images that replace those of the bag.
+        topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
+
+    Raises:
+        MissingExtraError: The package rosbags is missing.
+        DatasetError: The bag is damaged, topics are missing, or the intrinsics or the
+            place of the colour camera are not known.
+    """
+
+    format = "ROS bag"
+    options: tuple[str, ...] = ("topics", "depth_unit")
+    timed = True
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None, topics: str | None = None) -> None:
+        super().__init__(path)
+        chosen = bag_topics.parse(topics)
+        self._bag = BagFile(self.path)
+        weakref.finalize(self, self._bag.close)
+        with foreign(DatasetError, f"the bag {self.path}"):
+            self._find_frames(chosen, camera)
+
+    def _find_frames(self, chosen: dict[str, str], camera: Camera | str | None) -> None:
+        """Set topics, times and pairs of messages, and the cameras."""
+        self._topics = bag_topics.find(self._bag.connections, chosen, str(self.path))
+        depth, color = self._times(self._topics.depth), self._times(self._topics.color)
+        self._exact = depth.exact and color.exact
+        self._pairs = self._associated(depth, color)
+        self.timestamps = depth.stamps[[k for _, k in self._pairs]]
+        self._color_stamps = color.stamps[[k for k, _ in self._pairs]]
+        self._recorded = [(int(color.recorded[i]), int(depth.recorded[j])) for i, j in self._pairs]
+        self._find_cameras(camera)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a file starts like a bag, or a folder holds the metadata.yaml of a ROS 2 bag."""
+        if path.is_dir():
+            return (path / "metadata.yaml").is_file()
+        magic = MAGIC.get(path.suffix.lower())
+        return magic is not None and starts_with(path, magic)
+
+    def _frame(self, index: int, name: str) -> Frame:
+        depth, values, color, image = self._decoded(index, self.camera.depth_scale)
+        expected = self.camera if self.calibration is None else self.calibration.camera
+        for what, found, camera in (("colour", image, expected), ("depth", values, self.camera)):
+            if found.shape[:2] != camera.shape:
+                raise FrameError(
+                    f"{name}: the {what} image is {size(found)} pixels, but its camera is "
+                    f"{camera.width}x{camera.height}"
+                )
+        values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
+        if self._exact:
+            return Frame(float(self.timestamps[index]), values, image, float(self._color_stamps[index]))
+        return Frame(_stamp(depth), values, image, _stamp(color))
+
+    def _decoded(self, index: int, depth_scale: float) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """Depth and colour message of a frame, each with its image."""
+        topics, (color_time, depth_time), name = self._topics, self._recorded[index], f"frame {index} of {self.path}"
+        with foreign(FrameError, name):
+            color, depth = self._bag.read([(topics.color, color_time), (topics.depth, depth_time)])
+            values = bag_images.depth_of(depth, depth_scale, f"the depth image of {name}")
+            return depth, values, color, bag_images.color_of(color, f"the colour image of {name}")
+
+    @cached_property
+    def ground_truth(self) -> Trajectory | None:  # pyright: ignore[reportIncompatibleVariableOverride]
+        """True poses of the depth camera, None if /tf has no world frame; read from the bag when first asked for."""
+        with foreign(DatasetError, f"the poses in /tf of {self.path}"):
+            return self._true_poses()
+
+    def _true_poses(self) -> Trajectory | None:
+        world, frame = self._topics.world, self._depth_frame
+        if not self._transforms.reaches(world, frame):
+            return None
+        return self._tree(None).trajectory(world, frame, self.timestamps)
+
+    def _times(self, connection: "Connection") -> MessageTimes:
+        """Times of the messages of a topic."""
+        found = self._bag.times(connection)
+        if np.mean(np.diff(found.stamps, prepend=-np.inf) > 0) < 0.9:  # a driver that does not fill the headers
+            return found._replace(stamps=1e-9 * found.recorded, exact=True)
+        return found
+
+    def _associated(self, depth: MessageTimes, color: MessageTimes) -> list[tuple[int, int]]:
+        """Numbers of the colour and depth messages of each frame, in the order of their stamps."""
+        colors, color_order = np.unique(color.stamps, return_index=True)
+        depths, depth_order = np.unique(depth.stamps, return_index=True)
+        pairs = [(int(color_order[i]), int(depth_order[j])) for i, j in associate(colors, depths)]
+        if not pairs:
+            raise DatasetError(
+                f"{self.path}: no image of {self._topics.color.topic} lies within {1000 * LARGEST_GAP:.0f} ms of one "
+                f"of {self._topics.depth.topic}; they cover {colors[0]:.3f} to {colors[-1]:.3f} s and "
+                f"{depths[0]:.3f} to {depths[-1]:.3f} s"
+            )
+        return pairs
+
+    def _find_cameras(self, given: Camera | str | None) -> None:
+        """Set the intrinsics, the lenses and the calibration from the camera_info and a first frame."""
+        topics = self._topics
+        depth, values, color, image = self._probe()
+        depth_size, color_size = values.shape[::-1], image.shape[1::-1]
+        self._depth_frame = depth.header.frame_id
+        color_lens = self._lens(topics.color_info, topics.color, color_size)
+        one_size = depth_size == color_size
+        if given is not None:
+            known = intrinsics.given(given)
+            depth_lens = Lens(known.camera(depth_size[0], depth_size[1], self._units()))
+            source = known.source
+        else:
+            info, beside = topics.depth_info, topics.depth
+            if info is None and one_size and topics.registered:
+                info, beside = topics.color_info, topics.color
+            depth_lens = self._lens(info, beside, depth_size)
+            source = info.topic if info else ""
+        if depth_lens is None:
+            raise DatasetError(
+                f"{self.path} holds no camera_info beside {topics.depth.topic}; choose it with --topics "
+                "depth_info=/..., or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+            )
+        if color_lens is None and not one_size:
+            raise DatasetError(
+                f"{self.path}: depth is {size(values)} and colour {size(image)} pixels, and there is no camera_info "
+                f"beside {topics.color.topic}; choose it with --topics color_info=/..."
+            )
+        if color_lens is None or (given is not None and one_size):
+            color_lens = depth_lens
+        self.sources = {
+            "intrinsics": source,
+            "depth unit": "the bag, or millimetres as ROS has them",
+            "times": "the bag",
+        }
+        self.camera, self._depth_lens, self._color_lens = depth_lens.camera, depth_lens, color_lens
+        together = color_lens is depth_lens
+        self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
+
+    def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
+        """The first frame that can be decoded.
+
+        Raises:
+            DatasetError: None of some frames all over the bag can be decoded.
+        """
+        problem = None
+        for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
+            try:
+                return self._decoded(int(index), 1.0)
+            except FrameError as error:
+                problem = problem or error
+        raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+    def _between(self, depth: Lens, color: Lens, color_frame: str) -> Calibration | None:
+        """Calibration of the colour camera, None if its images are registered to depth."""
+        same_frame = color_frame.lstrip("/") == self._depth_frame.lstrip("/") or self._topics.registered
+        T = np.eye(4) if same_frame else self._T_color_depth(color_frame)
+        if T is None:
+            raise DatasetError(
+                f"{self.path}: depth is seen from {self._depth_frame!r} and colour from {color_frame!r}, and "
+                "/tf_static holds no transform between them; choose registered depth with --topics depth=/..., or, if "
+                "it is registered, give its intrinsics with --camera"
+            )
+        if same_frame and _equal(depth, color):
+            return None
+        calibration = Calibration(color.camera, T)
+        return None if calibration.is_registered(depth.camera) else calibration
+
+    def _T_color_depth(self, color_frame: str) -> NDArray[np.float64] | None:
+        """Motion of points of the depth camera into the colour camera, None if the bag does not tell."""
+        return self._transforms.between(color_frame, self._depth_frame)
+
+    def _units(self) -> float:
+        """Depth units per metre."""
+        return MILLIMETRES
+
+    def _lens(self, connection: "Connection | None", image: "Connection", shape: tuple[int, int]) -> Lens | None:
+        """Lens of a camera_info for images of a width and height; for rectified ones it is in the projection matrix."""
+        info = self._bag.first(connection)
+        if info is None:
+            return None
+        K, P, D = (getattr(info, name if hasattr(info, name) else name.upper()) for name in "kpd")
+        rectified = "rect" in bag_topics.base(image.topic).rpartition("/")[2] and P[0] > 0
+        fx, cx, fy, cy = (P[0], P[2], P[5], P[6]) if rectified else (K[0], K[2], K[4], K[5])
+        width, height = (info.width, info.height) if info.width and info.height else shape
+        units = self._units()
+        camera = Camera(float(fx), float(fy), float(cx), float(cy), int(width), int(height), units).resized(*shape)
+        return Lens(camera) if rectified else self._lens_of(camera, info.distortion_model, tuple(map(float, D)))
+
+    def _lens_of(self, camera: Camera, model: str, coefficients: tuple[float, ...]) -> Lens:
+        return Lens.of(camera, model, coefficients)
+
+    @cached_property
+    def _transforms(self) -> TransformTree:
+        """Frames of /tf_static and of the first messages of /tf."""
+        return self._tree(FIRST_TRANSFORMS)
+
+    def _tree(self, count: int | None) -> TransformTree:
+        """Frames of /tf_static and of the first ``count`` messages of /tf, None for all."""
+        tree = TransformTree()
+        for topic, limit in ((TOPIC, count), (STATIC_TOPIC, FIRST_TRANSFORMS)):
+            found = [c for c in self._bag.connections if c.topic == topic and c.msgcount]
+            if found:
+                messages = (message for _, message in self._bag.messages(found, limit))
+                tree.add(messages, static=topic == STATIC_TOPIC)
+        return tree
+
+
+def starts_with(path: Path, magic: bytes) -> bool:
+    """Whether a file starts with these bytes, or will once Git LFS has fetched it."""
+    if not path.is_file():
+        return False
+    with open_plain(path, pointers=True) as file:
+        return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
+
+
+def _stamp(message: Any) -> float:  # noqa: ANN401
+    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+
+
+def _equal(one: Lens, other: Lens) -> bool:
+    """Whether two lenses project alike, to the accuracy with which drivers write intrinsics."""
+    a, b = one.camera, other.camera
+    numbers = [(c.fx, c.fy, c.cx, c.cy, *(c.distortion or (0.0,) * 5)) for c in (a, b)]
+    alike = len(numbers[0]) == len(numbers[1]) and np.allclose(*numbers, rtol=0, atol=1e-3)
+    return a.shape == b.shape and alike and one.model == other.model

@@ -1,0 +1,300 @@
+"""A bag by the package rosbags: its topics, the times of their messages from its index, and the messages themselves.
+
+rosbags trusts what it reads. Here decompression is limited, an SQLite file must be nothing but tables, and messages are
+decoded by the definitions that ROS publishes for their types: of those in a bag rosbags would make Python code. Topics
+of all other types are listed and not read.
+"""
+
+import os
+import sqlite3
+import struct
+from bz2 import BZ2Decompressor
+from collections.abc import Callable, Generator, Iterable
+from contextlib import closing, contextmanager
+from itertools import islice
+from pathlib import Path
+from typing import IO, TYPE_CHECKING, Any, NamedTuple, cast
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import DatasetError
+from dudmap.extras import extra
+from dudmap.input_files import LARGEST_RATIO, RATIO_FREE_BYTES, open_plain, read_text
+from dudmap.io.sequences.message_stream import MessageStream
+
+if TYPE_CHECKING:
+    from rosbags.interfaces import Connection
+
+LARGEST_CHUNK = 2**28
+"""Largest chunk or message of a bag after decompression, bytes; recorders write chunks of up to 4 MB, and one raw image
+of ``LARGEST_PIXELS`` has 200 MB."""
+LARGEST_METADATA = 2**19
+"""Largest metadata.yaml, bytes; one with 100 topics has 60 kB, and its parser takes 20 seconds for a megabyte."""
+SAMPLES = 30
+"""Number of first messages from which the delay of recording is estimated where stamps cannot be read cheaply."""
+CDR_STAMP = {0: struct.Struct(">4xiI"), 1: struct.Struct("<4xiI")}
+"""Encapsulation, seconds and nanoseconds at the start of a ROS 2 message with a header, by byte order."""
+ROS1_STAMP = struct.Struct("<4xII")
+"""Sequence number, seconds and nanoseconds at the start of a ROS 1 message with a header."""
+HEAD = 12
+"""Bytes of either."""
+MCAP_RECORD, MCAP_INDEX, MCAP_MESSAGE, MCAP_CHUNK = 9, 6, 31, 49
+"""Bytes before the content of an MCAP record, before the entries in that of a message index, before the data of a
+message, and before those of an uncompressed chunk (MCAP specification, sections Records, Message and Chunk)."""
+TF = "tf2_msgs/msg/TFMessage"
+OLD_TF = "tf/msg/tfMessage"
+"""Name of the same type before tf2."""
+
+
+class MessageTimes(NamedTuple):
+    """Times of the messages of a topic, in the order of recording.
+
+    Attributes:
+        recorded: (N,) int64 strictly increasing times of recording, nanoseconds; they identify a message.
+        stamps: (N,) float64 times in the headers of the messages, seconds.
+        exact: Whether ``stamps`` were read from the headers; otherwise they are the times of recording less the median
+            delay of the first messages.
+    """
+
+    recorded: NDArray[np.int64]
+    stamps: NDArray[np.float64]
+    exact: bool
+
+
+class BagFile:
+    """An open bag.
+
+    Args:
+        path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
+
+    Attributes:
+        connections: Topics, each with its type and number of messages.
+
+    Raises:
+        MissingExtraError: The package rosbags is missing.
+        DatasetError: The bag is damaged.
+    """
+
+    def __init__(self, path: Path) -> None:
+        with extra("ros-bags", f"the ROS bag {path}"):
+            from rosbags import rosbag1, rosbag2
+            from rosbags.typesys import Stores, get_typestore
+        self._ros1 = path.suffix == ".bag"
+        try:
+            _check(path)
+            limit_rosbags()
+            with without_definitions():
+                self._reader: Any = (rosbag1 if self._ros1 else rosbag2).Reader(path)
+                self._reader.open()
+        except Exception as error:  # what rosbags and its decompressors raise for damaged data has no common base
+            raise DatasetError(f"cannot open the bag {path}: {error}") from error
+        self.connections: list[Connection] = self._reader.connections
+        self._types = get_typestore(Stores.ROS1_NOETIC if self._ros1 else Stores.ROS2_HUMBLE)
+        if self._ros1:
+            tf = get_typestore(Stores.ROS2_HUMBLE).fielddefs[TF]
+            self._types.register({TF: tf, OLD_TF: tf})
+        self._stream = MessageStream(self._passing)
+
+    def close(self) -> None:
+        """Close the file."""
+        self._stream.close()
+        self._reader.close()
+
+    def messages(self, connections: "list[Connection]", count: int | None = None) -> Generator[tuple[int, Any]]:
+        """Times of recording and content of the first ``count`` messages of some topics, None for all."""
+        with self._stream.lock, closing(self._reader.messages(connections)) as found:
+            for connection, time, raw in islice(found, count):
+                yield time, self._decoded(raw, connection)
+
+    def first(self, connection: "Connection | None") -> Any:  # noqa: ANN401 - the type is made from its definition
+        """First message of a topic, None without one."""
+        for _, message in self.messages([connection], 1) if connection else ():
+            return message
+        return None
+
+    def times(self, connection: "Connection") -> MessageTimes:
+        """Times of the messages of a topic whose type has a header.
+
+        They come from the index of the bag, and the stamps from the first bytes of each message, so that images are not
+        read. In compressed bags that would mean to decompress everything, so the stamps are estimated. Only an MCAP
+        file without chunks is read through once.
+        """
+        rows = list(self._ros1_entries(connection) if self._ros1 else self._ros2_entries(connection))
+        recorded, first = np.unique(np.array([time for time, _ in rows], dtype=np.int64), return_index=True)
+        heads = [head for _, head in rows if head is not None]
+        if len(heads) == len(rows):
+            return MessageTimes(recorded, np.array([self._stamp(heads[k]) for k in first], np.float64), True)
+        with closing(self._reader.messages([connection])) as messages:
+            delays = [1e-9 * time - self._stamp(raw) for _, time, raw in islice(messages, SAMPLES)]
+        return MessageTimes(recorded, 1e-9 * recorded - np.median(delays), False)
+
+    def read(self, wanted: "list[tuple[Connection, int]]") -> list[Any]:
+        """Messages of these topics, which are the same in every call, at these times of recording.
+
+        Raises:
+            KeyError: There is no such message.
+        """
+        raw = self._stream.read([(connection.topic, time) for connection, time in wanted])
+        return [self._decoded(data, connection) for data, (connection, _) in zip(raw, wanted, strict=True)]
+
+    def _passing(self, topics: list[str], start: int) -> Generator[tuple[str, int, bytes]]:
+        """All messages of some topics from a time of recording on."""
+        chosen = [connection for connection in self.connections if connection.topic in topics]
+        with closing(self._reader.messages(chosen, start=start)) as messages:
+            yield from ((connection.topic, time, bytes(data)) for connection, time, data in messages)
+
+    def _decoded(self, raw: bytes, connection: "Connection") -> Any:  # noqa: ANN401
+        decode = self._types.deserialize_ros1 if self._ros1 else self._types.deserialize_cdr
+        return decode(raw, connection.msgtype)
+
+    def _stamp(self, data: bytes) -> float:
+        """Time in seconds in the header of a serialised message."""
+        seconds, nanoseconds = (ROS1_STAMP if self._ros1 else CDR_STAMP[data[1] & 1]).unpack_from(data)
+        return seconds + 1e-9 * nanoseconds
+
+    def _ros1_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
+        """Time of recording and first bytes of every message; None for bytes that would have to be decompressed."""
+        from rosbags.rosbag1.reader import Header, RecordType, decompressors, read_uint32
+
+        with open_plain(self._reader.path) as file:
+            for entry in self._reader.indexes[connection.id]:
+                chunk = self._reader.chunks[entry.chunk_pos]
+                if chunk.decompressor is not decompressors["none"]:
+                    yield entry.time, None
+                    continue
+                file.seek(chunk.datapos + entry.offset)
+                while Header.read(cast("Any", file)).get_uint8("op") == RecordType.CONNECTION:
+                    file.seek(read_uint32(cast("Any", file)), os.SEEK_CUR)
+                file.seek(4, os.SEEK_CUR)
+                yield entry.time, file.read(HEAD)
+
+    def _ros2_entries(self, connection: "Connection") -> Generator[tuple[int, bytes | None]]:
+        """The same of all files of a bag of ROS 2."""
+        storage = self._reader.storage
+        packed = storage.metadata.compression_mode == "message"
+        for part in getattr(storage, "storages", [storage]):  # a folder with metadata.yaml has one or several files
+            for own in (other for other in part.connections if other.topic == connection.topic):
+                for time, head in (_sqlite_entries if hasattr(part, "dbconn") else _mcap_entries)(part, own):
+                    yield time, None if packed else head
+
+
+def _sqlite_entries(part: Any, connection: "Connection") -> Generator[tuple[int, bytes | None]]:  # noqa: ANN401
+    with closing(sqlite3.connect(_sqlite_uri(part.path), uri=True)) as database:
+        rows = database.execute("SELECT id, timestamp FROM messages WHERE topic_id = ?", (connection.id,)).fetchall()
+        for row, time in rows:
+            with database.blobopen("messages", "data", row, readonly=True) as blob:
+                yield time, blob.read(HEAD)
+
+
+def _mcap_entries(part: Any, connection: "Connection") -> Iterable[tuple[int, bytes | None]]:  # noqa: ANN401
+    if not part.chunks:
+        yield from ((time, bytes(data[:HEAD])) for _, time, data in part.messages([connection]))
+        return
+    with open_plain(part.path) as file:
+        for chunk in (chunk for chunk in part.chunks if connection.id in chunk.message_index_offsets):
+            file.seek(chunk.message_index_offsets[connection.id])
+            index = file.read(struct.unpack_from("<Q", file.read(MCAP_RECORD), 1)[0])
+            for time, offset in struct.iter_unpack("<QQ", index[MCAP_INDEX:]):
+                if chunk.compression:
+                    yield time, None
+                    continue
+                file.seek(chunk.chunk_start_offset + MCAP_CHUNK + offset + MCAP_MESSAGE)
+                yield time, file.read(HEAD)
+
+
+def _check(path: Path) -> None:
+    """Check that a bag has plain files only, and that an SQLite file is nothing but tables.
+
+    A view in the place of a table would be a program that runs when the bag is read.
+
+    Raises:
+        OSError: A file is none, or larger than files of its kind.
+        ValueError: An SQLite file holds something else than tables and indexes.
+        sqlite3.Error: It is damaged.
+    """
+    if path.is_dir():
+        read_text(path / "metadata.yaml", LARGEST_METADATA)
+    for file in sorted(path.iterdir()) if path.is_dir() else [path]:
+        if file.suffix in (".db3", ".mcap", ".bag"):
+            open_plain(file).close()
+        if file.suffix == ".db3":
+            with closing(sqlite3.connect(_sqlite_uri(file), uri=True)) as database:
+                found = database.execute("SELECT type, name, sql FROM sqlite_master").fetchall()
+            for kind, name, sql in found:
+                if kind not in ("table", "index") or "VIRTUAL" in str(sql).upper() or "GENERATED" in str(sql).upper():
+                    raise ValueError(f"it holds {name!r}, which is neither a plain table nor an index")
+
+
+def _sqlite_uri(path: Path) -> str:
+    """Address under which SQLite opens a file for reading, whatever characters its name has."""
+    return f"file:{quote(str(path))}?mode=ro&immutable=1"
+
+
+def limit_rosbags() -> None:
+    """Make rosbags give up where something unpacks to too much."""
+    import lz4.frame
+    from rosbags.rosbag1 import reader as rosbag1
+    from rosbags.rosbag2 import reader as rosbag2
+    from rosbags.rosbag2 import storage_mcap
+
+    zstd = cast("Any", storage_mcap).zstd
+    unzstd, unlz4 = bounded(zstd.ZstdDecompressor), bounded(lz4.frame.LZ4FrameDecompressor)
+    rosbag1.decompressors.update(bz2=bounded(BZ2Decompressor), lz4=unlz4)
+    storage_mcap.DECOMPRESSORS.update(lz4=lambda data, _: unlz4(data), zstd=lambda data, _: unzstd(data))
+    cast("Any", rosbag2).zstd = _BoundedZstd(zstd, unzstd)
+
+
+@contextmanager
+def without_definitions() -> Generator[None]:
+    """Have rosbags ignore the definitions of messages in MCAP files meanwhile: it would refuse a file for one
+    definition in a language that it does not know. Other users of rosbags in this process keep them."""
+    from rosbags.interfaces import MessageDefinition, MessageDefinitionFormat
+    from rosbags.rosbag2 import storage_mcap
+
+    theirs = storage_mcap.get_msgdef
+    storage_mcap.get_msgdef = lambda schema: MessageDefinition(MessageDefinitionFormat.NONE, "")
+    try:
+        yield
+    finally:
+        storage_mcap.get_msgdef = theirs
+
+
+def bounded(make: Callable[[], Any]) -> Callable[[bytes], bytes]:
+    """Decompression with a decompressor of the standard library's interface, of ``LARGEST_CHUNK`` bytes or less."""
+
+    def decompress(data: bytes) -> bytes:
+        out = make().decompress(bytes(data), LARGEST_CHUNK + 1)
+        if len(out) > LARGEST_CHUNK:
+            raise ValueError(f"a chunk unpacks to more than {LARGEST_CHUNK / 1e6:.0f} MB")
+        return out
+
+    return decompress
+
+
+class _BoundedZstd:
+    """Stands for the module zstd in the reader of bags whose messages or files are compressed one by one."""
+
+    def __init__(self, zstd: Any, decompress: Callable[[bytes], bytes]) -> None:  # noqa: ANN401
+        self._zstd, self.decompress = zstd, decompress
+
+    @contextmanager
+    def open(self, file: IO[bytes], mode: str) -> Generator["_BoundedFile"]:
+        size = os.fstat(file.fileno()).st_size
+        with self._zstd.open(file, mode) as unpacked:
+            yield _BoundedFile(unpacked, max(RATIO_FREE_BYTES, LARGEST_RATIO * size))
+
+
+class _BoundedFile:
+    """A file that is unpacked while it is read, of so many bytes or less."""
+
+    def __init__(self, file: IO[bytes], left: int) -> None:
+        self._file, self._left = file, left
+
+    def read(self, size: int) -> bytes:
+        data = self._file.read(size)
+        self._left -= len(data)
+        if self._left < 0:
+            raise ValueError(f"one of its files unpacks to more than {LARGEST_RATIO} times its size")
+        return data

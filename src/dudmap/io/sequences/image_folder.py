@@ -1,0 +1,267 @@
+"""Recordings of pairs of image files: what all folder formats share."""
+
+import re
+from collections.abc import Iterable, Sized
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry.association import TimedFile, associate
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, FrameError
+from dudmap.input_files import damaged
+from dudmap.io.sequences import camera_files, images, intrinsics
+from dudmap.io.sequences.poses import read_matrix, rigid_trajectory
+
+PROBES = 30
+"""Number of evenly spread frames that are tried until one is valid and gives the image size."""
+FRAME_RATE = 30.0
+"""Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
+
+
+class ImageFolder:
+    """Base class of recordings whose frames are a colour file and a depth file each.
+
+    A format says what its files are called (``color_files`` and so on) or how they pair (``_find_pairs``), and
+    optionally its cameras where no file does (``published``), where the truth is (``_find_ground_truth``) and how an
+    image is stored (``_read_depth``).
+
+    Args:
+        path: The folder.
+        camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``;
+            colour images of another size than depth keep their own camera.
+
+    Attributes:
+        name: Name of the folder.
+        camera: Intrinsics.
+        sources: Where ``intrinsics``, ``depth unit``, ``times`` and ``frames`` come from: a file, a name, an option, or
+            that they are assumed.
+        calibration: Of the colour camera, where it is another one; None for colour that is registered to depth.
+        timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
+        ground_truth: True camera poses, None if they are not known.
+        timed: Whether the times were read; False where frames are only numbered, and 1/30 s apart is assumed.
+
+    Raises:
+        DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
+    """
+
+    format = ""
+    options: tuple[str, ...] = ("fps", "depth_unit")
+    timed = True
+    depth_scale = 1000.0
+    """Depth units per metre where neither the recording nor the user says otherwise."""
+    color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
+    depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
+    pose_files: tuple[str, str] | None = None
+    """Folder, and pattern of the names of its numbered files: images, and true poses, a matrix camera to world each."""
+    published: tuple[str, dict[str, float]] | None = None
+    """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        self.path = Path(path)
+        self.name = self.path.resolve().name
+        self._pairing, self.image_counts = "a list of pairs", None
+        self._pairs = self._find_pairs()
+        self.timestamps = np.array([depth.timestamp for _, depth in self._pairs], dtype=np.float64)
+        known = self._find_intrinsics() if camera is None else self._replaced(camera)
+        unit = "depth_scale" in known.values
+        self.sources = {
+            "intrinsics": known.source,
+            "depth unit": known.source if unit else f"assumed, usual in the format {self.format}",
+            "times": "the recording" if self.timed else f"assumed, {FRAME_RATE:g} frames a second",
+            "frames": self._pairing,
+        }
+        self.calibration = known.calibration()
+        self.camera = self._probe(known)
+        self.ground_truth = self._find_ground_truth()
+
+    @property
+    def color_timestamps(self) -> NDArray[np.float64]:
+        """(N,) timestamps of the colour images of all frames, seconds."""
+        return np.array([color.timestamp for color, _ in self._pairs], dtype=np.float64)
+
+    def __len__(self) -> int:
+        return len(self._pairs)
+
+    def __getitem__(self, index: int) -> Frame:
+        """Frame number ``index``.
+
+        Raises:
+            FrameError: The frame cannot be read, or has another size than the recording.
+        """
+        index = range(len(self))[index]
+        with damaged(FrameError, f"frame {index} of {self.path}"):
+            frame = self._read(index, self.camera.depth_scale)
+        if frame.depth.shape != self.camera.shape:
+            raise FrameError(
+                f"frame {index}: {self._pairs[index][1].path} is {size(frame.depth)} pixels, but the recording's "
+                f"camera is {self.camera.width}x{self.camera.height}"
+            )
+        return frame
+
+    def set_rate(self, fps: float) -> None:
+        """Replace the assumed rate of numbered frames: as many of the usual steps of their numbers make a second.
+
+        Raises:
+            DatasetError: The recording has times of its own.
+        """
+        if self.timed:
+            raise DatasetError(
+                f"{self.path} has times of its own, which --fps {fps:g} does not replace; leave --fps out"
+            )
+        factor = 1.0 / (fps * float(np.median(np.diff(self.timestamps)))) if len(self) > 1 else FRAME_RATE / fps
+        self._pairs = [tuple(TimedFile(factor * file.timestamp, file.path) for file in pair) for pair in self._pairs]
+        self.timestamps = factor * self.timestamps
+        if self.ground_truth is not None:
+            self.ground_truth = Trajectory(factor * self.ground_truth.timestamps, self.ground_truth.Ts_world_camera)
+        self.timed, self.sources["times"] = True, f"--fps {fps:g}"
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame; this layout has none."""
+        return None
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files of all frames, by increasing time of the depth."""
+        return self._pair_numbered(self._numbered(self.color_files), self._numbered(self.depth_files))
+
+    def _numbered(self, files: tuple[str, str]) -> dict[int, Path]:
+        folder, pattern = files
+        return numbered_files((self.path / folder).iterdir(), pattern)
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        """Intrinsics of a file that lies there, else those of the data set.
+
+        Raises:
+            DatasetError: There is neither, or the file cannot be understood.
+        """
+        known = camera_files.find(self.path) or self._published()
+        if known is None:
+            raise camera_files.unknown(self.path)
+        return known
+
+    def _published(self) -> intrinsics.Intrinsics | None:
+        """Intrinsics of the data set, where the layout or a name tells which one it is."""
+        if self.published is None:
+            return None
+        name, values = self.published
+        return intrinsics.Intrinsics(dict(values), f"the {name} camera{intrinsics.BY_NAME}")
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        """True camera poses."""
+        poses = self._numbered(self.pose_files) if self.pose_files else {}
+        return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
+
+    def _pair_numbered(
+        self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
+    ) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``, or, where the
+        numbers only count the frames, over ``FRAME_RATE``.
+
+        Raises:
+            DatasetError: No number occurs in both.
+        """
+        numbers = sorted(colors.keys() & depths.keys())
+        if not numbers:
+            raise DatasetError(
+                f"{self.path} has {len(colors)} colour and {len(depths)} depth images, but none of them has the same "
+                "number"
+            )
+        self.timed = per_second is not None
+        rate = per_second or FRAME_RATE
+        self._pairing, self.image_counts = _counted("equal numbers", colors, depths), (len(colors), len(depths))
+        return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
+
+    def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
+        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart.
+
+        Raises:
+            DatasetError: No colour image is so near a depth image.
+        """
+        pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
+        if not pairs:
+            raise DatasetError(
+                f"{self.path}: no colour image lies within 20 ms of a depth image; the colour images cover "
+                f"{colors[0].timestamp:.3f} to {colors[-1].timestamp:.3f} s and the depth images "
+                f"{depths[0].timestamp:.3f} to {depths[-1].timestamp:.3f} s"
+            )
+        how = "nearest in time, at most 20 ms apart"
+        self._pairing, self.image_counts = _counted(how, colors, depths), (len(colors), len(depths))
+        return [(colors[i], depths[j]) for i, j in pairs]
+
+    def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
+        """Depth image (H, W) in metres."""
+        return images.read_depth(path, depth_scale)
+
+    def _read_color(self, path: Path) -> NDArray[np.uint8]:
+        """Colour image (H, W, 3), RGB."""
+        return images.read_color(path)
+
+    def _replaced(self, camera: Camera | str) -> intrinsics.Intrinsics:
+        """The given intrinsics; with the colour camera of the recording where colour has another size than depth."""
+        given = intrinsics.given(camera)
+        try:
+            own = self._find_intrinsics()
+        except DatasetError:  # the recording does not give them, which is why the user does
+            return given
+        shape = own.color and self._read_depth(self._pairs[0][1].path, 1.0).shape
+        if not own.color or (own.color["height"], own.color["width"]) == shape:
+            return given
+        source = f"{given.source}; colour: {own.source}"
+        return intrinsics.Intrinsics(given.values, source, own.color, own.T_depth_color)
+
+    def _read(self, index: int, depth_scale: float) -> Frame:
+        color_file, depth_file = self._pairs[index]
+        try:
+            depth = self._read_depth(depth_file.path, depth_scale)
+            color = self._read_color(color_file.path)
+        except FrameError as error:
+            raise FrameError(f"frame {index}: {error}") from error
+        if self.calibration is not None and color.shape[:2] != self.calibration.camera.shape:
+            expected = self.calibration.camera
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {size(color)} pixels, but the recording's "
+                f"colour camera is {expected.width}x{expected.height}"
+            )
+        if self.calibration is None and color.shape[:2] != depth.shape:
+            raise FrameError(
+                f"frame {index}: the colour image {color_file.path} is {size(color)} pixels but the depth image "
+                f"{depth_file.path} is {size(depth)}; both must have one size, with depth registered to "
+                "colour, or intrinsics.txt must give the colour camera (color_fx and so on)"
+            )
+        return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
+
+    def _probe(self, known: intrinsics.Intrinsics) -> Camera:
+        """Camera with the size of the first valid frame.
+
+        Raises:
+            DatasetError: No frame is valid.
+        """
+        problem = None
+        for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
+            try:
+                frame = self._read(int(index), known.values.get("depth_scale", self.depth_scale))
+            except FrameError as error:
+                problem = problem or str(error)
+                continue
+            if frame.depth.any():
+                return known.camera(frame.depth.shape[1], frame.depth.shape[0], self.depth_scale)
+            problem = problem or f"frame {index}: the depth image holds no reading, all its pixels are zero"
+        raise DatasetError(f"no frame of {self.path} is usable; {problem}")
+
+
+def _counted(how: str, colors: Sized, depths: Sized) -> str:
+    return f"{len(colors)} colour and {len(depths)} depth images, {how}"
+
+
+def size(image: NDArray) -> str:
+    """Width and height of an image, for messages."""
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+def numbered_files(paths: Iterable[Path], pattern: str) -> dict[int, Path]:
+    """Files by the number that the first group of a pattern of the whole file name holds; others are left out."""
+    matches = ((re.fullmatch(pattern, path.name), path) for path in paths)
+    return {int(match.group(1)): path for match, path in sorted(matches, key=lambda item: item[1].name) if match}

@@ -1,0 +1,164 @@
+"""Decoding of colour, depth and mask images, with one clear error for every defect of a file."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import FrameError
+from dudmap.input_files import damaged, load_array, read_bytes
+from dudmap.io.sequences.image_headers import check_size
+
+PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
+
+
+def read_color(path: Path) -> NDArray[np.uint8]:
+    """Colour image (H, W, 3) in RGB order.
+
+    Raises:
+        FrameError: The file is missing, truncated, damaged or not an image.
+    """
+    return decode_color(_bytes(path), str(path))
+
+
+def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Colour image (H, W, 3) in RGB order from the content of an image file; ``name`` is used in messages.
+
+    Raises:
+        FrameError: The data are truncated, damaged or not an image.
+    """
+    import cv2
+
+    image = _decoded(data, name, cv2.IMREAD_COLOR)
+    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB).astype(np.uint8, copy=False)
+
+
+def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats.
+
+    Raises:
+        FrameError: The file is missing, truncated, damaged, has several channels, or is neither 16 bit nor float.
+    """
+    return decode_depth(_bytes(path), depth_scale, str(path))
+
+
+def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages.
+
+    Raises:
+        FrameError: The data are truncated, damaged, have several channels, or are neither 16 bit nor float.
+    """
+    import cv2
+
+    image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
+    if image.ndim != 2:
+        raise FrameError(f"the depth image {name} has {image.shape[2]} channels; expected one with 16 bit or float")
+    return metres(image, depth_scale, name)
+
+
+def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.float32]:
+    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = no reading.
+
+    Raises:
+        FrameError: The values are neither 16 bit nor float.
+    """
+    if image.dtype == np.uint16:
+        return image.astype(np.float32) / np.float32(depth_scale)
+    if image.dtype.kind == "f":
+        depth = image.astype(np.float32)
+        depth[~(np.isfinite(depth) & (depth > 0))] = 0
+        return depth
+    raise FrameError(f"the depth image {name} holds {image.dtype} values; expected 16 bit or float")
+
+
+def read_depth_array(path: Path) -> NDArray[np.float32]:
+    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too.
+
+    Raises:
+        FrameError: The file is missing, damaged, or holds something else.
+    """
+    try:
+        metres = np.squeeze(load_array(path))
+    except (OSError, ValueError, EOFError) as error:
+        raise FrameError(f"cannot read the array {path}: {error}") from error
+    if metres.ndim != 2 or metres.dtype.kind != "f":
+        raise FrameError(f"the array {path} holds {metres.dtype} of shape {metres.shape}; expected floats (H, W)")
+    metres = metres.astype(np.float32)
+    metres[~(np.isfinite(metres) & (metres > 0))] = 0
+    return metres
+
+
+def read_mask(path: Path) -> NDArray[np.bool_]:
+    """Mask (H, W) of an 8-bit image; values above 127 are true.
+
+    Raises:
+        FrameError: The file is missing, truncated, damaged or not an image.
+    """
+    return read_gray(path) > 127
+
+
+def read_gray(path: Path) -> NDArray[np.uint8]:
+    """8-bit image (H, W) of one channel; colours are converted.
+
+    Raises:
+        FrameError: The file is missing, truncated, damaged or not an image.
+    """
+    import cv2
+
+    return _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)
+
+
+def _bytes(path: Path) -> bytes:
+    try:
+        return read_bytes(path)
+    except FileNotFoundError:
+        raise FrameError(f"the listed file {path} does not exist") from None
+    except OSError as error:
+        raise FrameError(f"cannot read {path}: {error.strerror}") from error
+
+
+def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
+    """Image of the content of an image file.
+
+    Raises:
+        FrameError: It is truncated, damaged, too large or not an image.
+    """
+    import cv2
+
+    with damaged(FrameError, name):
+        image = cv2.imdecode(_checked(data, name), flags)
+    if image is None:
+        raise FrameError(f"{name} is not an image that can be decoded")
+    return np.asarray(image)
+
+
+def _checked(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
+    """Content of a complete image file; decoders would fill the missing part of a truncated one with grey."""
+    raw = bytes(data)
+    if not raw:
+        raise FrameError(f"{name} is an empty file")
+    if raw.startswith(PNG):
+        _check_png(name, raw)
+    elif raw.startswith(JPEG) and b"\xff\xd9" not in raw[-1024:]:
+        raise FrameError(f"{name} is cut off: the JPEG end marker is missing")
+    check_size(raw, name)
+    return np.frombuffer(raw, dtype=np.uint8)
+
+
+def _check_png(name: str, data: bytes) -> None:
+    """Check all chunks: length, type, data, CRC-32 of type and data (PNG specification, section 5.3)."""
+    at = len(PNG)
+    while at + 12 <= len(data):
+        (length,) = struct.unpack_from(">I", data, at)
+        end = at + 8 + length
+        if end + 4 > len(data):
+            break
+        if zlib.crc32(data[at + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+            raise FrameError(f"{name} is damaged: a PNG checksum does not match")
+        if data[at + 4 : at + 8] == b"IEND":
+            return
+        at = end + 4
+    raise FrameError(f"{name} is cut off: the PNG end is missing")

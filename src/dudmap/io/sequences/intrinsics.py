@@ -1,0 +1,224 @@
+"""Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
+
+import math
+import re
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import DatasetError
+from dudmap.input_files import read_text
+
+DISTORTION_KEYS = ("k1", "k2", "p1", "p2", "k3")
+DEPTH_SCALE = 5000.0
+"""Depth units per metre in the TUM layout, where nothing else is given."""
+KEYS = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale", *DISTORTION_KEYS)
+COLOR_PREFIX = "color_"
+"""Prefix of the keys of a second camera for the colour images, with fx, fy, cx, cy, width and height, which are
+required, and the coefficients of its distortion."""
+COLOR_REQUIRED = ("fx", "fy", "cx", "cy", "width", "height")
+MOTION_KEY = "T_depth_color"
+"""Key of the 12 or 16 numbers, row by row, of the motion that takes points of the colour camera to the depth camera."""
+
+
+@dataclass(frozen=True)
+class Intrinsics:
+    """Intrinsics before the image size is known.
+
+    Attributes:
+        values: Numbers by key (``KEYS``); fx, fy, cx and cy are always present, the others where they are known.
+        source: Origin of the numbers, for error messages.
+        color: Numbers by key of the camera of the colour images, empty if it is the same.
+        T_depth_color: (4, 4) points of the colour camera to the depth camera.
+    """
+
+    values: dict[str, float]
+    source: str
+    color: dict[str, float] = field(default_factory=dict)
+    T_depth_color: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
+
+    def calibration(self) -> Calibration | None:
+        """Calibration of the colour camera; None if it is the same as the depth camera.
+
+        Raises:
+            DatasetError: The numbers are invalid.
+        """
+        if not self.color:
+            return None
+        return Calibration(_camera(self.color, 1000.0), se3.inverse(self.T_depth_color))
+
+    def camera(self, width: int, height: int, depth_scale: float = DEPTH_SCALE) -> Camera:
+        """Camera for images of the given size.
+
+        Args:
+            width, height: Size of the depth images.
+            depth_scale: Units per metre where they are not known.
+
+        Raises:
+            DatasetError: The intrinsics belong to another image size, or are invalid.
+        """
+        expected = (int(self.values.get("width", width)), int(self.values.get("height", height)))
+        if expected != (width, height):
+            raise DatasetError(
+                f"{self.source} is for images of {expected[0]}x{expected[1]} pixels, but the recording's are "
+                f"{width}x{height}; give the right intrinsics with --camera fx,fy,cx,cy,w,h,depth_scale"
+            )
+        return _camera(self.values | {"width": width, "height": height}, self.values.get("depth_scale", depth_scale))
+
+
+def _camera(values: dict[str, float], depth_scale: float) -> Camera:
+    distortion = tuple(values.get(key, 0.0) for key in DISTORTION_KEYS)
+    return Camera(
+        fx=values["fx"],
+        fy=values["fy"],
+        cx=values["cx"],
+        cy=values["cy"],
+        width=int(values["width"]),
+        height=int(values["height"]),
+        depth_scale=depth_scale,
+        distortion=distortion if any(distortion) else (),
+    )
+
+
+def _by_key(*numbers: float) -> dict[str, float]:
+    return dict(zip(KEYS, numbers, strict=False))
+
+
+BY_NAME = ", by name"
+"""End of a source of intrinsics that are known from the name or the layout of a data set, and in no file."""
+KNOWN = (
+    (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", _by_key(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
+    (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _by_key(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
+    (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", _by_key(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
+    (r"rgbd_bonn", "Bonn", _by_key(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)),
+)
+"""Pattern of the folder name, name and published intrinsics of the data sets."""
+
+
+def by_name(path: Path) -> Intrinsics | None:
+    """Published intrinsics of the data set that the folder name of a recording in TUM layout matches."""
+    for pattern, name, values in KNOWN:
+        if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
+            return Intrinsics(values, f"the {name} camera{BY_NAME}")
+    return None
+
+
+def given(camera: Camera | str) -> Intrinsics:
+    """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
+
+    Raises:
+        DatasetError: The text does not hold 4, 6 or 7 numbers.
+    """
+    if isinstance(camera, Camera):
+        return from_camera(camera)
+    try:
+        numbers = [float(field) for field in camera.split(",")]
+    except ValueError:
+        numbers = []
+    if len(numbers) not in (4, 6, 7) or not all(map(math.isfinite, numbers)):
+        raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
+    return Intrinsics(_by_key(*numbers), f"--camera {camera}")
+
+
+def from_camera(camera: Camera) -> Intrinsics:
+    """Intrinsics of a camera."""
+    values = {key: getattr(camera, key) for key in KEYS[:7]}
+    return Intrinsics(values | dict(zip(DISTORTION_KEYS, camera.distortion, strict=False)), "the given camera")
+
+
+def from_file(path: Path) -> Intrinsics:
+    """Parse a text file: ``key value`` lines, a matrix of 9 or 16 numbers, or ``fx fy cx cy [w h [depth_scale]]``.
+
+    Raises:
+        DatasetError: The file has none of these forms, or a key is unknown or missing.
+    """
+    try:
+        lines = read_text(path).splitlines()
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"cannot read {path}: {error}") from error
+    split = (re.sub(r"[,:=\[\];]", " ", line.partition("#")[0]).split() for line in lines)
+    numbered = [(number, row) for number, row in enumerate(split, start=1) if row]
+    rows = [row for _, row in numbered]
+    if rows and not _is_number(rows[0][0]):
+        return _keyed(path, rows)
+    if any(not _is_number(field) for row in rows for field in row):
+        raise DatasetError(
+            f"cannot understand {path}; expected lines such as 'fx 517.3' with fx, fy, cx, cy, width, height and "
+            "depth_scale, or a 3x3 matrix, or one line 'fx fy cx cy'"
+        )
+    numbers = np.array([float(field) for row in rows for field in row])
+    if numbers.size in (4, 6, 7, 9, 16):
+        return from_matrix(numbers, path)
+    line, row = next(((line, row) for line, row in numbered if len(row) != 3), (len(lines), rows[-1] if rows else []))
+    raise DatasetError(
+        f"{path}, line {line}: {len(row)} numbers, of {numbers.size} in the file; expected the 9 of a 3x3 matrix K"
+    )
+
+
+def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
+    """Intrinsics of the numbers of a file: a 3x3 or 4x4 matrix row by row, or ``fx fy cx cy [w h [depth_scale]]``.
+
+    Raises:
+        DatasetError: They are of another count, or no intrinsic matrix.
+    """
+    source = str(path)
+    if numbers.size in (4, 6, 7):
+        return Intrinsics(_by_key(*numbers.tolist()), source)
+    if numbers.size not in (9, 16):
+        raise DatasetError(f"{path} holds {numbers.size} numbers; expected the 9 of a 3x3 matrix K, row by row")
+    K = numbers.reshape(math.isqrt(numbers.size), -1)
+    if np.any(K[[1, 2, 2], [0, 0, 1]]) or K[2, 2] != 1:
+        raise DatasetError(f"{path} holds {K[:3, :3].tolist()}; expected the rows fx 0 cx, 0 fy cy, 0 0 1")
+    return Intrinsics(_by_key(*(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))), source)
+
+
+def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:
+    values, color, T_depth_color = {}, {}, None
+    color_keys = [COLOR_PREFIX + key for key in (*COLOR_REQUIRED, *DISTORTION_KEYS)]
+    for row in rows:
+        if row[0] == MOTION_KEY:
+            T_depth_color = _motion(path, row[1:])
+            continue
+        if row[0] in color_keys and len(row) == 2 and _is_number(row[1]):
+            color[row[0].removeprefix(COLOR_PREFIX)] = float(row[1])
+            continue
+        if row[0] not in KEYS or len(row) != 2 or not _is_number(row[1]):
+            raise DatasetError(
+                f"{path}: cannot understand the line {' '.join(row)!r}; expected one of {', '.join(KEYS)} and a number"
+            )
+        values[row[0]] = float(row[1])
+    missing = [key for key in KEYS[:4] if key not in values]
+    if missing:
+        raise DatasetError(f"{path} lacks {', '.join(missing)}")
+    missing = [COLOR_PREFIX + key for key in COLOR_REQUIRED if key not in color]
+    if missing and (color or T_depth_color is not None):
+        raise DatasetError(f"{path} lacks {', '.join(missing)}, which the second camera of the colour images needs")
+    return Intrinsics(values, str(path), color, np.eye(4) if T_depth_color is None else T_depth_color)
+
+
+def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
+    """Rigid motion of 12 or 16 numbers, row by row.
+
+    Raises:
+        DatasetError: They are not a rigid motion.
+    """
+    T = np.eye(4)
+    if len(fields) in (12, 16) and all(_is_number(field) for field in fields):
+        T[:3] = np.array(fields[:12], dtype=np.float64).reshape(3, 4)
+        if np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(T[:3, :3]) > 0:
+            T[:3, :3] = se3.nearest_rotation(T[:3, :3])
+            return T
+    raise DatasetError(f"{path}: {MOTION_KEY} is not a rigid motion of 12 or 16 numbers, row by row")
+
+
+def _is_number(text: str) -> bool:
+    """Whether a text is a finite number."""
+    try:
+        return math.isfinite(float(text))
+    except ValueError:
+        return False

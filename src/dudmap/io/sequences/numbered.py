@@ -1,0 +1,144 @@
+"""Numbered colour and depth images in any plain folder: exports of ZED, RealSense, Azure Kinect, your own camera."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry.association import TimedFile
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError
+from dudmap.input_files import read_text
+from dudmap.io.sequences import camera_files
+from dudmap.io.sequences.camera_files import IMAGES
+from dudmap.io.sequences.image_folder import ImageFolder
+from dudmap.io.sequences.poses import read_matrices, rigid_trajectory
+
+DEPTH_WORDS = ("depth",)
+COLOR_WORDS = ("color", "colour", "rgb", "left", "image", "img", "mono")
+NEITHER_WORDS = ("confidence", "right", "mask", "normal", "vis", "infra", "ir")
+"""Words of files and folders that hold other images than depth and colour."""
+POSES = ("poses.txt", "pose.txt", "poses", "pose")
+"""Files and folders of true poses."""
+LARGEST_NUMBER = 10**8
+"""From here on a number in a file name is a time, not the number of a frame: 38 days at 30 frames a second."""
+TIME_UNITS = ((1e17, 1e9), (1e14, 1e6), (1e11, 1e3), (0.0, 1.0))
+"""Smallest value and units per second of times since 1970: ns, us, ms, s. All lie between 1973 and 5138."""
+
+
+class NumberedSequence(ImageFolder):
+    """Folder of numbered images, in two folders (``color/000001.png``, ``depth/000001.png``) or in one.
+
+    Which images are depth and colour is told by words in the names of files and folders, or by two patterns. Equal
+    numbers pair, 30 frames a second; numbers above 10^8 are times, which pair at 20 ms. Depth: 16 bit, or float metres.
+    The truth is groundtruth.txt, or matrices camera to world: poses.txt with one per frame, or files with
+    the numbers of the images in a folder ``pose`` or ``poses``.
+
+    Args:
+        path: The folder.
+        camera: As for ``ImageFolder``.
+        color, depth: Patterns of the files of the images, such as ``frames/*.jpg``, where their names do not tell.
+
+    Raises:
+        DatasetError: As for ``ImageFolder``; or no numbered image matches a pattern, or the truth cannot be understood.
+    """
+
+    format = "numbered images"
+    options = (*ImageFolder.options, "color", "depth")
+
+    def __init__(
+        self, path: str | Path, camera: Camera | str | None = None, color: str | None = None, depth: str | None = None
+    ) -> None:
+        self._patterns = {"color": color, "depth": depth}
+        super().__init__(path, camera)
+
+    @staticmethod
+    def recognises(path: Path) -> bool:
+        """Whether a folder holds depth and colour images by the words of their names."""
+        return path.is_dir() and all(kinds_of_images(path).values())
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        kinds = kinds_of_images(self.path)
+        for kind, pattern in self._patterns.items():
+            if pattern is not None:
+                kinds[kind] = [file for file in sorted(self.path.glob(pattern)) if _is_numbered_image(file)]
+            if not kinds[kind]:
+                what = f"matches --{kind} {pattern}" if pattern else f"is {kind} by its name; give --{kind} PATTERN"
+                raise DatasetError(f"no numbered image in {self.path} {what}; there are {camera_files.seen(self.path)}")
+        colors, depths = ({_number(file): file for file in kinds[kind]} for kind in ("color", "depth"))
+        if max(map(abs, colors)) < LARGEST_NUMBER and all(float(n).is_integer() for n in (*colors, *depths)):
+            return self._pair_numbered({int(n): f for n, f in colors.items()}, {int(n): f for n, f in depths.items()})
+        first, second = (sorted(TimedFile(_seconds(n), f) for n, f in files.items()) for files in (colors, depths))
+        return self._pair_timed(first, second)
+
+    def set_rate(self, fps: float) -> None:
+        """As for ``ImageFolder``; groundtruth.txt has times of its own."""
+        super().set_rate(fps)
+        self.ground_truth = self._find_ground_truth()
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        if (self.path / "groundtruth.txt").is_file():
+            return Trajectory.load(self.path / "groundtruth.txt")
+        for name in POSES:
+            place = self.path / name
+            if place.is_file():
+                return rigid_trajectory(zip(self.timestamps.tolist(), self._matrices(place), strict=True))
+            files = {_number(file): file for file in place.glob("*.txt") if re.search(r"\d", file.stem)}
+            stamps = {_number(depth.path): depth.timestamp for _, depth in self._pairs}
+            if files:
+                known = sorted(files.keys() & stamps.keys())
+                return rigid_trajectory((stamps[number], read_matrices(files[number])[0]) for number in known)
+        return None
+
+    def _matrices(self, file: Path) -> NDArray[np.float64]:
+        """Poses (N, 4, 4) of a file with one matrix per frame."""
+        poses = read_matrices(file)
+        if len(poses) != len(self):
+            raise DatasetError(
+                f"{file}, line {len(read_text(file).splitlines())}: the last pose is number {len(poses)}, but there "
+                f"are {len(self)} frames; expected one pose per frame: complete the file, or move it away"
+            )
+        return poses
+
+
+def kinds_of_images(path: Path) -> dict[str, list[Path]]:
+    """Numbered colour and depth images of a folder, or of one folder of each kind in it."""
+    found = _sorted_out(path)
+    if not all(found.values()):
+        for kind, words in (("color", COLOR_WORDS), ("depth", DEPTH_WORDS)):
+            folders = [p for p in sorted(path.iterdir()) if p.is_dir() and _kind_of(p.name) == kind]
+            folders.sort(key=lambda p: [word in p.name.lower() for word in words], reverse=True)
+            numbered = ([f for f in sorted(folder.iterdir()) if _is_numbered_image(f)] for folder in folders)
+            found[kind] = next((files for files in numbered if files), [])
+    return found
+
+
+def _sorted_out(path: Path) -> dict[str, list[Path]]:
+    """Colour and depth images among the files of one folder."""
+    files = [file for file in sorted(path.iterdir()) if _is_numbered_image(file)]
+    return {kind: [file for file in files if _kind_of(file.stem) == kind] for kind in ("color", "depth")}
+
+
+def _kind_of(name: str) -> str | None:
+    words = re.findall("[a-z]+", name.lower())
+    text = " ".join(words)
+    if any(word in NEITHER_WORDS or word.startswith(("confid", "mask")) for word in words):
+        return None
+    if any(word in text for word in DEPTH_WORDS):
+        return "depth"
+    return "color" if any(word in text for word in COLOR_WORDS) else None
+
+
+def _is_numbered_image(file: Path) -> bool:
+    return file.suffix.lower() in IMAGES and re.search(r"\d", file.stem) is not None
+
+
+def _number(file: Path) -> float:
+    """Last number in a file's name; a decimal one counts as a whole."""
+    return float(re.findall(r"\d+(?:\.\d+)?", file.stem)[-1])
+
+
+def _seconds(number: float) -> float:
+    return next(number / units for smallest, units in TIME_UNITS if number >= smallest)

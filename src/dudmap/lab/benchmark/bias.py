@@ -1,0 +1,129 @@
+"""Mean pull of each term of the registration, at the true pose against a map fused at true poses.
+
+An instrument for systematic errors, which neither residuals nor the ATE of a run show separately: where images, poses
+and clocks are exact, every mean correction must vanish.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.exposure import exposed, fit_exposure
+from dudmap.core.frames.frame import Frame
+from dudmap.core.frames.observation import Level
+from dudmap.core.frames.preprocess import Preprocessor
+from dudmap.core.frames.pyramid import Pyramid
+from dudmap.core.geometry import se3
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.tracking.tracker import Tracker
+from dudmap.errors import DatasetError
+from dudmap.io.sequences import Sequence
+
+ITERATIONS = 8
+"""Gauss-Newton steps of each registration."""
+DAMPING = 1e-4
+"""Damping relative to the diagonal of H, which only keeps unconstrained directions from drifting."""
+
+
+class Pull(NamedTuple):
+    """Corrections of the frames' true poses by one term.
+
+    Attributes:
+        term: ``distances``, ``colour`` or ``both``.
+        corrections: (n, 6) float64, translation (mm) and rotation vector (deg), camera axes.
+    """
+
+    term: str
+    corrections: NDArray[np.float64]
+
+    @property
+    def mean(self) -> NDArray[np.float64]:
+        """Mean correction (6,)."""
+        return self.corrections.mean(axis=0)
+
+    @property
+    def spread(self) -> NDArray[np.float64]:
+        """Standard deviation (6,) of the corrections over the frames."""
+        return self.corrections.std(axis=0)
+
+
+def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[Pull]:
+    """Fuse a static recording at its true poses, then register every ``stride``-th frame from its true pose.
+
+    The world frame is the first camera's, as in a run. Frames without a true pose are left out.
+
+    Raises:
+        DatasetError: The recording has no true poses for at least two frames.
+    """
+    truth = sequence.ground_truth
+    if truth is None:
+        raise DatasetError(f"{sequence.name} has no true poses; benchmark bias needs a recording with groundtruth.txt")
+    voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
+    preprocess = Preprocessor(sequence.camera, config.preprocess, voxel_size=voxel_size)
+    volume = TsdfVolume(preprocess.camera, config.volume, config.sensor, config.preprocess.depth_max)
+    frames: list[tuple[Level, NDArray[np.float64]]] = []
+    for index, stamp in enumerate(sequence.timestamps):
+        if not truth.timestamps[0] <= stamp <= truth.timestamps[-1]:
+            continue
+        observation = preprocess(sequence[index])
+        T_truth = truth.interpolate(float(stamp))
+        T_first = frames[0][1] if frames else T_truth
+        volume.integrate(
+            Frame(observation.timestamp, observation.depth, observation.rgb), se3.inverse(T_first) @ T_truth
+        )
+        frames.append((Pyramid.of(observation, preprocess.camera, config).fine, T_truth))
+    if len(frames) < 2:
+        raise DatasetError(f"{sequence.name} has true poses for {len(frames)} frames; benchmark bias needs at least 2")
+    tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
+    T_world_first = se3.inverse(frames[0][1])
+    corrections: dict[str, list[NDArray[np.float64]]] = {"distances": [], "colour": [], "both": []}
+    for level, T_truth in frames[::stride]:
+        T_true = T_world_first @ T_truth
+        volume.look_at(T_true)
+        weights = np.ones_like(level.depth)
+        differences = tracker.linearize(volume, level, T_true, weights).residuals[1]
+        lit = exposed(level, fit_exposure(level.intensity, differences, weights))
+        for term, found in corrections.items():
+            correction = se3.inverse(T_true) @ _registered(tracker, volume, lit, T_true, term)
+            rotation = np.degrees(se3.log_rotation(correction[:3, :3]))
+            found.append(np.concatenate([1000 * correction[:3, 3], rotation]))
+    return [Pull(term, np.array(found)) for term, found in corrections.items()]
+
+
+def _registered(
+    tracker: Tracker, volume: TsdfVolume, level: Level, T: NDArray[np.float64], term: str
+) -> NDArray[np.float64]:
+    """Pose (4, 4) that one term of the cost, or both, wants, by Gauss-Newton from ``T``."""
+    weights = np.ones_like(level.depth)
+    for _ in range(ITERATIONS):
+        both = tracker.linearize(volume, level, T, weights)
+        distances = tracker.linearize(volume, level, T, weights, color_weight=0.0)
+        H, b = {
+            "distances": (distances.H, distances.b),
+            "colour": (both.H - distances.H, both.b - distances.b),
+            "both": (both.H, both.b),
+        }[term]
+        diagonal = np.diag(H)
+        damped = H + np.diag(DAMPING * diagonal + 1e-12 * (1 + diagonal.max()))
+        step = np.asarray(-np.linalg.solve(damped, b), dtype=np.float64)
+        T = se3.retract(T, step)
+        if np.linalg.norm(step) < tracker.config.stop / 10:
+            break
+    return T
+
+
+def bias_table(pulls: list[Pull]) -> str:
+    """Markdown table of the mean corrections and their spread."""
+    lines = [
+        "| term | mean x, y, z (mm) | mean rotation x, y, z (deg) | spread (mm) | spread (deg) |",
+        "|---|---|---|---|---|",
+    ]
+    for pull in pulls:
+        mean, spread = pull.mean, pull.spread
+        cells = [mean[:3], mean[3:], spread[:3], spread[3:]]
+        digits = (2, 3, 2, 3)
+        texts = [", ".join(f"{value:+.{n}f}" for value in cell) for cell, n in zip(cells, digits, strict=True)]
+        lines.append(f"| {pull.term} | " + " | ".join(texts) + " |")
+    return "\n".join(lines) + "\n"

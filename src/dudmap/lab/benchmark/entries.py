@@ -1,0 +1,83 @@
+"""Entries of a benchmark suite: descriptions of recordings, which another process can open."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from dudmap.errors import DatasetError
+
+if TYPE_CHECKING:
+    from dudmap.core.geometry.mesh import Mesh
+    from dudmap.io.sequences import Sequence
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One recording of a suite.
+
+    Attributes:
+        name: Name in tables, folders and published figures.
+        path: Folder, file or archive of a recording on disk; None for a synthetic one.
+        parameters: Arguments of ``lab.synthetic.sequence``; ``camera`` is a (width, height) in pixels, ``faults`` a
+            mapping of the fields of ``SensorFaults`` that differ from those of the sensor.
+        address: Public page it can be downloaded from, empty if there is none.
+        max_frames: Use only this many frames from the start.
+    """
+
+    name: str
+    path: Path | None = None
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    address: str = ""
+    max_frames: int | None = None
+
+    def open(self) -> "Sequence":
+        """Open the recording, or set up the synthetic one.
+
+        Raises:
+            DatasetError: The folder is missing or not a recording.
+        """
+        if self.path is not None:
+            from dudmap.io.sequences import open_sequence
+
+            return open_sequence(self.path)
+        from dudmap.lab.synthetic import sequence
+        from dudmap.lab.synthetic.cameras import find_camera
+        from dudmap.lab.synthetic.faults import SensorFaults
+        from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+
+        size = self.parameters.get("camera", (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height))
+        sensor = self.parameters.get("sensor")
+        camera = find_camera(sensor).camera(*size) if sensor else DEFAULT_CAMERA.resized(*size)
+        usual = find_camera(sensor).faults if sensor else SensorFaults()
+        faults = replace(usual, **self.parameters.get("faults", {}))
+        return sequence(**{**self.parameters, "camera": camera, "faults": faults})
+
+    def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
+        """True static surface and its observed part, in the frame of the ground truth, if known."""
+        from dudmap.core.geometry.mesh import Mesh
+        from dudmap.lab.synthetic.recording import SyntheticSequence
+
+        if isinstance(sequence, SyntheticSequence):
+            return sequence.surface(), sequence.surface(observed=True)
+        if self.path is None or not (self.path / "surface.ply").is_file():
+            return None
+        whole, seen = self.path / "surface.ply", self.path / "surface_observed.ply"
+        return Mesh.load(whole), Mesh.load(seen if seen.is_file() else whole)
+
+
+def local_entries(data: Path) -> list[Entry]:
+    """Every recording in a folder, or the folder itself if it is a recording.
+
+    Raises:
+        DatasetError: No recording was found.
+    """
+    from dudmap.io.sequences import is_recording
+
+    if not data.is_dir():
+        raise DatasetError(f"there is no folder {data}; expected one that holds recordings")
+    folders = [data, *sorted(child for child in data.iterdir() if child.is_dir())]
+    found = [Entry(folder.resolve().name, folder) for folder in folders if is_recording(folder)]
+    if not found:
+        raise DatasetError(f"no recording found in {data}; `dudmap info` says what it finds in a folder")
+    return found

@@ -1,0 +1,201 @@
+"""Random worlds with random sensors: how often, and how badly, a system fails on what nobody chose."""
+
+import hashlib
+import json
+import shlex
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from dudmap.config import Config
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.limits import code_hash
+from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
+from dudmap.lab.benchmark.table import grid
+
+SILENT_ATE, SILENT_LOST = 0.05, 0.2
+"""A silent failure has an ATE RMSE above SILENT_ATE metres with less than the share SILENT_LOST of the frames lost."""
+SIZES = ((240, 180), (256, 192), (320, 240))
+SCENES = {"room": 0.4, "corridor": 0.15, "desk": 0.15, "yard": 0.1, "box": 0.1, "textureless": 0.05, "plane": 0.05}
+PATHS = {"handheld": 0.4, "fast": 0.15, "slow": 0.1, "pan": 0.1, "orbit": 0.1, "dolly": 0.1, "still": 0.05}
+CONTENTS = {"nothing": 0.25, "one": 0.3, "two": 0.1, "crowd": 0.2, "situation": 0.15}
+MOVERS = (
+    "person", "people", "wanderer", "carried_box", "removed_box", "ball", "balloon", "creeper", "stopping_cart",
+    "starting_cart", "door",
+)  # fmt: skip
+SITUATIONS = ("people_at_start", "follow", "stops", "starts", "put_down", "taken_away")
+"""Situations in which the camera always sees the scene; ``blocked`` and ``kidnapped`` lose frames by design."""
+CROWDED = ("room", "corridor", "yard")
+SENSORS = ("kinect_v1", "kinect_v2", "realsense_d435", "realsense_l515", "iphone_lidar")
+NOISES = ("kinect", "realsense", "d435", "kinect_v2", "l515", "iphone")
+NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
+"""Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
+Draw = Callable[[np.random.Generator], Any]
+FAULTS: dict[str, Draw] = {
+    "color_translation": lambda rng: _rounded(rng.uniform((-0.03, -0.01, -0.01), (0.03, 0.01, 0.01))),
+    "color_rotation_deg": lambda rng: _rounded(rng.uniform(-0.7, 0.7, 3)),
+    "color_focal_ratio": lambda rng: _rounded(rng.uniform(0.92, 1.08)),
+    "color_center_shift": lambda rng: _rounded(rng.uniform(-4, 4, 2)),
+    "color_delay": lambda rng: _rounded(rng.uniform(-0.015, 0.03)),
+    "color_readout": lambda rng: _rounded(rng.uniform(0.005, 0.03)),
+    "color_distortion": lambda rng: _rounded(rng.uniform((-0.1, -0.1, -2e-3, -2e-3), (0.15, 0.1, 2e-3, 2e-3))),
+    "auto_exposure": lambda rng: _rounded(rng.uniform(0.1, 0.6)),
+    "white_balance_drift": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
+    "vignetting": lambda rng: _rounded(rng.uniform(0.05, 0.4)),
+    "jpeg_quality": lambda rng: float(rng.integers(50, 96)),
+    "depth_scale_error": lambda rng: _rounded(rng.uniform(-0.01, 0.01)),
+    "depth_offset": lambda rng: _rounded(rng.uniform(-0.01, 0.01)),
+    "depth_bands": lambda rng: _rounded(rng.uniform(2e-4, 1.5e-3)),
+    "depth_distortion": lambda rng: _rounded(rng.uniform(1e-3, 0.01)),
+    "flying_pixels": lambda rng: _rounded(rng.uniform(0.1, 0.8)),
+    "multipath": lambda rng: _rounded(rng.uniform(0.1, 0.5)),
+    "dropped_frames": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
+    "late_frames": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
+}
+"""Size of each fault: what named cameras and recordings show, and a little more."""
+
+
+def _rounded(value: Any) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
+    """Four decimals, so that a command line holds the same number."""
+    return tuple(round(float(x), 4) for x in value) if np.ndim(value) else round(float(value), 4)
+
+
+def draw_world(seed: int, number: int) -> dict[str, Any]:
+    """Arguments of ``dudmap.lab.synthetic.sequence`` (as ``Entry.parameters``) of world ``number`` of a seed."""
+    rng = np.random.default_rng([seed, number])
+
+    def one_of(shares: dict[str, float]) -> str:
+        return str(rng.choice(list(shares), p=np.array(list(shares.values())) / sum(shares.values())))
+
+    scene, content = one_of(SCENES), one_of(CONTENTS)
+    world: dict[str, Any] = {
+        "scene": scene,
+        "camera_path": one_of(PATHS),
+        "camera": SIZES[rng.integers(len(SIZES))],
+        "frames": int(rng.integers(90, 121)),
+        "seed": int(rng.integers(1, 100_000)),
+    }
+    if content == "crowd" and scene in CROWDED:
+        world["coverage"] = _rounded(rng.uniform(0.05, 0.5))
+    elif content == "situation":
+        world["situation"] = str(rng.choice(SITUATIONS))
+        if world["situation"] == "follow":
+            world["camera_path"] = "follow"
+    else:
+        count = {"nothing": 0, "one": 1}.get(content, 2)
+        world["movers"] = tuple(str(name) for name in rng.choice(MOVERS, count, replace=False))
+    if content != "nothing":
+        world["start_dynamic"] = bool(rng.random() < 0.3)
+        if rng.random() < 0.4:
+            world["speed"] = _rounded(np.exp(rng.uniform(np.log(0.05), np.log(2.0))))
+    if rng.random() < NAMED:
+        return world | {"sensor": str(rng.choice(SENSORS))}
+    faults = {name: draw(rng) for name, draw in FAULTS.items() if rng.random() < FAULTY}
+    blur = _rounded(rng.uniform(0.1, 0.6)) if rng.random() < BLURRED else 0.0
+    return world | {"noise": str(rng.choice(NOISES)), "faults": faults, "motion_blur": blur}
+
+
+def synth_command(world: dict[str, Any]) -> str:
+    """The ``dudmap synth`` command that writes a world to a folder; its depth is rounded to 1/5000 m there."""
+    words = ["dudmap", "synth", "OUT", "--size", "{}x{}".format(*world["camera"])]
+    for key, value in world.items():
+        option = "--" + key.replace("_", "-")
+        if key == "movers":
+            words += [option, ",".join(value) or "none"]
+        elif key == "faults":
+            for name, size in value.items():
+                words += ["--fault", f"{name}={','.join(map(str, size)) if isinstance(size, tuple) else size}"]
+        elif key == "start_dynamic":
+            words += [option] if value else []
+        elif key != "camera":
+            words += [option, str(value)]
+    return shlex.join(words)
+
+
+def measure_worlds(
+    seed: int,
+    numbers: Iterable[int],
+    config: Config,
+    out: Path,
+    workers: int = 1,
+    done: Callable[[Row], None] = lambda row: None,
+) -> list[Row]:
+    """One row per world, in the order of their numbers; each is written to a file as soon as it is measured.
+
+    Args:
+        seed: Seed of the worlds.
+        numbers: Their numbers.
+        config: Configuration of the system.
+        out: Folder of the file, seed-<seed>-<fingerprint>.jsonl; worlds of the same code and configuration that it
+            holds are not measured again.
+        workers: Number of processes at a time.
+        done: Called with every row measured now.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    fingerprint = hashlib.sha256(f"{code_hash()}{config.to_toml()}".encode()).hexdigest()[:8]
+    file = out / f"seed-{seed}-{fingerprint}.jsonl"
+    lines = file.read_text(encoding="utf-8").splitlines() if file.is_file() else []
+    rows: dict[int, Row] = {row["world"]: row for line in lines if line.endswith("}") for row in [json.loads(line)]}
+    wanted = list(dict.fromkeys(numbers))
+
+    def one(number: int) -> None:
+        world = draw_world(seed, number)
+        row: Row = {"seed": seed, "world": number, "parameters": world}
+        row |= in_own_process(_measure, (Entry(f"world-{number}", parameters=world), config))
+        with file.open("a", encoding="utf-8") as stream:
+            stream.write(json.dumps(row) + "\n")
+        rows[number] = row
+        done(row)
+
+    with ThreadPoolExecutor(workers) as pool:
+        list(pool.map(one, [number for number in wanted if number not in rows]))
+    return [rows[number] for number in wanted]
+
+
+def _measure(job: tuple[Entry, Config]) -> Row:
+    entry, config = job
+    return measure_sequence(entry.open(), config, None, calibrate=True)
+
+
+def is_silent_failure(row: Row) -> bool:
+    """Whether a world is wrong without saying so."""
+    ate = row.get("ate_rmse_m")
+    return ate is not None and ate > SILENT_ATE and row["lost"] < SILENT_LOST * row["frames"]
+
+
+def report(rows: list[Row], seed: int, worst: int = 10) -> str:
+    """Markdown: the distribution of the ATE, the silent failures, and the worst worlds with their commands."""
+    measured = [row for row in rows if row.get("ate_rmse_m") is not None]
+    measured.sort(key=lambda row: -row["ate_rmse_m"])
+    failed = [row for row in rows if row.get("ate_rmse_m") is None]
+    silent = [row for row in measured if is_silent_failure(row)]
+    text = f"{len(rows)} random worlds of seed {seed}\n\n"
+    if measured:
+        ates = 100 * np.array([row["ate_rmse_m"] for row in measured])
+        count, frames = (sum(row[key] for row in measured) for key in ("lost", "frames"))
+        lost = f"{count} of {frames} in {sum(row['lost'] > 0 for row in measured)} worlds"
+        figures = [f"{value:.2f}" for value in (np.median(ates), np.percentile(ates, 95), ates.max())]
+        header = ["median ATE, cm", "95 % ATE, cm", "largest ATE, cm", "frames lost", "silent failures", "no result"]
+        text += grid(header, [[*figures, lost, str(len(silent)), str(len(failed))]], words=0)
+    else:
+        text += "No world gave a result.\n"
+    text += _listed("Silent failures (ATE > 5 cm, less than 20 % of the frames lost)", silent)
+    text += _listed("Worst worlds", measured[:worst])
+    return text + _listed("Worlds without a result", failed)
+
+
+def _listed(title: str, rows: list[Row]) -> str:
+    """List of worlds, each with the command that measures it again and the one that writes it to a folder."""
+    if not rows:
+        return f"\n{title}: none.\n"
+    text = f"\n{title}:\n"
+    for row in rows:
+        figure = row.get("error") or "no error could be computed"
+        if row.get("ate_rmse_m") is not None:
+            figure = f"{100 * row['ate_rmse_m']:.2f} cm, {row['lost']} of {row['frames']} frames lost"
+        again = f"dudmap benchmark random --seed {row['seed']} --only {row['world']}"
+        text += f"\n- world {row['world']}: {figure}\n  - `{again}`\n  - `{synth_command(row['parameters'])}`\n"
+    return text

@@ -1,0 +1,186 @@
+"""Faults of the stream: what a run makes of each, with the poses it vouches for compared with the truth."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.config import Config
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.core.slam import Slam
+from dudmap.errors import ConfigError, FrameError
+from dudmap.io.sequences import Sequence
+from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
+
+SILENT_ERROR = 0.03
+"""Error of a pose said to be tracked from which on it is wrong, metres; at least
+``SILENT_RATIO`` times the largest error of the run without the fault."""
+SILENT_RATIO = 3.0
+LAST_FRAMES = 5
+"""Frames at the end of a stream without a pose from which on it counts as lost to the end."""
+
+
+@dataclass(frozen=True, eq=False)
+class FaultRun:
+    """What became of the frames of one stream.
+
+    Attributes:
+        fault: Its name.
+        rejected: Number of frames not used, by kind (``FrameResult.rejected``, ``FrameError.kind``).
+        lost: Frames whose registration was rejected.
+        maps: Submaps in the end.
+        errors: (N,) distance of the pose from the truth, metres, per frame that arrived; NaN of those without a pose.
+        flagged: (N,) bool, poses that the run itself calls doubtful: ``FrameResult.blind``, ``uncertain`` or repeated.
+    """
+
+    fault: str
+    rejected: dict[str, int]
+    lost: int
+    maps: int
+    errors: NDArray[np.float64]
+    flagged: NDArray[np.bool_]
+
+    def wrong(self, clean: "FaultRun") -> tuple[int, int]:
+        """Poses that are wrong although the run calls them tracked: without a word, and those it calls doubtful."""
+        wrong = self.errors > max(SILENT_ERROR, SILENT_RATIO * float(np.nanmax(clean.errors)))
+        return int(np.count_nonzero(wrong & ~self.flagged)), int(np.count_nonzero(wrong & self.flagged))
+
+    def frames_to_recovery(self) -> int | None:
+        """Longest run of frames that arrived without getting a pose; None if the last LAST_FRAMES have none."""
+        without, longest = 0, 0
+        for missing in np.isnan(self.errors):
+            without = without + 1 if missing else 0
+            longest = max(longest, without)
+        return None if without >= LAST_FRAMES else longest
+
+    def outcome(self, clean: "FaultRun") -> str:
+        """What happened, in words; it begins with FAILED where a wrong pose was called tracked, or none came back."""
+        if self.wrong(clean)[0]:
+            return "FAILED: wrong poses are called tracked"
+        if self.frames_to_recovery() is None:
+            return "FAILED: lost to the end"
+        if self.lost:
+            return "lost and recovered" if self.maps == 1 else "lost, went on in a new map"
+        return "skipped and counted" if self.rejected else "handled"
+
+
+class Excerpt:
+    """The first frames of a recording, each of which is read once."""
+
+    def __init__(self, recording: Sequence, frames: int) -> None:
+        self.recording = recording
+        self.name, self.camera, self.calibration = recording.name, recording.camera, recording.calibration
+        self.timestamps, self.ground_truth = recording.timestamps[:frames], recording.ground_truth
+        self._frames: dict[int, Frame] = {}
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> Frame:
+        if index not in self._frames:
+            self._frames[index] = self.recording[index]
+        return self._frames[index]
+
+    def mask(self, index: int) -> NDArray[np.bool_] | None:
+        """True dynamic mask (H, W) of a frame if known."""
+        return self.recording.mask(index)
+
+
+def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
+    """A synthetic scene with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
+    from dudmap.lab import synthetic
+
+    focal = 525 / 640 * width
+    camera = Camera(focal, focal, (width - 1) / 2, (width * 3 // 4 - 1) / 2, width, width * 3 // 4)
+    return synthetic.sequence(scene, frames=frames, seed=seed, camera=camera, noise="kinect")
+
+
+def measure_stream_faults(
+    recording: Sequence, config: Config, faults: list[str] | None = None, frames: int | None = None
+) -> Iterator[tuple[FaultRun, FaultRun]]:
+    """Run the system over a recording once without a fault and once with each.
+
+    Args:
+        recording: With true poses.
+        config: All parameters.
+        faults: Names of the faults; None or none takes all.
+        frames: Use only so many frames of the recording.
+
+    Yields:
+        A run as soon as it ends, and the one without a fault, which is the first.
+
+    Raises:
+        ConfigError: A fault is unknown, or the recording has no true poses.
+    """
+    if recording.ground_truth is None:
+        raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
+    kept = Excerpt(recording, min(frames or len(recording), len(recording)))
+    streams = {name: FaultyStream(kept, name) for name in ["none", *(n for n in faults or FAULTS if n != "none")]}
+    clean: FaultRun | None = None
+    for name, stream in streams.items():
+        run = run_stream(stream, name, config)
+        clean = clean or run
+        yield run, clean
+
+
+def run_stream(stream: FaultyStream, fault: str, config: Config) -> FaultRun:
+    """Process a stream and compare every pose with the truth of its frame.
+
+    The poses of each submap are compared after the rigid motion that makes its first one right.
+    """
+    slam = Slam(stream.camera, config, calibration=stream.calibration)
+    truth = _true_poses(stream)
+    rejected: dict[str, int] = {}
+    errors, flagged, anchors, lost = [], [], {}, 0
+    for number, delivery in enumerate(stream.deliveries):
+        errors.append(np.nan)
+        flagged.append(False)
+        try:
+            result = slam.process(stream[number])
+        except FrameError as error:
+            rejected[error.kind] = rejected.get(error.kind, 0) + 1
+            continue
+        if result.rejected:
+            rejected[result.rejected] = rejected.get(result.rejected, 0) + 1
+        elif result.T_world_camera is None:
+            lost += 1
+        else:
+            flagged[-1] = result.blind or bool(result.uncertain) or result.state == "repeated"
+            T_true = truth[delivery.number]
+            anchor = anchors.setdefault(result.submap, T_true @ se3.inverse(result.T_world_camera))
+            errors[-1] = float(np.linalg.norm((anchor @ result.T_world_camera - T_true)[:3, 3]))
+    return FaultRun(fault, rejected, lost, len(slam.maps), np.array(errors), np.array(flagged))
+
+
+def _true_poses(stream: FaultyStream) -> list[NDArray[np.float64]]:
+    """True pose (4, 4) of every frame of the recording."""
+    truth: Trajectory | None = stream.ground_truth
+    assert truth is not None
+    first, last = float(truth.timestamps[0]), float(truth.timestamps[-1])
+    return [truth.interpolate(min(max(float(t), first), last)) for t in stream.recording.timestamps]
+
+
+def table_head(name: str, frames: int) -> str:
+    """Caption and head of the Markdown table."""
+    return (
+        f"{name}, {frames} frames:\n\n"
+        "| fault | what happens | outcome | frames | rejected | lost | RMSE, mm | largest, mm | wrong: silent, flagged "
+        "| frames to recovery |\n"
+        "|---|---|---|---|---|---|---|---|---|---|"
+    )
+
+
+def fault_row(run: FaultRun, clean: FaultRun) -> str:
+    """Line of the table: errors are those of the poses said to be tracked."""
+    kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
+    errors = 1000 * run.errors[np.isfinite(run.errors)]
+    recovery, (silent, flagged) = run.frames_to_recovery(), run.wrong(clean)
+    return (
+        f"| {run.fault} | {FAULTS[run.fault].description} | {run.outcome(clean)} | {len(run.errors)} | {kinds} "
+        f"| {run.lost} | {np.sqrt(np.mean(errors**2)):.1f} | {errors.max():.1f} | {silent}, {flagged} "
+        f"| {'never' if recovery is None else recovery} |"
+    )

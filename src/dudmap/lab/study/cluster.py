@@ -1,0 +1,72 @@
+"""Runs on a Ray cluster (extra ``cluster``)."""
+
+from concurrent.futures import Future
+from importlib import import_module
+from typing import Any
+
+from dudmap.errors import ConfigError
+from dudmap.extras import extra
+from dudmap.lab.study.executor import WorkerDied, set_threads
+from dudmap.lab.study.worker import Job, Outcome, perform
+
+CPUS_PER_RUN = 1
+"""Cores that a run reserves, and its number of threads."""
+
+
+class RayExecutor:
+    """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
+
+    Args:
+        address: ``auto``, or ``ray://HOST:PORT``.
+        workers: Number of runs at a time; None takes the cores of the cluster.
+
+    Raises:
+        MissingExtraError: Ray is not installed.
+        ConfigError: There is no cluster at the address.
+    """
+
+    def __init__(self, address: str, workers: int | None = None) -> None:
+        with extra("cluster", "--cluster"):
+            ray: Any = import_module("ray")
+        try:
+            ray.init(address, ignore_reinit_error=True, log_to_driver=False, logging_level="error")
+        except (ConnectionError, ValueError) as error:
+            raise ConfigError(f"there is no Ray cluster at {address}: {error}") from None
+        except ImportError as error:  # ray:// needs the client of Ray
+            raise ConfigError(f"ray lacks its client ({error}); pip install 'dudmap[cluster]'") from None
+        self._ray = ray
+        self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(
+            _perform
+        )  # retries: dudmap.lab.study.conduct
+        self.workers = workers or max(1, int(ray.cluster_resources().get("CPU", 1)) // CPUS_PER_RUN)
+        self.cores = CPUS_PER_RUN
+        self._running: set[Any] = set()
+
+    def submit(self, job: Job) -> "Future[Outcome]":
+        """See ``Executor``."""
+        reference = self._perform.remote(job)
+        self._running.add(reference)
+        out: Future[Outcome] = Future()
+        reference.future().add_done_callback(lambda future: self._pass_on(reference, future, out))
+        return out
+
+    def _pass_on(self, reference: Any, future: "Future[Outcome]", out: "Future[Outcome]") -> None:  # noqa: ANN401
+        self._running.discard(reference)
+        errors = self._ray.exceptions
+        lost = (errors.WorkerCrashedError, errors.NodeDiedError, errors.OutOfMemoryError, errors.ObjectLostError)
+        error = future.exception()
+        if error is None:
+            out.set_result(future.result())
+        else:
+            out.set_exception(WorkerDied() if isinstance(error, lost) else error)
+
+    def close(self) -> None:
+        """See ``Executor``. The cluster goes on; its runs of this study are ended."""
+        for reference in list(self._running):
+            self._ray.cancel(reference, force=True)
+        self._ray.shutdown()
+
+
+def _perform(job: Job) -> Outcome:
+    set_threads(CPUS_PER_RUN)
+    return perform(job)

@@ -1,0 +1,153 @@
+"""Execution of the runs of a study: begins what is missing, repeats what a dead worker left, reports progress."""
+
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+from queue import SimpleQueue
+from typing import Any
+
+from dudmap.lab.study.executor import Executor, WorkerDied
+from dudmap.lab.study.plan import Run
+from dudmap.lab.study.store import StudyFolder
+from dudmap.lab.study.tables import Table
+from dudmap.lab.study.worker import Job
+
+ATTEMPTS = 3
+"""Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""
+POLL = 0.5
+"""Time between two looks at a run that another process has claimed, seconds."""
+
+
+@dataclass
+class Progress:
+    """State of a study.
+
+    Attributes:
+        total: Number of different runs.
+        done: Number of runs that have a result, those of earlier starts included.
+        begun: Number of runs that had one at the start.
+        deaths: Number of workers that died.
+        spent: Time of all runs so far, those of earlier starts included, seconds.
+        started: ``time.monotonic`` at the start.
+        cores: Cores that a run uses.
+    """
+
+    total: int
+    done: int
+    begun: int
+    deaths: int = 0
+    spent: float = 0.0
+    started: float = 0.0
+    cores: int = 1
+
+    def seconds_left(self) -> float | None:
+        """Expected time left at the rate so far; None before the first run ended."""
+        now = self.done - self.begun
+        return None if not now else (time.monotonic() - self.started) / now * (self.total - self.done)
+
+    @property
+    def core_hours(self) -> float:
+        """Core-hours of all runs so far."""
+        return self.spent * self.cores / 3600
+
+    def cost(self, price: float = 0.0) -> str:
+        """Core-hours so far and about how many the whole study needs, with their cost at a price per core-hour."""
+        whole = self.core_hours / self.done * self.total if self.done else 0.0
+        hours = f"{self.core_hours:.3g} of about {whole:.3g} core-hours"
+        return hours + (f", cost {self.core_hours * price:.2f} of about {whole * price:.2f}" if price else "")
+
+    def describe(self, price: float = 0.0) -> str:
+        """State in words, with the cost at a price per core-hour."""
+        left = self.seconds_left()
+        died = f", {self.deaths} workers died" if self.deaths else ""
+        rest = "" if left is None else f", {duration(left)} left"
+        return f"run {self.done} of {self.total}{rest}, {self.cost(price)}{died}"
+
+    def __str__(self) -> str:
+        return self.describe()
+
+
+def duration(seconds: float) -> str:
+    """Time in words."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"
+
+
+def conduct(
+    runs: Sequence[Run],
+    root: Path,
+    executor: Executor,
+    *,
+    keep: bool = False,
+    do: Callable[[Run, Path | None], dict[str, Any]] | None = None,
+    report: Callable[[Progress], None] = lambda progress: None,
+) -> Progress:
+    """Do all runs that have no result yet.
+
+    Args:
+        runs: The runs; equal ones are done once.
+        root: Study folder.
+        executor: Where they are done.
+        keep: Keep whole run folders.
+        do: See ``Job``.
+        report: Called after every run.
+    """
+    folder = StudyFolder(root)
+    folder.create()
+    unique = {run.key: run for run in runs}
+    results = {key: folder.result(key) for key in unique}
+    missing = deque(key for key, result in results.items() if result is None)
+    known = [result["seconds"] for result in results.values() if result is not None]
+    state = Progress(
+        len(unique), len(known), len(known), spent=sum(known), started=time.monotonic(), cores=executor.cores
+    )
+    deaths: Counter[str] = Counter()
+    running: dict[Future[Any], str] = {}
+    ended: SimpleQueue[Future[Any]] = SimpleQueue()  # waiting for a thousand futures anew after each would take longer
+    while missing or running:
+        while missing and len(running) < executor.workers:
+            key = missing.popleft()
+            future = executor.submit(Job(unique[key], root, keep, do))
+            running[future] = key
+            future.add_done_callback(ended.put)
+        future = ended.get()
+        key = running.pop(future)
+        try:
+            outcome = future.result()
+        except WorkerDied:
+            folder.note("died", key)
+            deaths[key] += 1
+            state.deaths += 1
+            if deaths[key] < ATTEMPTS:
+                missing.append(key)
+            continue
+        if outcome == "claimed":  # by another start of the study, or a worker that has yet to notice its end
+            missing.append(key)
+            time.sleep(POLL)
+            continue
+        result = folder.result(key)
+        assert result is not None
+        state.done += 1
+        state.spent += result["seconds"]
+        report(state)
+    return state
+
+
+def table_of(runs: Sequence[Run], root: Path) -> Table:
+    """One row per run: number of the point, recording, replicate, values of the factors, figures, error, time.
+
+    A run without a result has the error "no result: its worker died".
+    """
+    import pandas as pd
+
+    folder = StudyFolder(root)
+    rows = []
+    for run in runs:
+        result = folder.result(run.key) or {"row": {"error": "no result: its worker died"}, "seconds": None}
+        row = {"run": run.key, "point": run.point, "sequence": run.sequence, "replicate": run.replicate}
+        rows.append({**row, **run.values, "seconds": result["seconds"], **result["row"]})
+    return pd.DataFrame(rows)

@@ -1,0 +1,207 @@
+"""Experimental designs: which combinations of levels are run.
+
+Every design comes from a library: factorial, Plackett-Burman (1946), central composite (Box and Wilson 1951) and
+Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences from ``scipy.stats.qmc``, and the designs
+of Saltelli (2010) and Morris (1991), from which their indices are computed without a model, from SALib.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import ConfigError
+from dudmap.lab.study.factors import Factor, Value
+
+Coded = NDArray[np.float64]
+Point = dict[str, Value]
+"""Values of all factors by key."""
+
+MORRIS_LEVELS = 4
+"""Levels per factor of a Morris design; Morris (1991) and SALib take 4."""
+
+
+@dataclass(frozen=True)
+class DesignOptions:
+    """Table ``design`` of a design file.
+
+    Attributes:
+        kind: Name of the design, one of ``DESIGNS``.
+        samples: Number of points of a Latin hypercube or Sobol sequence; base samples N of a Saltelli design, which has
+            N (2 K + 2) points for K factors; trajectories N of a Morris design, which has N (K + 1) points.
+        resolution: Resolution of a fractional factorial design.
+        generators: Generators of a fractional factorial design such as ``a b c abc``, instead of a resolution.
+        seed: Seed of a sampled design.
+        foldover: Whether a Plackett-Burman design is followed by its mirror image, which makes the effects free of
+            interactions of two factors.
+    """
+
+    kind: str = "full-factorial"
+    samples: int = 64
+    resolution: int = 4
+    generators: str = ""
+    seed: int = 0
+    foldover: bool = True
+
+
+def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
+    """All points of a design, each once.
+
+    Raises:
+        ConfigError: The design does not exist, or does not fit the factors.
+    """
+    if options.kind not in DESIGNS:
+        raise ConfigError(f"unknown design {options.kind!r}; known are {', '.join(DESIGNS)}")
+    found: list[Point]
+    if options.kind == "full-factorial":
+        found = _full_factorial(factors)
+    elif options.kind == "fractional-factorial":
+        found = [_two_level(factors, row) for row in _fractional(factors, options)]
+    elif options.kind == "plackett-burman":
+        found = [_two_level(factors, row) for row in _plackett_burman(factors, options)]
+    else:
+        words = [factor.key for factor in factors if not factor.numeric]
+        if words:
+            raise ConfigError(f"a {options.kind} design needs numbers, but {words[0]} has levels that are none")
+        rows = DESIGNS[options.kind](factors, options)
+        found = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
+    if options.kind in ("saltelli", "morris"):  # their indices need every row, repeated ones too
+        return found
+    return [point for number, point in enumerate(found) if point not in found[:number]]
+
+
+def count_of(factors: Sequence[Factor], options: DesignOptions) -> int:
+    """Number of points of a design, without making those of one that can be large."""
+    if options.kind == "full-factorial":
+        return int(np.prod([max(len(factor.levels), 1) for factor in factors], dtype=object))
+    by_kind = {
+        "latin-hypercube": options.samples,
+        "sobol": options.samples,
+        "saltelli": options.samples * (2 * len(factors) + 2),
+        "morris": options.samples * (len(factors) + 1),
+        "central-composite": 2 ** len(factors) + 2 * len(factors) + 1,
+    }
+    return by_kind[options.kind] if options.kind in by_kind else len(points_of(factors, options))
+
+
+def _full_factorial(factors: Sequence[Factor]) -> list[Point]:
+    from pyDOE3 import fullfact
+
+    ranges = [factor.key for factor in factors if not factor.levels]
+    if ranges:
+        raise ConfigError(f"a full-factorial design needs levels, but {ranges[0]} has a range")
+    rows = fullfact([len(factor.levels) for factor in factors]).astype(int)
+    return [{f.key: f.levels[n] for f, n in zip(factors, row, strict=True)} for row in rows]
+
+
+def _two_level(factors: Sequence[Factor], row: Coded) -> Point:
+    ends = [(f.levels[0], f.levels[-1]) if not f.numeric else (f.value(-1), f.value(1)) for f in factors]
+    return {f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)}
+
+
+def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import fracfact, fracfact_by_res
+
+    try:
+        if options.generators:
+            rows = np.asarray(fracfact(options.generators))
+        else:
+            rows = np.asarray(fracfact_by_res(len(factors), options.resolution))
+    except ValueError as error:
+        raise ConfigError(f"no fractional factorial design for {len(factors)} factors: {error}") from None
+    if rows.shape[1] != len(factors):
+        raise ConfigError(
+            f"the generators {options.generators!r} make {rows.shape[1]} columns for {len(factors)} factors"
+        )
+    return rows
+
+
+def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import pbdesign
+
+    for factor in factors:
+        if len(factor.levels) > 2:
+            raise ConfigError(
+                f"a plackett-burman design has two levels, but {factor.key} has {len(factor.levels)}; give it a range"
+            )
+    runs = 4 * (len(factors) // 4 + 1)
+    while True:  # pyDOE3 knows the sizes 2^n, 12 2^n and 20 2^n
+        try:
+            rows = np.asarray(pbdesign(runs - 1))[:, : len(factors)]
+            break
+        except AssertionError:
+            runs += 4
+    return np.vstack([rows, -rows]) if options.foldover else rows
+
+
+def _central_composite(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import ccdesign
+
+    if len(factors) < 2:
+        raise ConfigError("a central-composite design needs two factors or more")
+    return np.asarray(ccdesign(len(factors), center=(0, 1), face="faced"))
+
+
+def _box_behnken(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from pyDOE3 import bbdesign
+
+    if len(factors) < 3:
+        raise ConfigError("a box-behnken design needs three factors or more")
+    return np.asarray(bbdesign(len(factors), center=1))
+
+
+def _latin_hypercube(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from scipy.stats.qmc import LatinHypercube
+
+    return 2 * LatinHypercube(len(factors), rng=np.random.default_rng(options.seed)).random(options.samples) - 1
+
+
+def _sobol(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from scipy.stats.qmc import Sobol
+
+    _check_power(options)
+    sampler = Sobol(len(factors), rng=np.random.default_rng(options.seed))
+    return 2 * sampler.random_base2(options.samples.bit_length() - 1) - 1
+
+
+def _saltelli(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from SALib.sample.sobol import sample
+
+    _check_power(options)
+    return sample(problem(factors), options.samples, calc_second_order=True, seed=options.seed)
+
+
+def _morris(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    from SALib.sample.morris import sample
+
+    return sample(problem(factors), options.samples, num_levels=MORRIS_LEVELS, seed=options.seed)
+
+
+def _check_power(options: DesignOptions) -> None:
+    if options.samples & (options.samples - 1):
+        raise ConfigError(f"a {options.kind} design has {options.samples} samples; expected a power of two")
+
+
+def problem(factors: Sequence[Factor]) -> dict[str, Any]:
+    """The factors in coded units, as SALib wants them."""
+    return {
+        "num_vars": len(factors),
+        "names": [factor.name for factor in factors],
+        "bounds": [[-1.0, 1.0]] * len(factors),
+    }
+
+
+DESIGNS: dict[str, Callable[[Sequence[Factor], DesignOptions], Coded]] = {
+    "full-factorial": lambda factors, options: np.empty((0, len(factors))),
+    "fractional-factorial": _fractional,
+    "plackett-burman": _plackett_burman,
+    "central-composite": _central_composite,
+    "box-behnken": _box_behnken,
+    "latin-hypercube": _latin_hypercube,
+    "sobol": _sobol,
+    "saltelli": _saltelli,
+    "morris": _morris,
+}
+"""Designs by name, as coded points; full-factorial takes the levels themselves (``_full_factorial``)."""

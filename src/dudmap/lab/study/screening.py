@@ -1,0 +1,181 @@
+"""Screening of many keys: all numeric keys as factors, and the effect of each on each recording."""
+
+from collections.abc import Collection, Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from dudmap.config import Config, keys
+from dudmap.errors import ConfigError
+from dudmap.lab.study.factors import Factor, is_number, value_of
+from dudmap.lab.study.tables import Table
+
+if TYPE_CHECKING:
+    from dudmap.lab.study.report import Report
+
+FALSE_SHARE = 0.05
+"""Share of the effects called significant that may be due to chance (Benjamini and Hochberg 1995)."""
+MOST_SHOWN = 16
+"""Keys that a figure shows."""
+
+
+def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -> tuple[Factor, ...]:
+    """Every numeric key as a factor between its value divided by a ratio and its value times the ratio.
+
+    Both ends are kept inside the bounds of the key; where a bound excludes its own value, the end lies halfway between
+    value and bound. A whole number changes by 1 at least. Of a list of numbers all elements change together, and the
+    factor has two levels. A key with the value 0 has no ratio and is left out.
+
+    Args:
+        given: Table ``all_numeric`` of a design file: ``ratio``, and keys to leave out (``without``).
+        base: Configuration whose values are varied.
+        chosen: Keys that the design file gives itself, which are left out.
+
+    Raises:
+        ConfigError: The table is malformed.
+    """
+    if not isinstance(given, dict) or set(given) - {"ratio", "without"}:
+        raise ConfigError(f"all_numeric is {given!r}; expected, for example, all_numeric = {{ ratio = 1.5 }}")
+    ratio, without = given.get("ratio", 1.5), given.get("without", [])
+    if not is_number(ratio) or not ratio > 1:
+        raise ConfigError(f"ratio of all_numeric is {ratio!r}; expected a number above 1")
+    if not isinstance(without, list):
+        raise ConfigError(f"without of all_numeric is {without!r}; expected a list of configuration keys")
+    for key in without:
+        if key not in keys():
+            raise ConfigError(f"all_numeric leaves out {key!r}, which is no configuration key")
+    out = []
+    for key in keys():
+        value = value_of(base, key)
+        if key in without or key in chosen:
+            continue
+        if isinstance(value, tuple):
+            ends = [[_scaled(element, factor) for element in value] for factor in (1 / ratio, ratio)]
+            out.append(Factor(key, tuple(ends)))
+        elif isinstance(value, int | float) and not isinstance(value, bool) and value != 0:
+            low, high = _ends(key, value, ratio)
+            whole = isinstance(value, int)
+            out.append(Factor(key, (), low, high, "linear" if whole or low <= 0 else "log", whole))
+    return tuple(out)
+
+
+def _ends(key: str, value: float, ratio: float) -> tuple[float, float]:
+    low, high = sorted((_scaled(value, 1 / ratio), _scaled(value, ratio)))
+    if isinstance(value, int):
+        low, high = min(low, value - 1), max(high, value + 1)
+    for name, bound in bounds_of(key).items():
+        if name in ("ge", "gt"):
+            low = max(low, bound) if name == "ge" else low if low > bound else (value + bound) / 2
+        else:
+            high = min(high, bound) if name == "le" else high if high < bound else (value + bound) / 2
+    return float(low), float(high)
+
+
+def _scaled(value: float, factor: float) -> float:
+    return max(round(value * factor), 1) if isinstance(value, int) else float(f"{value * factor:.6g}")
+
+
+def bounds_of(key: str) -> dict[str, float]:
+    """Bounds of a numeric key by their kind: ``ge``, ``gt``, ``le``, ``lt``."""
+    section, _, name = key.rpartition(".")
+    model: Any = type(getattr(Config(), section))
+    found = model.model_fields[name].metadata
+    return {kind: getattr(item, kind) for item in found for kind in ("ge", "gt", "le", "lt") if hasattr(item, kind)}
+
+
+def screen(table: Table, factors: Sequence[Factor], response: str) -> Table:
+    """Effect of every two-level factor on every recording: mean at its high end minus mean at its low end.
+
+    Least squares with all factors together (statsmodels), each recording on its own, so that a key that matters on one
+    recording only is found. The probabilities are adjusted for the number of keys and recordings together (Benjamini
+    and Hochberg 1995). In a design that is folded over, the effects are free of interactions of two factors, which are
+    in the residual.
+
+    Returns:
+        One row per factor and recording: effect, its 95 % interval (low, high), adjusted p, and the effect in standard
+        deviations of the residual.
+
+    Raises:
+        ConfigError: The runs of a recording do not suffice for all factors.
+    """
+    import pandas as pd
+    import statsmodels.api as sm
+    from statsmodels.stats.multitest import multipletests
+
+    rows: list[tuple[Any, ...]] = []
+    for name, part in table.groupby("sequence", sort=False):
+        exog = np.column_stack([np.ones(len(part)), *(_signs(part[factor.key]) for factor in factors)])
+        if len(part) <= exog.shape[1] or np.linalg.matrix_rank(exog) < exog.shape[1]:
+            raise ConfigError(f"{len(part)} runs on {name} do not tell apart {len(factors)} factors")
+        model = sm.OLS(part[response].to_numpy(float), exog).fit()
+        interval, scatter = np.asarray(model.conf_int()), float(np.sqrt(model.mse_resid))
+        for n, factor in enumerate(factors, 1):
+            effect, (low, high) = 2 * float(model.params[n]), 2 * interval[n]
+            p = float(model.pvalues[n]) if scatter > 0 else 1.0
+            rows.append((factor.key, name, effect, low, high, p, effect / scatter if scatter > 0 else 0.0))
+    out = pd.DataFrame(rows, columns=["key", "recording", "effect", "low", "high", "p", "relative"])
+    out["p"] = multipletests(out["p"].to_numpy(), method="fdr_bh")[1]
+    return out
+
+
+def _signs(values: Table) -> Any:  # noqa: ANN401 - an array
+    """-1 and +1 of the two values of a factor; a list of numbers is ordered by its first element."""
+    plain = values.map(lambda value: value[0] if isinstance(value, list | tuple) else value)
+    return np.where(plain == plain.max(), 1.0, -1.0)
+
+
+def describe_screening(report: "Report", effects: Table, heading: str) -> None:
+    """Add the keys that matter, with their effects per recording, and the names of the others."""
+    from dudmap.lab.study import figures
+
+    significant = effects[effects["p"] < FALSE_SHARE]
+    order = significant.groupby("key")["relative"].agg(lambda column: column.abs().max()).sort_values(ascending=False)
+    count = effects["key"].nunique()
+    report.text(
+        f"{len(order)} of {count} keys have an effect on {heading} on at least one recording (from the low to the high "
+        f"end; at most {FALSE_SHARE:.0%} of them by chance, Benjamini and Hochberg)."
+    )
+    if order.empty:
+        return
+    wide = effects.pivot_table(index="key", columns="recording", values="effect", sort=False).loc[order.index]
+    sure = effects.assign(sure=effects["p"] < FALSE_SHARE).pivot_table(index="key", columns="recording", values="sure")
+    cells = wide.copy().astype(object)
+    for key in wide.index:
+        for recording in wide.columns:
+            star = "*" if sure.loc[key, recording] else ""
+            cells.loc[key, recording] = f"{wide.loc[key, recording]:.3g}{star}"
+    report.table(cells.reset_index())
+    report.text("A star marks the effects that are significant.")
+    shown = effects[effects["key"].isin(order.index[:MOST_SHOWN])]
+    report.figure(
+        figures.screening_figure(shown, list(order.index[:MOST_SHOWN]), heading), "Effects with 95 % intervals."
+    )
+
+
+def summary(effects: Table) -> str:
+    """Which keys matter for which response, in words; the table has the columns of ``screen`` and ``response``."""
+    if effects.empty:
+        return "No response could be screened."
+    sure = effects[effects["p"] < FALSE_SHARE]
+    lines = [f"{sure['key'].nunique()} of {effects['key'].nunique()} keys have a significant effect:"]
+    for name, part in sure.groupby("response", sort=False):
+        order = part.groupby("key")["relative"].agg(lambda column: column.abs().max()).sort_values(ascending=False)
+        lines.append(f"{name}: {', '.join(order.index)}")
+    return "\n".join(lines)
+
+
+def which_matter(effects: Mapping[str, Table]) -> Table:
+    """For every key, the largest effect on each response in standard deviations of the residual; NaN if none is sure.
+
+    Args:
+        effects: Tables of ``screen`` by the name of the response.
+    """
+    import pandas as pd
+
+    columns = {}
+    for name, table in effects.items():
+        sure = table[table["p"] < FALSE_SHARE]
+        largest = sure.loc[sure.groupby("key")["relative"].apply(lambda column: column.abs().idxmax())]
+        columns[name] = largest.set_index("key")["relative"]
+    every = list(dict.fromkeys(key for table in effects.values() for key in table["key"]))
+    return pd.DataFrame(columns).reindex(every).rename_axis("key").reset_index()

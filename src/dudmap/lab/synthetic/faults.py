@@ -1,0 +1,205 @@
+"""Faults of real RGB-D sensors, with which a synthetic recording can be rendered."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.errors import ConfigError
+
+LIMITS: dict[str, tuple[float, float]] = {
+    "color_translation": (-1.0, 1.0),
+    "color_rotation_deg": (-30.0, 30.0),
+    "color_focal_ratio": (0.3, 3.0),
+    "color_center_shift": (-500.0, 500.0),
+    "color_delay": (-1.0, 1.0),
+    "color_readout": (-0.2, 0.2),
+    "color_distortion": (-1.0, 1.0),
+    "auto_exposure": (0.0, 10.0),
+    "white_balance_drift": (0.0, 0.5),
+    "vignetting": (0.0, 0.9),
+    "jpeg_quality": (0.0, 100.0),
+    "depth_scale_error": (-0.2, 0.2),
+    "depth_offset": (-0.2, 0.2),
+    "depth_bands": (0.0, 0.02),
+    "depth_distortion": (0.0, 0.1),
+    "flying_pixels": (0.0, 1.0),
+    "multipath": (0.0, 0.95),
+    "dropped_frames": (0.0, 0.8),
+    "late_frames": (0.0, 1.0),
+}
+"""Smallest and largest accepted value of every fault."""
+BAND_ROWS, MOST_BANDS = 16, 24
+"""Rows of a colour image with a rolling shutter are rendered in up to ``MOST_BANDS`` bands of one time each, of at
+least ``BAND_ROWS`` rows; the time of a row is then wrong by at most 1/30 of the readout at 240 rows, 1/48 from 384
+rows on. Blurred images need fewer: there it is wrong by at most half the step between two moments of the exposure."""
+
+
+@dataclass(frozen=True)
+class SensorFaults:
+    """What a real sensor does and its files do not say; the default is a sensor without faults.
+
+    Depth is taken by the recording's camera at the time stamp. Colour is taken by a camera of its own, whose image has
+    the same size; the files present it as if it were registered to the depth and taken at the same time.
+
+    Attributes:
+        color_translation: Position of the colour camera in the frame of the depth camera, metres.
+        color_rotation_deg: Rotation vector (axis times angle) of the colour camera in that frame, degrees.
+        color_focal_ratio: Focal lengths of the colour camera over those of the depth camera.
+        color_center_shift: Principal point of the colour camera minus that of the depth camera (u, v), pixels.
+        color_delay: Time from the stamp to the exposure of the middle of the colour image, seconds.
+        color_readout: Time from the first to the last row of the colour image (rolling shutter), seconds; row v of H is
+            exposed at stamp + color_delay + color_readout ((v + 1/2) / H - 1/2). Negative: the last row is first.
+        color_distortion: Lens distortion left in the colour image: k1, k2, p1, p2 of the Brown-Conrady model (thesis
+            eq. 3.88) with the intrinsics of the colour camera.
+        auto_exposure: Time constant, in seconds, with which the exposure follows the mean brightness of the image,
+            from the frame before on; 0 for a fixed exposure.
+        white_balance_drift: Relative amplitude of a slow oscillation of red against blue.
+        vignetting: Share of the brightness lost in the corners of the image, in addition to the little that every
+            recording has.
+        jpeg_quality: Quality 1 to 100 of the JPEG compression of the colour; 0 for none.
+        depth_scale_error: Relative error of all depths.
+        depth_offset: Constant added to all depths, metres.
+        depth_bands: Root mean square depth error at 1 m, in metres, of vertical bands of constant disparity error, as
+            of a cold sensor; it grows with z^2.
+        depth_distortion: Root mean square relative depth error at 2 m of a smooth pattern over the image that changes
+            with the range and grows with z.
+        flying_pixels: Share of the pixels next to a depth edge that read a depth between both surfaces.
+        multipath: Reflectance of all surfaces to the light of a time-of-flight sensor; light that comes over another
+            surface makes corners recede. 0 for no indirect light.
+        dropped_frames: Share of the frames that are missing.
+        late_frames: Share of the frames taken late, by 10 to 60 % of the frame interval; their stamps say so.
+
+    Raises:
+        ConfigError: A value is outside ``LIMITS`` or has the wrong number of elements.
+    """
+
+    color_translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    color_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    color_focal_ratio: float = 1.0
+    color_center_shift: tuple[float, float] = (0.0, 0.0)
+    color_delay: float = 0.0
+    color_readout: float = 0.0
+    color_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
+    auto_exposure: float = 0.0
+    white_balance_drift: float = 0.0
+    vignetting: float = 0.0
+    jpeg_quality: float = 0.0
+    depth_scale_error: float = 0.0
+    depth_offset: float = 0.0
+    depth_bands: float = 0.0
+    depth_distortion: float = 0.0
+    flying_pixels: float = 0.0
+    multipath: float = 0.0
+    dropped_frames: float = 0.0
+    late_frames: float = 0.0
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value, usual = getattr(self, field.name), field.default
+            low, high = LIMITS[field.name]
+            size = len(usual) if isinstance(usual, tuple) else 1
+            if np.size(value) != size or not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
+                what = "a number" if size == 1 else f"{size} numbers"
+                raise ConfigError(f"fault {field.name} is {value}; expected {what} from {low:g} to {high:g}")
+
+    @property
+    def T_depth_color(self) -> NDArray[np.float64]:
+        """(4, 4) pose of the colour camera in the frame of the depth camera."""
+        T = np.eye(4)
+        T[:3, :3] = se3.exp_rotation(np.radians(self.color_rotation_deg))
+        T[:3, 3] = self.color_translation
+        return T
+
+    def color_camera(self, camera: Camera) -> Camera:
+        """Intrinsics of the colour camera beside the depth camera ``camera``."""
+        return replace(
+            camera,
+            fx=camera.fx * self.color_focal_ratio,
+            fy=camera.fy * self.color_focal_ratio,
+            cx=camera.cx + self.color_center_shift[0],
+            cy=camera.cy + self.color_center_shift[1],
+            distortion=self.color_distortion if any(self.color_distortion) else (),
+        )
+
+    @property
+    def color_is_separate(self) -> bool:
+        """Whether colour is seen from another place, at another time or through another lens than depth."""
+        return any(np.any(getattr(self, name) != getattr(SensorFaults, name)) for name in SEPARATING)
+
+    def row_times(self, height: int, margin: int = 0) -> NDArray[np.float64]:
+        """Exposure (H + 2 margin,) of the rows from -margin on relative to the stamp, seconds; H = ``height``."""
+        rows = np.arange(-margin, height + margin)
+        return self.color_delay + self.color_readout * ((rows + 0.5) / height - 0.5)
+
+    def row_bands(self, height: int, margin: int = 0, step: float = 0.0) -> list[tuple[int, int, float]]:
+        """Bands of rows rendered at one time: first row, row after the last, and time relative to the stamp, s.
+
+        Rows count from 0 at the upper edge of an image that is ``margin`` rows larger at the top and at the bottom.
+        Bands need not differ by less than ``step`` seconds, the resolution of a blurred exposure.
+        """
+        count = max(min(MOST_BANDS, height // BAND_ROWS), 1) if self.color_readout else 1
+        if step > 0:
+            count = min(count, max(int(np.ceil(abs(self.color_readout) / step)), 1))
+        times = self.row_times(height, margin)
+        edges = np.linspace(0, len(times), count + 1).astype(int)
+        return [(int(a), int(b), float(times[a:b].mean())) for a, b in pairwise(edges)]
+
+    def frame_times(self, frames: int, fps: float, seed: int) -> NDArray[np.float64]:
+        """Stamps (N,) in seconds of the frames that arrive out of ``frames``; the first always does, at 0."""
+        times = np.arange(frames) / fps
+        if not self.dropped_frames and not self.late_frames:
+            return np.round(times, 6)
+        rng = np.random.default_rng([seed, 5])
+        late = rng.random(frames) < self.late_frames
+        times += late * rng.uniform(0.1, 0.6, frames) / fps
+        arrives = rng.random(frames) >= self.dropped_frames
+        times[0], arrives[0] = 0.0, True
+        return np.round(times[arrives], 6)
+
+    def truth(self, camera: Camera) -> dict[str, Any]:
+        """What is written beside a recording: the faults, and the colour camera that they amount to."""
+        return {
+            "faults": asdict(self),
+            "depth_camera": asdict(camera),
+            "color_camera": asdict(self.color_camera(camera)),
+            "T_depth_color": self.T_depth_color.tolist(),
+        }
+
+
+SEPARATING = (
+    "color_translation",
+    "color_rotation_deg",
+    "color_focal_ratio",
+    "color_center_shift",
+    "color_delay",
+    "color_readout",
+    "color_distortion",
+)
+"""Faults that change from where, when or through which lens the colour camera sees the scene."""
+
+
+def parse_faults(assignments: Sequence[str], base: SensorFaults | None = None) -> SensorFaults:
+    """Faults of ``NAME=VALUE`` pairs, on top of ``base``; a value of several numbers is comma-separated.
+
+    Raises:
+        ConfigError: A pair cannot be understood, or a value is out of range.
+    """
+    base = base or SensorFaults()
+    values: dict[str, Any] = {}
+    for assignment in assignments:
+        name, _, text = assignment.partition("=")
+        name = name.strip()
+        if name not in LIMITS:
+            raise ConfigError(f"unknown fault {name!r}; known faults: {', '.join(LIMITS)}")
+        several = isinstance(getattr(base, name), tuple) or "," in text
+        try:
+            values[name] = tuple(float(part) for part in text.split(",")) if several else float(text)
+        except ValueError:
+            raise ConfigError(f"cannot understand the fault {assignment!r}; expected NAME=NUMBER[,NUMBER...]") from None
+    return replace(base, **values)

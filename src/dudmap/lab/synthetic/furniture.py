@@ -1,0 +1,97 @@
+"""Walls, furniture and pictures of the built-in scenes."""
+
+import numpy as np
+
+from dudmap.lab.synthetic.scene import Material, Primitive, box, capsule, cylinder, ellipsoid, pose
+
+WOOD = Material("wood", (0.9, 0.9))
+DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
+METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
+CARDBOARD = Material("cardboard", (1.6, 1.6))
+
+
+def shell(
+    x: tuple[float, float], y: tuple[float, float], top: float, walls: Material, floor: Material
+) -> list[Primitive]:
+    """Floor, ceiling and four walls, 0.2 m thick, around a box-shaped free space."""
+    (x0, x1), (y0, y1), d = x, y, 0.2
+    cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0 + 2 * d, y1 - y0 + 2 * d
+    ceiling = Material("plaster", (0.4, 0.4), tint=(1.05, 1.05, 1.05))
+    return [
+        box((cx, cy, -d / 2), (w, h, d), floor),
+        box((cx, cy, top + d / 2), (w, h, d), ceiling),
+        box((x0 - d / 2, cy, top / 2), (d, h, top), walls),
+        box((x1 + d / 2, cy, top / 2), (d, h, top), walls),
+        box((cx, y0 - d / 2, top / 2), (w, d, top), walls),
+        box((cx, y1 + d / 2, top / 2), (w, d, top), walls),
+    ]
+
+
+def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
+    """Table of the given width, depth and height on four legs."""
+    (x, y), (w, d, h) = center, size
+    legs = [
+        box((x + sx * (w / 2 - 0.05), y + sy * (d / 2 - 0.05), (h - 0.04) / 2), (0.06, 0.06, h - 0.04), material)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    return [box((x, y, h - 0.02), (w, d, 0.04), material), *legs]
+
+
+def chair(center: tuple[float, float], yaw: float, material: Material) -> list[Primitive]:
+    """Chair with a cushion, its back towards +y before the rotation by ``yaw`` degrees."""
+    parts = [
+        box((0, 0, 0.45), (0.44, 0.44, 0.05), Material("plaid", (2.3, 2.3))),
+        box((0, 0.2, 0.75), (0.42, 0.04, 0.3), material),
+    ]
+    parts += [
+        cylinder((sx * 0.19, sy * 0.19, 0), (sx * 0.19, sy * 0.19, 0.43), 0.02, METAL)
+        for sx in (-1, 1)
+        for sy in (-1, 1)
+    ]
+    parts += [cylinder((sx * 0.17, 0.2, 0.45), (sx * 0.17, 0.2, 0.75), 0.015, METAL) for sx in (-1, 1)]
+    return [p.moved(pose((*center, 0), yaw)) for p in parts]
+
+
+def poster(
+    x: float, y: float, z: float, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
+) -> Primitive:
+    """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
+    w, h = size
+    material = Material(
+        "poster",
+        (0.5 / w, 0.5 / h),
+        ((quarter % 2) * 0.5 + 0.25, (quarter // 2) * 0.5 + 0.25),
+        variation=0.05,
+        faces=False,
+    )
+    extent = (depth, w, h) if side else (w, depth, h)
+    return box((x, y, z), extent, material)
+
+
+def shelf(x: float, y: float, width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
+    """Bookshelf standing at (x, y), open towards -y before the rotation by ``yaw`` degrees."""
+    height, depth = 0.42 * rows, 0.3
+    parts = [
+        box((-width / 2 + 0.01, 0, height / 2), (0.02, depth, height), WOOD),
+        box((width / 2 - 0.01, 0, height / 2), (0.02, depth, height), WOOD),
+        box((0, depth / 2 - 0.005, height / 2), (width, 0.01, height), DARK_WOOD),
+    ]
+    for row in range(rows + 1):
+        parts.append(box((0, 0, min(0.01 + 0.42 * row, height - 0.01)), (width, depth, 0.02), WOOD))
+    for row in range(rows):
+        books = Material("books", (1.0, 0.25 / 0.36), (0.13 * row, 0.25 * row), variation=0.05)
+        length = width * (0.62 if row % 2 else 0.86)
+        parts.append(box((-width / 2 + 0.03 + length / 2, 0.02, 0.02 + 0.42 * row + 0.16), (length, 0.2, 0.32), books))
+    return [p.moved(pose((x, y, 0), yaw)) for p in parts]
+
+
+def plant(x: float, y: float, spread: float = 0.35) -> list[Primitive]:
+    """Pot with seven stalks and leaves."""
+    leaf = Material("grass", (2, 2))
+    parts = [cylinder((x, y, 0), (x, y, 0.35), 0.17, Material("brick", (1.5, 1.5)))]
+    for a in np.arange(7) * 0.9:
+        tip = (x + spread * np.cos(a), y + 0.7 * spread * np.sin(a), 0.75 + 0.25 * np.sin(2.3 * a))
+        parts.append(capsule((x, y, 0.35), tip, 0.018, leaf))
+        parts.append(ellipsoid(tip, (0.13, 0.09, 0.06), leaf, 57.3 * a))
+    return parts

@@ -1,0 +1,342 @@
+"""Moving objects: walking people, carried boxes, balls, balloons, carts and doors."""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.errors import ConfigError
+from dudmap.lab.synthetic.motion import FloorPath, crossing, smooth_step
+from dudmap.lab.synthetic.person import Figure
+from dudmap.lab.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
+
+Matrix = NDArray[np.float64]
+Line = tuple[tuple[float, float], tuple[float, float]]
+MOVING_SPEED = 0.01
+"""Speed below which an object is at rest, m/s."""
+
+
+@dataclass(frozen=True, eq=False)
+class SyntheticMover:
+    """A moving object; all limbs of a person are one mover.
+
+    Attributes:
+        name: Kind of object.
+        primitives: Its solids, each in the frame of its part.
+        parts: Function of time that returns T_world_part (P, 4, 4) of every solid.
+        reference: Function of time that returns T_world_mover (4, 4), whose origin defines the velocity of the mover.
+        present: Function of time that returns whether the mover exists.
+        settles: Whether it counts as static while it is at rest; people never do.
+    """
+
+    name: str
+    primitives: list[Primitive]
+    parts: Callable[[float], Matrix]
+    reference: Callable[[float], Matrix]
+    present: Callable[[float], bool] = lambda _: True
+    settles: bool = True
+
+    def velocity(self, t: float) -> Matrix:
+        """Velocity (3,) of the origin of the reference frame, m/s, world frame."""
+        h = 0.005
+        return (self.reference(t + h)[:3, 3] - self.reference(t - h)[:3, 3]) / (2 * h)
+
+    def top_speed(self, t: float, span: float) -> float:
+        """Largest mean speed of any bounding-box corner of the solids over ``span`` seconds around ``t``, m/s."""
+        corners = np.stack(np.meshgrid(*[[-1.0, 1.0]] * 3), axis=-1).reshape(1, 8, 3)
+        bounds = np.array([p.bounds() for p in self.primitives])[:, None, :] * corners
+        local = np.array([p.T_body_primitive for p in self.primitives])
+        where = []
+        for moment in (t - span / 2, t + span / 2):
+            Ts = self.parts(moment) @ local
+            where.append(bounds @ np.swapaxes(Ts[:, :3, :3], 1, 2) + Ts[:, None, :3, 3])
+        return float(np.linalg.norm(where[1] - where[0], axis=2).max() / span)
+
+
+@dataclass(frozen=True)
+class Staging:
+    """Conditions under which movers are built.
+
+    Attributes:
+        scene: Scene in which they move.
+        rng: Random number generator.
+        speed: Requested speed, m/s; None for the natural speed of each mover.
+        duration: Duration of the recording, seconds.
+        start_dynamic: Whether they are in view and moving in the first frame.
+    """
+
+    scene: Scene
+    rng: np.random.Generator
+    speed: float | None
+    duration: float
+    start_dynamic: bool
+
+    def pace(self, natural: float) -> float:
+        """Requested speed, else ``natural`` (m/s at life size) scaled to the scene."""
+        return self.speed if self.speed is not None else natural * self.scene.mover_scale
+
+
+def person_on(
+    path: FloorPath,
+    figure: Figure,
+    ground: float,
+    name: str = "person",
+    carrying: Callable[[float], float] = lambda _: 0.0,
+) -> SyntheticMover:
+    """Person walking along a path; ``carrying`` is a function of time for the lift of the arms in [0, 1]."""
+
+    def reference(t: float) -> Matrix:
+        position, yaw, _ = path.at(t)
+        return pose((*position, ground), float(np.degrees(yaw)))
+
+    def parts(t: float) -> Matrix:
+        return figure.poses(reference(t), path.at(t)[2], carrying(t))
+
+    return SyntheticMover(name, figure.primitives, parts, reference, path.present, settles=False)
+
+
+def rigid(
+    name: str,
+    primitives: list[Primitive],
+    reference: Callable[[float], Matrix],
+    present: Callable[[float], bool] = lambda _: True,
+) -> SyntheticMover:
+    """Rigid mover."""
+    return SyntheticMover(
+        name, primitives, lambda t: np.tile(reference(t), (len(primitives), 1, 1)), reference, present
+    )
+
+
+def shifted(line: Line, shift: float, reverse: bool = False) -> Line:
+    """Line shifted by ``shift`` metres to its left, and reversed with ``reverse``."""
+    a, b = np.asarray(line[0]), np.asarray(line[1])
+    normal = np.array([-(b - a)[1], (b - a)[0]]) / np.linalg.norm(b - a)
+    (ax, ay), (bx, by) = (end + shift * normal for end in (a, b))
+    start, end = (float(ax), float(ay)), (float(bx), float(by))
+    return (end, start) if reverse else (start, end)
+
+
+def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
+    size = staging.scene.mover_scale
+    return Figure(staging.rng, outfit, size, 1.35 * float(np.clip(np.sqrt(speed / size / 1.2), 0.35, 1.2)))
+
+
+def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
+    scene, speed = staging.scene, staging.pace(1.2)
+    path = crossing(
+        shifted(scene.walk_line, shift * scene.mover_scale, reverse),
+        speed,
+        staging.duration,
+        enter=1.0 + delay,
+        start_inside=staging.start_dynamic,
+        entry_speed=1.2 * scene.mover_scale,
+    )
+    return person_on(path, _figure(staging, outfit, speed), scene.ground)
+
+
+def _people(staging: Staging) -> list[SyntheticMover]:
+    return [_walker(staging, 1, 0.0, False, 0.0), _walker(staging, 2, 0.3, True, 0.6)]
+
+
+def _wanderer(staging: Staging) -> list[SyntheticMover]:
+    """Person who walks in circles and never leaves the view."""
+    scene, speed = staging.scene, staging.pace(0.6)
+    a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
+    along, middle = (b - a) / 2, (a + b) / 2
+    across = np.array([-along[1], along[0]]) / np.linalg.norm(along)
+    angles = np.arange(0.0, 2 * np.pi * 400, 0.1) + 2.2
+    loop = (
+        middle
+        + 0.5 * np.sin(angles)[:, None] * along
+        + 0.22 * scene.mover_scale * np.cos(angles)[:, None] * across
+    )  # fmt: skip
+    walked = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(loop, axis=0), axis=1))])
+    times = walked / speed
+    keep = times <= staging.duration + 2.0
+    path = FloorPath(list(times[keep] - 1.5), loop[keep].tolist(), smooth=0.1)
+    return [person_on(path, _figure(staging, 3, speed), scene.ground)]
+
+
+CARTON = (0.36, 0.30, 0.28)
+
+
+def _carton(size: float) -> list[Primitive]:
+    x, y, z = (extent * size for extent in CARTON)
+    return [box((0, 0, z / 2), (x, y, z), Material("cardboard", (1.9 / size, 1.9 / size)))]
+
+
+def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
+    """Person who brings a box, puts it down and leaves; or who enters, takes a box and leaves with it."""
+    scene, speed, size = staging.scene, staging.pace(1.0), staging.scene.mover_scale
+    a, b = np.asarray(scene.walk_line[0]), np.asarray(scene.walk_line[1])
+    spot = scene.rest[:2, 3]
+    foot = a + (b - a) * float((spot - a) @ (b - a) / ((b - a) @ (b - a)))
+    towards = (spot - foot) / np.linalg.norm(spot - foot)
+    stand = spot - 0.52 * size * towards
+    way = [a, foot, stand, stand, foot, b]
+    if staging.start_dynamic:
+        way[0] = a + 0.35 * (b - a)
+    steps = [float(np.linalg.norm(q - p)) / speed for p, q in pairwise(way)]
+    steps[2] = 1.6
+    times = np.cumsum([0.0, *steps])
+    path = FloorPath(list(times), [list(p) for p in way], smooth=0.15, gaps=[(float(times[-1]), np.inf)])
+    begin, end = float(times[2]) + 0.3, float(times[2]) + 1.3  # the box is moved between hands and floor
+    yaw = float(np.degrees(np.arctan2(towards[1], towards[0])))
+
+    def share(t: float) -> float:  # 0 in the hands, 1 on the floor
+        done = smooth_step((t - begin) / (end - begin))
+        return done if put_down else 1.0 - done
+
+    person = person_on(path, _figure(staging, 4, speed), scene.ground, carrying=lambda t: 1.0 - share(t))
+
+    def reference(t: float) -> Matrix:
+        if share(t) >= 1.0:
+            return scene.rest
+        held = person.reference(t) @ pose((0.40 * size, 0, 0.92 * size))
+        if share(t) <= 0.0:
+            return held
+        start = pose((*stand, scene.ground), yaw) @ pose((0.40 * size, 0, 0.92 * size))
+        return se3.interpolate(start, scene.rest, share(t))
+
+    def present(t: float) -> bool:
+        return put_down or t < times[-1]
+
+    return [person, rigid("carried_box" if put_down else "removed_box", _carton(size), reference, present)]
+
+
+def _ball(staging: Staging) -> list[SyntheticMover]:
+    scene, size = staging.scene, staging.scene.mover_scale
+    radius, speed = 0.2 * size, staging.pace(0.8)
+    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=speed)
+
+    def reference(t: float) -> Matrix:
+        position, yaw, walked = path.at(t)
+        rolled = pose((*position, scene.ground + radius), float(np.degrees(yaw)))
+        return rolled @ pose(pitch=float(np.degrees(walked / radius)))
+
+    skin = Material("checks", (1.5 / size, 1.5 / size), tint=(1.2, 0.7, 0.5))
+    return [rigid("ball", [ellipsoid((0, 0, 0), (radius,) * 3, skin)], reference, path.present)]
+
+
+def _balloon(staging: Staging) -> list[SyntheticMover]:
+    scene, size = staging.scene, staging.scene.mover_scale
+    speed = staging.pace(0.4)
+    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=1.0)
+
+    def reference(t: float) -> Matrix:
+        position, _, _ = path.at(t)
+        height = scene.ground + size * (1.35 + 0.15 * np.sin(1.7 * t))
+        return pose((*position, height), 25 * np.sin(0.9 * t), 6 * np.sin(2.3 * t))
+
+    skin = Material("stripes", (1.2 / size, 1.2 / size), tint=(1.2, 0.6, 0.7))
+    solids = [
+        ellipsoid((0, 0, 0), (0.2 * size, 0.2 * size, 0.25 * size), skin),
+        capsule((0, 0, -0.25 * size), (0, 0, -0.7 * size), 0.004 * size, Material("plain")),
+    ]
+    return [rigid("balloon", solids, reference, path.present)]
+
+
+def _cart_solids(size: float) -> list[Primitive]:
+    rubber = Material("denim", (3, 3), tint=(0.25, 0.25, 0.25))
+    body = box((0, 0, 0.38 * size), (0.5 * size, 0.4 * size, 0.6 * size), Material("books", (1.6 / size, 1.6 / size)))
+    wheels = [
+        cylinder((x * size, y * size - 0.02 * size, 0.06 * size), (x * size, y * size + 0.02 * size, 0.06 * size),
+                 0.06 * size, rubber)
+        for x in (-0.18, 0.18) for y in (-0.15, 0.15)
+    ]  # fmt: skip
+    return [body, *wheels]
+
+
+def _cart(path: FloorPath, scene: Scene, name: str) -> SyntheticMover:
+    def reference(t: float) -> Matrix:
+        position, yaw, _ = path.at(t)
+        return pose((*position, scene.ground), float(np.degrees(yaw)))
+
+    return rigid(name, _cart_solids(scene.mover_scale), reference, path.present)
+
+
+def _creeper(staging: Staging) -> list[SyntheticMover]:
+    """Cart that enters quickly and then crosses the view at 5 cm/s."""
+    speed = staging.pace(0.05)
+    quick = max(speed, 1.0 * staging.scene.mover_scale)
+    path = crossing(
+        staging.scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=quick
+    )
+    return [_cart(path, staging.scene, "creeper")]
+
+
+def _stopping(staging: Staging) -> list[SyntheticMover]:
+    """Cart that enters and stops in view permanently."""
+    scene, speed = staging.scene, staging.pace(0.8)
+    a, spot = np.asarray(scene.walk_line[0]), scene.rest[:2, 3]
+    if staging.start_dynamic:
+        a = spot + 0.5 * (a - spot)
+    begin = 0.0 if staging.start_dynamic else 0.5
+    end = begin + float(np.linalg.norm(spot - a)) / speed
+    return [_cart(FloorPath([begin, end], [list(a), list(spot)], smooth=0.2), scene, "stopping_cart")]
+
+
+def _starting(staging: Staging) -> list[SyntheticMover]:
+    """Cart that stands in view and leaves in the second half."""
+    scene, speed = staging.scene, staging.pace(0.8)
+    b, spot = np.asarray(scene.walk_line[1]), scene.rest[:2, 3]
+    begin = 0.4 if staging.start_dynamic else 0.5 * staging.duration
+    end = begin + float(np.linalg.norm(b - spot)) / speed
+    path = FloorPath([begin, end], [list(spot), list(b)], smooth=0.2, gaps=[(end, np.inf)])
+    return [_cart(path, scene, "starting_cart")]
+
+
+def _door(staging: Staging) -> list[SyntheticMover]:
+    """Door leaf that opens, rests and closes again."""
+    scene, size = staging.scene, staging.scene.mover_scale
+    width, height, angle = 0.8 * size, 1.95 * size, np.radians(95.0)
+    swing = angle * width / staging.pace(0.5)
+    begin = -0.3 * swing if staging.start_dynamic else 1.0
+    leaf = Material("wood", (0.9 / size, 0.7 / size), tint=(0.75, 0.85, 0.95))
+    handle = Material("plain", tint=(0.9, 0.8, 0.4))
+    solids = [
+        box((width / 2, 0, height / 2), (width, 0.04 * size, height), leaf),
+        cylinder((0, 0, 0), (0, 0, height), 0.035 * size, handle),
+        capsule(
+            (width * 0.9, -0.05 * size, 1.0 * size), (width * 0.75, -0.05 * size, 1.0 * size), 0.012 * size, handle
+        ),
+    ]
+
+    def reference(t: float) -> Matrix:
+        phase = (t - begin) % (2 * swing + 2.0) if t > begin else 0.0
+        opened = smooth_step(phase / swing) - smooth_step((phase - swing - 1.0) / swing)
+        return scene.hinge @ pose(yaw=-float(np.degrees(angle)) * opened)
+
+    return [rigid("door", solids, reference)]
+
+
+MOVERS: dict[str, Callable[[Staging], list[SyntheticMover]]] = {
+    "person": lambda staging: [_walker(staging, 0, 0.0, False, 0.0)],
+    "people": _people,
+    "wanderer": _wanderer,
+    "carried_box": lambda staging: _carrier(staging, put_down=True),
+    "removed_box": lambda staging: _carrier(staging, put_down=False),
+    "ball": _ball,
+    "balloon": _balloon,
+    "creeper": _creeper,
+    "stopping_cart": _stopping,
+    "starting_cart": _starting,
+    "door": _door,
+}
+
+
+def build_movers(names: tuple[str, ...], staging: Staging) -> list[SyntheticMover]:
+    """Movers by name.
+
+    Raises:
+        ConfigError: A name is unknown.
+    """
+    movers: list[SyntheticMover] = []
+    for name in names:
+        if name not in MOVERS:
+            raise ConfigError(f"unknown mover {name!r}; known movers: {', '.join(MOVERS)}")
+        movers += MOVERS[name](staging)
+    return movers

@@ -1,0 +1,187 @@
+"""Noise models of depth and colour sensors: triangulation (pattern or stereo) and time of flight."""
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.errors import ConfigError
+from dudmap.lab.synthetic.kernels import depth_noise as kernels
+from dudmap.lab.synthetic.render import Rendering, over_rows
+
+NOISE_SIZE = 1024
+
+
+@dataclass(frozen=True)
+class SensorModel:
+    """Sensor with noise in the disparity ``d = fx b / z``, so that sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
+
+    Attributes:
+        baseline: Distance from the camera to the projector or second camera on its right, metres.
+        depth_noise: Standard deviation of the depth at 1 m including the quantisation by ``step``, metres.
+        step: Quantisation step of the disparity, pixels.
+        lateral: Standard deviation of the lateral noise, pixels.
+        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
+        fatten: Width by which near surfaces are dilated (foreground fattening of window matching), pixels.
+        grazing: Cosine of the angle of incidence below which readings are lost.
+        edge_loss: Share of readings lost on the far side of a depth edge.
+        speckle: Share of readings lost at random.
+        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
+        color_noise: Standard deviation of the colour noise, grey values.
+    """
+
+    baseline: float
+    depth_noise: float
+    step: float
+    lateral: float
+    nearest: float
+    fade: float
+    farthest: float
+    fatten: int
+    grazing: float
+    edge_loss: float
+    speckle: float
+    correlation: float
+    color_noise: float
+
+    def row(self, focal: float) -> NDArray[np.float64]:
+        """Parameters in the order of the kernel, for a focal length in pixels.
+
+        The variance step^2 / 12 of the quantisation is part of ``depth_noise``.
+        """
+        total = self.depth_noise * focal * self.baseline
+        sigma = np.sqrt(max(total**2 - self.step**2 / 12, (0.3 * total) ** 2))
+        numbers = (self.baseline, sigma, self.step, self.lateral, self.nearest, self.fade, self.farthest)
+        return np.array([*numbers, self.fatten, self.grazing, self.edge_loss, self.speckle])
+
+
+@dataclass(frozen=True)
+class TimeOfFlightModel:
+    """Sensor that measures the range itself, so that its noise does not follow z^2.
+
+    The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 plus slant z^1.5 (theta / (pi/2 -
+    theta))^2 in metres, theta = angle of incidence (the form of Fankhauser et al. 2015).
+
+    Attributes:
+        noise: Coefficients of 1, z and z^2, metres.
+        slant: Coefficient of the term that grows with the angle of incidence, metres.
+        lateral: Standard deviation of the lateral noise, pixels.
+        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
+        grazing: Cosine of the angle of incidence below which readings are lost.
+        edge_loss: Share of readings lost on both sides of a depth edge.
+        speckle: Share of readings lost at random.
+        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
+        color_noise: Standard deviation of the colour noise, grey values.
+        native_width: Width in pixels at which the sensor measures; a wider image is interpolated from it. 0: any.
+    """
+
+    noise: tuple[float, float, float]
+    slant: float
+    lateral: float
+    nearest: float
+    fade: float
+    farthest: float
+    grazing: float
+    edge_loss: float
+    speckle: float
+    correlation: float
+    color_noise: float
+    native_width: int = 0
+
+    def row(self) -> NDArray[np.float64]:
+        """Parameters in the order of the kernel."""
+        numbers = (*self.noise, self.slant, self.lateral, self.nearest, self.fade, self.farthest)
+        return np.array([*numbers, self.grazing, self.edge_loss, self.speckle])
+
+
+SENSORS: dict[str, SensorModel | TimeOfFlightModel | None] = {
+    "kinect": SensorModel(0.075, 1.425e-3, 1 / 8, 0.35, 0.5, 4.5, 7.0, 0, 0.20, 0.35, 0.002, 1.2, 2.0),
+    "realsense": SensorModel(0.050, 1.9e-3, 1 / 32, 0.6, 0.3, 5.0, 9.0, 2, 0.12, 0.15, 0.004, 2.5, 2.5),
+    "none": None,
+    # Grunnet-Jepsen et al. 2018, Best-known methods for tuning RealSense D400: sigma_z = z^2 subpixel / (f b) with a
+    # subpixel error of 0.08 (cited), f = 848 px / (2 tan 45 deg) = 424 px (view of 90 degrees at 848 px, and disparity
+    # steps of 1/32 px: Grunnet-Jepsen et al. 2019, Subpixel linearity improvement, read), b = 50 mm: 3.8 mm at 1 m.
+    # Range from the D400 datasheet, cited.
+    # Correlation, fattening and losses as of "realsense".
+    "d435": SensorModel(0.050, 3.8e-3, 1 / 32, 0.6, 0.3, 4.0, 9.0, 2, 0.12, 0.15, 0.004, 2.5, 2.5),
+    # Fankhauser et al. 2015, Kinect v2 for mobile robot navigation: axial noise 1.5 - 0.5 z + 0.3 z^2 mm plus the slant
+    # term with 0.1 mm. Range from the manufacturer; lateral noise, losses and correlation assumed.
+    "kinect_v2": TimeOfFlightModel((1.5e-3, -0.5e-3, 0.3e-3), 0.1e-3, 0.4, 0.5, 4.5, 6.0, 0.1, 0.3, 0.003, 0.8, 2.0),
+    # Intel, LiDAR Camera L515 datasheet (2021): standard deviation 2.5 mm at 1 m and 15.5 mm at 9 m, taken as linear;
+    # range 0.25 to 9 m. The rest assumed.
+    "l515": TimeOfFlightModel((0.9e-3, 1.6e-3, 0.0), 0.1e-3, 0.4, 0.25, 6.0, 9.0, 0.15, 0.4, 0.005, 0.8, 2.0),
+    # Baruch et al. 2021, ARKitScenes: depth of 256 x 192 pixels; Luetzenburg et al. 2021: about 1 cm, range 5 m. How
+    # the 1 cm divides into noise (0.3 %, smooth over several pixels by the upsampling) and bias is assumed.
+    "iphone": TimeOfFlightModel((2e-3, 3e-3, 0.0), 0.1e-3, 0.8, 0.2, 4.0, 5.0, 0.05, 0.0, 0.0, 3.0, 1.5, 256),
+}
+
+
+class Sensor:
+    """Simulated sensor that adds noise to ideal images; equal seeds and frame numbers give equal errors.
+
+    Args:
+        name: One of ``SENSORS``.
+        seed: Seed of the noise.
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+
+    def __init__(self, name: str, seed: int) -> None:
+        if name not in SENSORS:
+            raise ConfigError(f"unknown noise model {name!r}; known models: {', '.join(SENSORS)}")
+        self.model = SENSORS[name]
+        self._seed = seed
+
+    def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+        """Depth (H, W) float32 in metres, 0 = no reading, and colour (H, W, 3) uint8 of frame ``index``."""
+        exact, color, cosine = rendering.depth, rendering.color, rendering.cosine
+        assert color is not None
+        assert cosine is not None
+        if self.model is None:
+            return exact, np.clip(np.rint(color), 0, 255).astype(np.uint8)
+        rng = np.random.default_rng([self._seed, 3, index])
+        offsets = rng.integers(0, NOISE_SIZE, (4, 2))
+        key = np.uint64(rng.integers(0, 2**63))
+        smooth, table = _noise(self.model.correlation)
+        out = np.empty(color.shape, dtype=np.uint8)
+        over_rows(len(color), kernels.measure_color, color, table, key, np.float32(self.model.color_noise), out)
+        if isinstance(self.model, TimeOfFlightModel):
+            return _measured_range(self.model, exact, cosine, (smooth, offsets, key)), out
+        depth = np.empty_like(exact)
+        model = self.model.row(focal)
+        over_rows(len(exact), kernels.measure_depth, exact, cosine, smooth, offsets, key, focal, model, depth)
+        return depth, out
+
+
+def _measured_range(
+    model: TimeOfFlightModel,
+    exact: NDArray[np.float32],
+    cosine: NDArray[np.float32],
+    noise: tuple[NDArray[np.float32], NDArray[np.int64], np.uint64],
+) -> NDArray[np.float32]:
+    """Depth (H, W) of a time-of-flight sensor, measured at its native resolution and interpolated where valid."""
+    height, width = exact.shape
+    if not 0 < model.native_width < width:
+        depth = np.empty_like(exact)
+        over_rows(height, kernels.measure_range, exact, cosine, *noise, model.row(), depth)
+        return depth
+    size = (model.native_width, round(height * model.native_width / width))
+    small, facing = (cv2.resize(image, size, interpolation=cv2.INTER_NEAREST_EXACT) for image in (exact, cosine))
+    depth = np.empty_like(small)
+    over_rows(size[1], kernels.measure_range, small, facing, *noise, model.row(), depth)
+    valid = cv2.resize((depth > 0).astype(np.float32), (width, height), interpolation=cv2.INTER_LINEAR)
+    total = cv2.resize(depth, (width, height), interpolation=cv2.INTER_LINEAR)
+    return np.where(valid > 0.5, total / np.maximum(valid, 0.5), 0).astype(np.float32)
+
+
+@lru_cache(maxsize=2)
+def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Periodic correlated noise (S, S) of unit variance, and 65536 samples of the unit Gaussian."""
+    rng = np.random.default_rng(7)
+    frequency = np.fft.fftfreq(NOISE_SIZE)
+    gain = np.exp(-2 * (np.pi * correlation) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
+    field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE))) * gain).real
+    return (field / field.std()).astype(np.float32), rng.standard_normal(65536).astype(np.float32)

@@ -1,0 +1,140 @@
+"""Set-up of a synthetic recording from names of scenes, movers, paths and sensors."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import ConfigError
+from dudmap.lab.synthetic.cameras import find_camera
+from dudmap.lab.synthetic.crowd import crowd_of
+from dudmap.lab.synthetic.faults import SensorFaults
+from dudmap.lab.synthetic.movers import Staging, build_movers
+from dudmap.lab.synthetic.paths import FOLLOW, PATHS, camera_poses
+from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.rooms import build_scene
+from dudmap.lab.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
+
+
+def sequence(
+    scene: str = "room",
+    movers: Sequence[str] | None = None,
+    camera_path: str | Path | None = None,
+    frames: int = 120,
+    fps: float = 30.0,
+    noise: str | None = None,
+    speed: float | None = None,
+    coverage: float | None = None,
+    start_dynamic: bool = False,
+    situation: str | None = None,
+    seed: int = 0,
+    camera: Camera | None = None,
+    motion_blur: float | None = None,
+    exposure_change: float = 0.0,
+    sensor: str | None = None,
+    faults: SensorFaults | None = None,
+) -> SyntheticSequence:
+    """Set up a synthetic recording; its frames are rendered on access.
+
+    Args:
+        scene: Name of a scene (``names()["scenes"]``).
+        movers: Names of the movers, () for none; None for one person, or those of the situation.
+        camera_path: Name of a built-in path, or a trajectory file in TUM format; None for hand-held, or that of the
+            situation.
+        frames: Number of frames.
+        fps: Frames per second.
+        noise: Noise model (``names()["noise"]``, ``none`` for exact depth); None for ``kinect``, or that of the sensor.
+        speed: Speed of the movers in m/s; None for the natural speed of each.
+        coverage: Share of the image, 0 to 0.95, that a stream of people covers on average; it replaces the movers,
+            and 0 means no movers.
+        start_dynamic: Whether the movers are in view from the first frame on.
+        situation: Name of a difficult situation (``names()["situations"]``).
+        seed: Seed of path, appearance and noise; equal seeds give equal frames.
+        camera: Intrinsics; None for 640x480 with 525 px focal length, or with the view of the sensor.
+        motion_blur: Exposure time as a share of the frame interval; None for 0, or that of the sensor.
+        exposure_change: Relative amplitude of a slow oscillation of the exposure.
+        sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
+        faults: What the sensor does and its files do not say; None for no faults, or those of the sensor.
+
+    Raises:
+        ConfigError: An argument is invalid; the message names the known values.
+    """
+    _check("frames", frames, 1, 1_000_000)
+    _check("fps", fps, 0.5, 1000)
+    model = find_camera(sensor) if sensor is not None else None
+    noise = noise or (model.noise if model else "kinect")
+    motion_blur = motion_blur if motion_blur is not None else model.motion_blur if model else 0.0
+    faults = faults or (model.faults if model else SensorFaults())
+    camera = camera or (model.camera(640, 480) if model else DEFAULT_CAMERA)
+    _check("motion_blur", motion_blur, 0, 1)
+    _check("exposure_change", exposure_change, 0, 0.9)
+    if speed is not None:
+        _check("speed", speed, 0.001, 20)
+    world = build_scene(scene)
+    special = find_situation(situation) if situation is not None else Situation(("person",))
+    names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
+    path = special.camera_path if camera_path is None else camera_path
+    at_once = start_dynamic or special.start_dynamic
+    times = faults.frame_times(frames, fps, seed)
+    staging = Staging(world, np.random.default_rng([seed, 4]), speed, float(times[-1]), at_once)
+    if coverage is not None and coverage > 0:
+        if movers is not None and set(names) - {"person", "people"}:
+            raise ConfigError(f"coverage stands for people, but the movers are {', '.join(names)}; drop one of the two")
+        names = ("crowd",)
+        alone = (
+            PATHS["still"](world, staging.rng, times) if path == FOLLOW else camera_poses(path, world, times, seed, [])
+        )
+        actors = crowd_of(coverage, staging, times, alone).movers()
+    else:
+        names = names if coverage is None else ()
+        actors = build_movers(names, staging)
+    poses = camera_poses(path, world, times, seed, actors)
+    poses = carried_elsewhere(poses, world, times, special.elsewhere)
+    poses[:, :3, :3] = [se3.nearest_rotation(R) for R in poses[:, :3, :3]]
+    ground_truth = Trajectory(times, poses)
+    if special.covered:
+
+        def camera_at(t: float) -> NDArray[np.float64]:
+            return ground_truth.interpolate(min(max(t, float(times[0])), float(times[-1])))
+
+        actors.append(cover(times, camera_at, special.covered))
+    parameters: dict[str, object] = {
+        "scene": scene,
+        "movers": list(names),
+        "camera_path": str(path),
+        "frames": frames,
+        "fps": fps,
+        "sensor_name": sensor,
+        "noise": noise,
+        "speed": speed,
+        "coverage": coverage,
+        "start_dynamic": at_once,
+        "situation": situation,
+        "covered_s": [[share * float(times[-1]) for share in span] for span in special.covered],
+        "elsewhere_s": [[share * float(times[-1]) for share in span] for span in special.elsewhere],
+        "seed": seed,
+        "motion_blur": motion_blur,
+        "exposure_change": exposure_change,
+    }
+    return SyntheticSequence(
+        world,
+        actors,
+        ground_truth,
+        camera,
+        noise=noise,
+        seed=seed,
+        fps=fps,
+        motion_blur=motion_blur,
+        exposure_change=exposure_change,
+        faults=faults,
+        parameters=parameters,
+    )
+
+
+def _check(name: str, value: float, low: float, high: float) -> None:
+    if not low <= value <= high:
+        raise ConfigError(f"{name} is {value}; expected a number from {low} to {high}")
