@@ -164,19 +164,24 @@ class Tracker:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
             lit, system = exposed(level, exposure), None
-            if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
+            if self.config.exposure and index == 0 and first_level == 0:
                 system = self.linearize(volume, lit, T, weights, color_weight)
+                change = fit_exposure(lit.intensity, system.residuals[1], weights)
                 iterations += 1
-                if self.config.exposure and index == 0 and first_level == 0:
-                    change = fit_exposure(lit.intensity, system.residuals[1], weights)
-                    if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
-                        exposure = chained(exposure, change)
-                        lit = exposed(level, exposure)
-                        system = self.linearize(volume, lit, T, weights, color_weight)
-                        iterations += 1
-                seen = self._observability(volume, lit, T, weights, system, color_weight)
+                if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
+                    exposure = chained(exposure, change)
+                    lit, system = exposed(level, exposure), None
             finest = first_level + index == len(self.config.iterations) - 1
-            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, seen), color_weight)
+            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, COMPLETE), color_weight)
+            if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
+                at_end = found.T_world_camera, weights, found.equations
+                seen = self._observability(volume, lit, *at_end, color_weight)
+                if not seen.is_complete:  # its steps went where noise led them
+                    iterations += found.iterations
+                    system = self.linearize(volume, lit, T, weights, color_weight)
+                    seen = self._observability(volume, lit, T, weights, system, color_weight)
+                    rules = self._rules(limit, finest, seen)
+                    found = self._descend(volume, lit, T, weights, system, rules, color_weight)
             T, system, settled = found.T_world_camera, found.equations, found.settled
             iterations += found.iterations
         if system is None:  # all levels are skipped: the initial pose is judged
