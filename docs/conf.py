@@ -60,5 +60,5 @@ def setup(app: Any) -> dict[str, bool]:
     """Connect this file's hooks."""
     app.connect("source-read", _read)
     app.connect("missing-reference", _public)
-    app.connect("env-get-outdated", lambda *_: ["commands", "python"])  # they change with the code, not with their pages
+    app.connect("env-get-outdated", lambda *_: ["commands", "python"])  # they change with the code
     return {"parallel_read_safe": True, "parallel_write_safe": True}
