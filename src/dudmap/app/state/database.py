@@ -1,6 +1,6 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
+Tables: ``blocks`` (voxels by map and slot), ``regions`` (blocks that have left the memory), ``frames`` (stored
 frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
 write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
 """
@@ -20,7 +20,6 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.block_keys import MAP_SHIFT
 from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 from dudmap.app.state.tree import Snapshot, lines
@@ -43,7 +42,7 @@ from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
 """Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
-SCHEMA = 2
+SCHEMA = 3
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 STEPS, LIMIT = 10_000, 100_000
@@ -55,7 +54,8 @@ TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
 CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
-CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
+CREATE TABLE blocks (map INTEGER, slot INTEGER, x INTEGER NOT NULL, y INTEGER NOT NULL, z INTEGER NOT NULL,
+                     crc INTEGER NOT NULL, voxels BLOB NOT NULL, PRIMARY KEY (map, slot));
 CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, level INTEGER, crc INTEGER NOT NULL, coords BLOB,
                       free_count BLOB, owners BLOB, geometry BLOB, colors BLOB, fused BLOB,
                       PRIMARY KEY (map, x, y, z, level));
@@ -151,22 +151,21 @@ class StateDatabase:
 
     def _write_maps(self, maps: list[MapSnapshot]) -> None:
         run, known = self._connection.executemany, {stored.number: stored for stored in self.maps.by_id.values()}
-        current = {changed.map_id for changed in maps}
-        gone = {stored.number for map_id, stored in self.maps.by_id.items() if map_id not in current}
-        for number in gone:
-            self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
+        for number in known.keys() - {changed.number for changed in maps}:
+            self._execute("DELETE FROM blocks WHERE map = ?", number)
             self._execute("DELETE FROM regions WHERE map = ?", number)
         for changed in maps:
             number, stored = changed.number, known.get(changed.number)
             if stored is not None:
-                run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
+                run("DELETE FROM blocks WHERE map = ? AND slot = ?", ((number, n) for n in changed.released.tolist()))
+                self._execute("DELETE FROM blocks WHERE map = ? AND slot >= ?", number, changed.num_slots)
                 back = ((number, *region) for region in stored.regions.keys() - changed.away.keys())
                 run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
             for region, records in changed.regions:
                 self._execute("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", number, *region)
                 rows = ((number, *region, *row) for row in _region_rows(records))
                 run(f"INSERT INTO regions VALUES ({', '.join('?' * 12)})", rows)
-            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
+            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?)", _block_rows(changed))
 
     def _write_frames(self, frames: list[FrameSnapshot]) -> None:
         for changed in frames:
@@ -262,28 +261,24 @@ class StateReader:
         except (*DAMAGE, MemoryError) as error:
             raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
 
-    def blocks(
-        self, map_number: int, first: int = 0, last: int = (1 << MAP_SHIFT) - 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-        """Keys (n,), slots (n,) and voxels (n, VOXELS) of the blocks of a map with Morton codes in a range.
+    def blocks(self, map_number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of the blocks of a map, by slot.
 
         Raises:
             StateError: The database is damaged.
         """
-        start = map_number << MAP_SHIFT
-        select = "SELECT key, slot, crc, voxels FROM blocks WHERE key BETWEEN ? AND ? ORDER BY key"
-        rows = list(self._rows(select, start | first, start | last))
-        for key, slot, crc, content in rows:
-            whole = isinstance(slot, int) and isinstance(content, bytes) and len(content) == 4 * VOXELS
+        select = "SELECT slot, x, y, z, crc, voxels FROM blocks WHERE map = ? ORDER BY slot"
+        rows = list(self._rows(select, map_number))
+        for *place, crc, content in rows:
+            whole = all(isinstance(n, int) for n in place) and isinstance(content, bytes) and len(content) == 4 * VOXELS
             if not whole or zlib.crc32(content) != crc:
-                raise StateError(
-                    f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
-                )
+                raise StateError(f"the state of the run in {self.path} is damaged: block {place[0]} is not as written")
         voxels = np.empty((len(rows), VOXELS), np.int32)
         for n in range(0, len(rows), ROWS):
-            part = b"".join(row[3] for row in rows[n : n + ROWS])
+            part = b"".join(row[5] for row in rows[n : n + ROWS])
             voxels[n : n + ROWS] = np.frombuffer(part, np.int32).reshape(-1, VOXELS)
-        return np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64), voxels
+        places = np.array([row[:4] for row in rows], np.int64).reshape(-1, 4)
+        return places[:, 0], places[:, 1:], voxels
 
     def region(self, map_number: int, region: Region) -> BlockRecords:
         """Blocks of a region of a map that had left the memory.
@@ -378,15 +373,10 @@ def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
     return crc
 
 
-def _key_range(number: int) -> tuple[int, int]:
-    return number << MAP_SHIFT, (number + 1) << MAP_SHIFT
-
-
-def _block_rows(changed: MapSnapshot) -> Iterable[tuple[int, int, int, bytes]]:
-    for slot, key, voxels in zip(changed.slots.tolist(), changed.keys.tolist(), changed.voxels, strict=True):
-        if key >= 0:
-            content = voxels.tobytes()
-            yield key, slot, zlib.crc32(content), content
+def _block_rows(changed: MapSnapshot) -> Iterable[tuple[Any, ...]]:
+    for slot, coords, voxels in zip(changed.slots.tolist(), changed.coords.tolist(), changed.voxels, strict=True):
+        content = voxels.tobytes()
+        yield changed.number, slot, *coords, zlib.crc32(content), content
 
 
 def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
