@@ -129,7 +129,7 @@ def test_other_work_is_done_while_no_frame_waits():
 def test_stopping_early_stops_the_sensor():
     before = threading.active_count()
     frames = in_real_time(np.array([0.0, 60.0]), str)
-    assert next(frames).item == "0"
+    assert next(frames).read == "0"
     frames.close()
     assert threading.active_count() == before
 

@@ -193,8 +193,8 @@ class Job:
                     display.note(_unmerged_submaps(state.slam))
                 if state.record.repeated:
                     display.note(_repeats(state.record))
-                if state.record.degenerate:
-                    display.note(f"{state.record.degenerate} frames do not show all directions of motion: not fused")
+                if degenerate := state.record.counts["degenerate"]:
+                    display.note(f"{degenerate} frames do not show all directions of motion: not fused")
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.options.max_frames} frames were dropped")
             except KeyboardInterrupt:
