@@ -1,8 +1,6 @@
 """A page in the browser with the map, the camera, what moves, images and plots, served by viser."""
 
 import io
-import socket
-import sys
 import threading
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -11,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.viewing.glb import glb
 from dudmap.app.viewing.mesh_feed import MeshChanges
-from dudmap.app.viewing.page_access import PageAccess
+from dudmap.app.viewing.page_access import PageAccess, port_problem
 from dudmap.app.viewing.picking import first_hit
 from dudmap.app.viewing.snapshot import KINDS, FrameFigures, jpeg
 from dudmap.core.geometry import se3
@@ -21,6 +18,7 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
 from dudmap.errors import DudmapError
 from dudmap.extras import extra
+from dudmap.io.exporting.gltf import encoded
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
@@ -54,7 +52,9 @@ class Window:
         with extra("view", "the page in the browser"):
             import viser  # pyright: ignore[reportMissingImports]
         self.access = PageAccess(host, port, token)
-        _check_port(host, port)
+        problem = port_problem(host, port)
+        if problem:  # viser would take another port without a word
+            raise DudmapError(f"cannot show a page at {host}:{port} ({problem}); name another --port or --host")
         self._lock = threading.RLock()
         with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
             self._server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -107,7 +107,8 @@ class Window:
                     self._chunks[key] = mesh
                     visible = self._show_map.value
                     name = _mesh_name(key)
-                    self._handles[name] = self._server.scene.add_glb(name, glb(mesh), visible=visible)
+                    file = encoded(mesh, double_sided=False)  # rooms are looked into from outside
+                    self._handles[name] = self._server.scene.add_glb(name, file, visible=visible)
 
     def add_frames(self, frames: list[FrameFigures], poses: dict[float, NDArray] | None = None) -> None:
         """Append frames; ``poses`` (4, 4) by time replace those of earlier frames after a correction."""
@@ -298,17 +299,3 @@ def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known wh
 def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
     """The frame with the corrected pose of its time, if there is one."""
     return replace(frame, T_world_camera=poses.get(frame.timestamp, frame.T_world_camera))
-
-
-def _check_port(host: str, port: int) -> None:
-    """Check that the page can be served there; viser would take another port without a word."""
-    with socket.socket() as probe:
-        if sys.platform != "win32":  # where it would let two programs take one port
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            reason = error.strerror or error
-            raise DudmapError(
-                f"cannot show a page at {host}:{port} ({reason}); name another --port or --host"
-            ) from None
