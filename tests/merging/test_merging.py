@@ -216,7 +216,8 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path
     a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", other, [0.0, 1.0, 2.0])
     report = merge_runs(a, b, tmp_path / "ab")
     assert sorted(path.name for path in report.out.iterdir()) == [
-        "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "metrics.json", "trajectory-2.txt", "trajectory.txt",
+        "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "metrics.json", "trajectory-2.txt",
+        "trajectory.txt",
     ]  # fmt: skip
     tree = json.loads((report.out / "merge.json").read_text())
     assert tree == report.tree

@@ -43,7 +43,8 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
 
     The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
     runs in the common world frame (trajectory.txt, trajectory-2.txt, ...), merge.json: the runs, the relative pose
-    and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is written if the maps are not to be joined.
+    and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is
+    written if the maps are not to be joined.
 
     Raises:
         MapError: The maps are not to be joined; the message says why.
