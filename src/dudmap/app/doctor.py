@@ -64,15 +64,14 @@ def _python() -> Check:
 
 def _packages() -> Iterator[Check]:
     for name, lowest, extra in requirements():
+        found = installed(name)
         if extra:
             continue
-        found = installed(name)
         if found is None:
             yield Check(name, "bad", "not installed", f"pip install '{name}>={lowest}'")
         elif numbers(found) < numbers(lowest):
-            yield Check(
-                name, "bad", f"{found}; {lowest} or newer is needed", f"pip install --upgrade '{name}>={lowest}'"
-            )
+            mend = f"pip install --upgrade '{name}>={lowest}'"
+            yield Check(name, "bad", f"{found}; {lowest} or newer is needed", mend)
         else:
             yield Check(name, "good", found)
 

@@ -8,7 +8,6 @@ are made of the classes of a table only, without calling them, and receive the a
 A node is a number, a text, None, or an object with one key that names its kind.
 """
 
-import json
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
@@ -367,8 +366,3 @@ def _class_name(value: object, place: str) -> str:
     if not schema.is_state_class(type(value)):
         raise StateError(f"{place} is a {schema.name_of(type(value))}, which cannot be stored")
     return schema.name_of(type(value))
-
-
-def lines(records: list[Any]) -> str:
-    """Plain values as lines of JSON."""
-    return "".join(json.dumps(record) + "\n" for record in records)
