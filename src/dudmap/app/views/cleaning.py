@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.views.background import Background, BackgroundRenderer
+from dudmap.app.views.background import BackgroundRenderer, continued
 from dudmap.app.views.tum_folder import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DatasetError, FrameError
@@ -45,13 +45,17 @@ class Cleaned(NamedTuple):
         frame: As recorded.
         moving: (h, w) bool, replaced pixels of the colour image.
         replaced: (H, W) bool, replaced pixels of the depth image: the same, and shadows without readings.
-        background: What the pixels were replaced by.
+        color: (h, w, 3) uint8; where it is not known, a smooth continuation of what is.
+        depth: (H, W) float32, metres, 0 where it is not known.
+        known: (h, w) bool, whether the colour is known.
     """
 
     frame: Frame
     moving: NDArray[np.bool_]
     replaced: NDArray[np.bool_]
-    background: Background
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    known: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -109,22 +113,17 @@ class Cleaner:
             raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
         color_camera = sequence.camera if run.calibration is None else run.calibration.camera
         self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera, registered=self.registered)
-        self._is_prepared = False
-
-    def prepare(self) -> None:
-        """Read the frames that lend their colours."""
-        step = max(1, -(-len(self.indices) // SOURCES))
-        for index in self.indices[::step]:
+        for index in self.indices[:: max(1, -(-len(self.indices) // SOURCES))]:
             try:
-                frame = self.sequence[index]
+                frame = sequence[index]
             except FrameError:
                 continue
             T_world_camera, T_world_color = self._poses[index], self._color_pose(frame)
-            moving = self._renderer.in_color(self.moving(index, frame), frame, T_world_camera, T_world_color)
+            moving = self._moving(index, frame, self._renderer.map_depth(T_world_camera))
+            moving = self._renderer.in_color(moving, frame, T_world_camera, T_world_color)
             self._renderer.add(frame, moving, T_world_camera, T_world_color)
-        self._is_prepared = True
 
-    def moving(self, index: int, frame: Frame) -> NDArray[np.bool_]:
+    def _moving(self, index: int, frame: Frame, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a margin.
 
         Raises:
@@ -133,31 +132,29 @@ class Cleaner:
         mask, width = read_mask(self._masks[index]), self.sequence.camera.width
         if mask.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")
-        behind = self._renderer.map_depth(self._poses[index])
         in_front = (frame.depth > 0) & (frame.depth < (1 - IN_FRONT) * behind)
         return grown(mask | (in_front & grown(mask, REACH * width)), MARGIN * width)
 
     def clean(self, index: int) -> Cleaned:
         """Frame number ``index`` without what moves."""
-        if not self._is_prepared:
-            self.prepare()
         frame, T_world_camera = self.sequence[index], self._poses[index]
         T_world_color = self._color_pose(frame)
-        replaced = self.moving(index, frame)
-        moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
         behind = self._renderer.map_depth(T_world_camera)
+        replaced = self._moving(index, frame, behind)
+        moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
         asked, surely = grown(moving, REACH * moving.shape[1]), None
         if self.registered:  # what is too near for the sensor has no readings, and its colours tell it
             asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
             surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
-        color, known = self._renderer.colors(frame, asked, T_world_color)
-        left = unlike(frame.color, color, asked & ~moving & known, surely)
+        found, seen = self._renderer.colors(frame, asked, T_world_color)
+        left = unlike(frame.color, found, asked & ~moving & seen, surely)
         if self.registered:
             replaced = replaced | left
         replaced = with_shadow(replaced, frame.depth, behind)
         moving = moving | left
-        background = self._renderer.render(frame, replaced, moving, T_world_camera, (color, known))
-        return Cleaned(frame, moving, replaced, background)
+        known = seen | ~moving
+        color = continued(np.where((moving & seen)[..., None], found, frame.color), known)
+        return Cleaned(frame, moving, replaced, color, np.where(replaced, behind, frame.depth), known)
 
     def _color_pose(self, frame: Frame) -> NDArray[np.float64]:
         return self.run.color_pose(frame.timestamp if frame.color_timestamp is None else frame.color_timestamp)
@@ -257,16 +254,16 @@ def clean_recording(
         except FrameError:
             left_out.append(index)
             continue
-        frame, background = cleaned.frame, cleaned.background
-        unknown_color, unknown = cleaned.moving & ~background.known, cleaned.replaced & (background.depth == 0)
+        frame = cleaned.frame
+        unknown_color, unknown = cleaned.moving & ~cleaned.known, cleaned.replaced & (cleaned.depth == 0)
         images = {"replaced": cleaned.replaced, "unknown": unknown | unknown_color if cleaner.registered else unknown}
         if not cleaner.registered:
             images |= {"replaced_color": cleaned.moving, "unknown_color": unknown_color}
         for kind, image in images.items():
             folder.add(kind, frame.timestamp, image)
         color_time = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
-        color = folder.add("rgb", color_time, background.color)
-        pairs.append(f"{color} {folder.add('depth', frame.timestamp, depth_units(background.depth, camera))}")
+        color = folder.add("rgb", color_time, cleaned.color)
+        pairs.append(f"{color} {folder.add('depth', frame.timestamp, depth_units(cleaned.depth, camera))}")
         shares.append((float(cleaned.moving.mean()), float(unknown_color.mean())))
         if progress is not None:
             progress(done, len(indices))
