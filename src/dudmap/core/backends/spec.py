@@ -191,12 +191,12 @@ class Backend(Protocol):
         weights: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         T_world_camera: NDArray[np.float64],
-        first: NormalEquations,
+        first: NormalEquations | None,
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations; see
-        ``core/backends/descent.py``. Images and parameters as of ``linearize``."""
+        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations if they are known;
+        see ``descent.py``. Images and parameters as of ``linearize``."""
         ...
 
     def sample(
