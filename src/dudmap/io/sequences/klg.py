@@ -12,7 +12,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import LARGEST_FILE, open_plain
 from dudmap.io.sequences import images, intrinsics
-from dudmap.io.sequences.file_recording import FileRecording
+from dudmap.io.sequences.recording import Recording
 from dudmap.io.sequences.sens import decode_values
 
 FRAME_HEADER = struct.Struct("<qii")
@@ -28,7 +28,7 @@ class _Entry(NamedTuple):
     color_bytes: int
 
 
-class KlgRecording(FileRecording):
+class KlgRecording(Recording):
     """Recording in a ``.klg`` file: depth in millimetres (raw or zlib) and colour (raw or JPEG), registered.
 
     The file gives neither the intrinsics nor the image size: the intrinsics must be given, and the size comes from

@@ -16,7 +16,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import LARGEST_FILE, open_plain
 from dudmap.io.sequences import images
-from dudmap.io.sequences.file_recording import FileRecording
+from dudmap.io.sequences.recording import Recording
 
 VERSION = 4
 """The version of the format that ScanNet publishes."""
@@ -36,7 +36,7 @@ class _Entry(NamedTuple):
     depth_time: int
 
 
-class SensRecording(FileRecording):
+class SensRecording(Recording):
     """Recording in a ``.sens`` file.
 
     Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
