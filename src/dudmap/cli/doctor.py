@@ -1,12 +1,11 @@
 """``dudmap doctor``: check the installation."""
 
+import json
 from typing import Annotated
 
 import typer
 
-from dudmap.app.terminal import plain_console
-from dudmap.cli import options as o
-from dudmap.cli.output import answer
+from dudmap.app.terminal import plain_console, say
 
 app = typer.Typer(add_completion=False)
 
@@ -15,7 +14,7 @@ MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", 
 
 @app.command()
 def doctor(
-    as_json: o.JsonOption = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a list.")] = False,
     licences: Annotated[
         bool, typer.Option("--licences", "--licenses", help="List the licences of all required packages instead.")
     ] = False,
@@ -34,7 +33,7 @@ def doctor(
     found = list(checks())
     works = all(check.state != "bad" for check in found)
     if as_json:
-        answer({"works": works, "checks": [check.tree() for check in found]}, "", as_json=True)
+        say(json.dumps({"works": works, "checks": [check.tree() for check in found]}))
     else:
         console = plain_console(soft_wrap=True)
         for check in found:
@@ -50,6 +49,8 @@ def _print_licences(as_json: bool) -> None:
     from dudmap.app.doctor import licences
 
     rows = licences()
-    tree = [{"package": row.package, "version": row.version, "licence": row.licence} for row in rows]
-    text = "\n".join(f"{row.package:<24} {row.version:<12} {row.licence}" for row in rows)
-    answer(tree, text, as_json=as_json)
+    if as_json:
+        say(json.dumps([{"package": r.package, "version": r.version, "licence": r.licence} for r in rows]))
+        return
+    for row in rows:
+        say(f"{row.package:<24} {row.version:<12} {row.licence}")

@@ -21,7 +21,7 @@ class DefaultGroup(TyperGroup):
         return super().parse_args(ctx, args)
 
 
-def answer(tree: Mapping[str, Any] | list[Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
+def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
     """Print the result of a command to stdout: as one JSON object, as text, or not at all."""
     if as_json:
         say(json.dumps(plain(tree), allow_nan=False))
