@@ -82,8 +82,8 @@ READERS = (
     "numbered_folders:EpflSequence",
     "numbered:BopSequence",
     "numbered:NumberedSequence",
-    "sens:SensRecording",
-    "klg:KlgRecording",
+    "image_logs:SensRecording",
+    "image_logs:KlgRecording",
     "record3d:Record3DRecording",
     "azure_kinect:AzureKinectRecording",
     "realsense:RealSenseRecording",
@@ -176,11 +176,7 @@ def _option(name: str) -> str:
 
 
 def _find(path: Path) -> tuple[Path, type[Recording]]:
-    """The recording at a path, in it, or in the archive at it, and its reader.
-
-    Raises:
-        DatasetError: There is none, or more than one.
-    """
+    """The recording at a path, in it, or in the archive at it, and its reader."""
     from dudmap.io.sequences.archive import split, unpack
 
     reader = reader_of(path) if path.exists() else None

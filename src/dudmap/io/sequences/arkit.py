@@ -20,7 +20,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_json, read_text
 from dudmap.io.sequences import images
-from dudmap.io.sequences.camera_json import values_of
+from dudmap.io.sequences.camera_files import values_of
 from dudmap.io.sequences.image_folder import ImageFolder, numbered_files, size
 from dudmap.io.sequences.intrinsics import Intrinsics, camera_values
 from dudmap.io.sequences.poses import OPENGL_AXES, read_matrix, rigid_trajectory

@@ -167,9 +167,6 @@ def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float
         size: Width and height of the images.
         whole: Those of the sensor's image at this resolution.
         cut: Column and row of it where the images begin.
-
-    Raises:
-        DatasetError: The model of the lens is another one.
     """
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":

@@ -183,11 +183,7 @@ class RosBag(Recording):
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
     def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
-        """The first frame that can be decoded.
-
-        Raises:
-            DatasetError: None of some frames all over the bag can be decoded.
-        """
+        """The first frame that can be decoded."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:

@@ -108,11 +108,7 @@ class ImageFolder(Recording):
         return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics of a file that lies there, else those of the data set.
-
-        Raises:
-            DatasetError: There is neither, or the file cannot be understood.
-        """
+        """Intrinsics of a file that lies there, else those of the data set."""
         known = camera_files.find(self.path) or self._published()
         if known is None:
             raise camera_files.unknown(self.path)
@@ -161,9 +157,6 @@ class ImageFolder(Recording):
     ) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``, or, where the
         numbers only count the frames, over ``FRAME_RATE``.
-
-        Raises:
-            DatasetError: No number occurs in both.
         """
         numbers = sorted(colors.keys() & depths.keys())
         if not numbers:
@@ -177,11 +170,7 @@ class ImageFolder(Recording):
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
     def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart.
-
-        Raises:
-            DatasetError: No colour image is so near a depth image.
-        """
+        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart."""
         pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
         if not pairs:
             raise DatasetError(
@@ -236,11 +225,7 @@ class ImageFolder(Recording):
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame.
-
-        Raises:
-            DatasetError: No frame is valid.
-        """
+        """Camera with the size of the first valid frame."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:

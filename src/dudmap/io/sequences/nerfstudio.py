@@ -12,7 +12,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import read_json
 from dudmap.io.sequences import images
-from dudmap.io.sequences.camera_json import values_of
+from dudmap.io.sequences.camera_files import values_of
 from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder
 from dudmap.io.sequences.intrinsics import Intrinsics
 from dudmap.io.sequences.poses import OPENGL_AXES, rigid_trajectory

@@ -14,9 +14,9 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import images, intrinsics
 from dudmap.io.sequences.archive import origin, unpack
+from dudmap.io.sequences.camera_files import read_yaml
 from dudmap.io.sequences.image_folder import ImageFolder, size
 from dudmap.io.sequences.intrinsics import camera_values
-from dudmap.io.sequences.yaml_files import read_yaml
 
 
 class TumSequence(ImageFolder):
