@@ -74,6 +74,11 @@ class FrameResult:
     checks: Mapping[str, float] = field(default_factory=dict)
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
 
+    def __repr__(self) -> str:
+        """The state without the images."""
+        reason = f": {self.lost_reason}" if self.lost_reason else ", fused" if self.fused else ""
+        return f"FrameResult({self.timestamp:.6f} s, {self.state}{reason}, {self.dynamic_share:.1%} dynamic)"
+
     @property
     def movers(self) -> tuple[Mover, ...]:
         """Moving objects, by id; none in a lost frame. They are found when they are first asked for."""

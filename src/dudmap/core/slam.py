@@ -94,11 +94,10 @@ class Slam(SlamResults):
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
-        voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
         backend = make_backend(self.device)
-        self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
+        self.preprocess = Preprocessor(camera, config.preprocess, backend, given)
         self.camera = self.preprocess.camera
         self.first_camera = camera
         self.prior_map = None if first_pass is None else first_pass.as_prior_map()
