@@ -25,7 +25,6 @@ from dudmap.own_folder import remove_files
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dudmap.core.calibration.depth_model import DepthModel
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.slam import Slam
@@ -63,7 +62,6 @@ class RunOptions(BaseModel):
     ahead: int = AHEAD
     live: bool = False
     passes: int = 1
-    depth_model: Path | None = None
     saved_map: Path | None = None
     localize: bool = False
     max_memory: int | None = None
@@ -93,7 +91,7 @@ class RunState:
 
     Attributes:
         slam, record: The system and the metrics of the pass that goes on.
-        calibration, model: Of the camera, as given.
+        calibration: Of the camera, as given.
         number: Number of the pass, from 0.
         next: Number of the frame that comes next.
         finished: System and metrics of the first pass, during the second.
@@ -102,7 +100,6 @@ class RunState:
     slam: "Slam"
     record: RunRecord
     calibration: "Calibration | None" = None
-    model: "DepthModel | None" = None
     number: int = 0
     next: int = 0
     finished: "tuple[Slam, RunRecord] | None" = None
@@ -111,7 +108,7 @@ class RunState:
         """What is stored of it."""
         slam, record = self.finished or (None, None)
         return {
-            "slam": self.slam, "record": self.record, "calibration": self.calibration, "model": self.model,
+            "slam": self.slam, "record": self.record, "calibration": self.calibration,
             "number": self.number, "next": self.next, "finished_slam": slam, "finished_record": record,
             "clocks": [list(one.elapsed()) for one in (self.record, record) if one is not None],
         }  # fmt: skip
@@ -123,8 +120,7 @@ class RunState:
         for one, clock in zip([tree["record"], record], tree["clocks"], strict=False):
             one.continue_from(*clock)
         finished = None if slam is None else (slam, record)
-        calibration, model = tree["calibration"], tree["model"]
-        return cls(tree["slam"], tree["record"], calibration, model, tree["number"], tree["next"], finished)
+        return cls(tree["slam"], tree["record"], tree["calibration"], tree["number"], tree["next"], finished)
 
 
 class RunStore:
