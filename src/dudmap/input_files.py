@@ -18,7 +18,7 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -202,10 +202,13 @@ def inflated(packed: bytes, largest: int) -> bytes:
 
 
 @contextmanager
-def damaged(kind: type[DudmapError], what: object) -> Iterator[None]:
+def damaged(
+    kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None
+) -> Iterator[None]:
     """Turn what a parser raises for damaged content into one sentence of class ``kind`` about ``what``.
 
-    It stands around readers, behind their own checks, for the defects that these do not name.
+    It stands around readers, behind their own checks, for the defects that these do not name. ``errors`` are those
+    that mean damage, by default ``DAMAGE`` and the errors of OpenCV.
 
     Raises:
         DudmapError: Of that class; our own errors pass unchanged.
@@ -216,25 +219,15 @@ def damaged(kind: type[DudmapError], what: object) -> Iterator[None]:
         yield
     except DudmapError:
         raise
-    except (*DAMAGE, cv2.error) as error:
+    except errors or (*DAMAGE, cv2.error) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise
         raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
 
 
-@contextmanager
-def foreign(kind: type[DudmapError], what: object) -> Iterator[None]:
-    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh.
-
-    Raises:
-        DudmapError: Of class ``kind``; our own errors pass unchanged.
-    """
-    try:
-        yield
-    except DudmapError:
-        raise
-    except Exception as error:
-        raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
+def foreign(kind: type[DudmapError], what: object) -> AbstractContextManager[None]:
+    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh."""
+    return damaged(kind, what, (Exception,))
 
 
 def describe(error: BaseException) -> str:

@@ -131,8 +131,8 @@ UpOption = Annotated[
 ]
 
 
-def numbers(text: str, count: int, option: str) -> list[float]:
-    """Numbers of an option, separated by commas.
+def numbers(text: str, count: int | None, option: str) -> list[float]:
+    """Numbers of an option, separated by commas; any count of them for None.
 
     Raises:
         ConfigError: They are not so many finite numbers.
@@ -141,8 +141,9 @@ def numbers(text: str, count: int, option: str) -> list[float]:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) != count or not all(map(isfinite, found)):
-        raise ConfigError(f"found {option} {text!r}; expected {count} numbers separated by commas")
+    if not found or len(found) != (count or len(found)) or not all(map(isfinite, found)):
+        what = f"{count} numbers" if count else "numbers"
+        raise ConfigError(f"found {option} {text!r}; expected {what} separated by commas")
     return found
 
 

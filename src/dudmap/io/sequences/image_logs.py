@@ -60,13 +60,13 @@ class SensRecording(Recording):
         super().__init__(path)
         with open_plain(self.path) as file:
             try:
-                num_frames = self._read_header(file, camera)
-                entries = [self._read_entry(file) for _ in range(num_frames)]
+                num_frames, end = self._read_header(file, camera), self.path.stat().st_size
+                entries = [self._read_entry(file, end) for _ in range(num_frames)]
             except struct.error:
                 raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
         self._entries = [entry for entry, _ in entries]
         self.timestamps = 1e-6 * np.array([entry.time for entry in self._entries], dtype=np.float64)
-        self.timed = not np.any(np.diff(self.timestamps) <= 0) and bool(self.timestamps[-1] > 0)
+        self.timed = not np.any(np.diff(self.timestamps) <= 0)
         if not self.timed:
             self.timestamps = PERIOD * np.arange(num_frames, dtype=np.float64)
             self.sources["times"] = "assumed, 30 frames a second"
@@ -105,11 +105,11 @@ class SensRecording(Recording):
         self._set_cameras(own, calibration, "the header of the file", camera)
         return num_frames
 
-    def _read_entry(self, file: IO[bytes]) -> tuple[FrameEntry, list[float]]:
+    def _read_entry(self, file: IO[bytes], end: int) -> tuple[FrameEntry, list[float]]:
         """Place and pose of the next frame, without reading its images."""
         *pose, color_time, depth_time, color_bytes, depth_bytes = _unpack(file, SENS_FRAME.format)
         entry = FrameEntry(file.tell(), (color_bytes, depth_bytes), depth_time, color_time)
-        if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > self.path.stat().st_size:
+        if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > end:
             raise struct.error
         return entry, pose
 
