@@ -202,9 +202,7 @@ def inflated(packed: bytes, largest: int) -> bytes:
 
 
 @contextmanager
-def damaged(
-    kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None
-) -> Iterator[None]:
+def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None) -> Iterator[None]:
     """Turn what a parser raises for damaged content into one sentence of class ``kind`` about ``what``.
 
     It stands around readers, behind their own checks, for the defects that these do not name. ``errors`` are those
@@ -215,11 +213,12 @@ def damaged(
     """
     import cv2
 
+    caught = errors or (*DAMAGE, cv2.error)
     try:
         yield
     except DudmapError:
         raise
-    except errors or (*DAMAGE, cv2.error) as error:
+    except caught as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise
         raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error

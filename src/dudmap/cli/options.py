@@ -1,4 +1,7 @@
-"""Options that several commands share, and the values that are written as text in them."""
+"""Options that several commands share, and the values that are written as text in them.
+
+A text that cannot be understood is a ``ConfigError``.
+"""
 
 import re
 from functools import partial
@@ -132,11 +135,7 @@ UpOption = Annotated[
 
 
 def numbers(text: str, count: int | None, option: str) -> list[float]:
-    """Numbers of an option, separated by commas; any count of them for None.
-
-    Raises:
-        ConfigError: They are not so many finite numbers.
-    """
+    """Numbers of an option, separated by commas; any count of them for None."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:
@@ -156,11 +155,7 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
 
 
 def image_size(text: str) -> tuple[int, int]:
-    """Width and height of ``--size``.
-
-    Raises:
-        ConfigError: It is no possible size.
-    """
+    """Width and height of ``--size``."""
     match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
     if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
         raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
@@ -168,11 +163,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def memory_size(text: str) -> int:
-    """Number of bytes of a text such as 1GB or 800MB.
-
-    Raises:
-        ConfigError: It is no amount of memory.
-    """
+    """Number of bytes of a text such as 1GB or 800MB."""
     from pydantic import ByteSize, TypeAdapter, ValidationError
 
     try:

@@ -1,4 +1,7 @@
-"""Plots of trajectory, surface and mask errors. Each function writes one PNG file."""
+"""Plots of trajectory, surface and mask errors. Each function writes one PNG file.
+
+A plot that cannot be written is a ``DudmapError``.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -85,9 +88,6 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
         axes: Where to draw.
         residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the reading and ``counts``
             (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,), ``sigma`` (2,).
-
-    Raises:
-        DatasetError: The file does not hold these arrays.
     """
     try:
         with open_arrays(residuals) as data:
