@@ -100,7 +100,7 @@ def make_folder(path: Path) -> None:
 
 
 def remove_files(folder: Path, written: Mapping[str, str]) -> None:
-    """Delete the files of a folder that ``written`` describes by a regular expression per sub-folder, ``""`` for itself.
+    """Delete the files of a folder that ``written`` describes: a pattern per sub-folder, ``""`` for the folder itself.
 
     Nothing is deleted if a sub-folder is a link, or something other than a plain file has such a name.
     """
