@@ -50,10 +50,6 @@ JsonOption = Annotated[bool, output_option("--json", help="Print the result as o
 QuietOption = Annotated[bool, output_option("--quiet", help="No progress bar and no table.")]
 RunArgument = Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")]
 RecordingArgument = Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")]
-OptionalRecordingArgument = Annotated[
-    Path | None, typer.Argument(help="Recording with true poses; default: synthetic rooms.")
-]
-
 CameraOption = Annotated[
     str | None,
     input_option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS"),

@@ -123,7 +123,6 @@ def compare_surfaces(
     ghost_distance: float = GHOST_DISTANCE,
     samples: int = SAMPLES,
     points: bool = False,
-    seed: int = 0,
 ) -> SurfaceResult:
     """Accuracy, completeness, F-scores and ghosts of an estimated surface.
 
@@ -135,7 +134,6 @@ def compare_surfaces(
         ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
         samples: Number of points sampled on each surface.
         points: Accept point clouds, whose points serve as samples and which have no area.
-        seed: Seed of the sampling.
 
     Raises:
         MapError: A mesh has no faces (without ``points``) or holds NaN.
@@ -152,8 +150,8 @@ def compare_surfaces(
     truth = _surface(reference, "the reference", points)
     found = Surface(estimate, "the estimate", points=points)
     part = truth if observed is None else _surface(observed, "the observed part of the reference", points)
-    to_truth = truth.distances(found.samples(samples, seed))
-    to_found = found.distances(part.samples(samples, seed + 1))
+    to_truth = truth.distances(found.samples(samples, 0))
+    to_found = found.distances(part.samples(samples, 1))
     ghost_share = float(np.mean(to_truth > ghost_distance))
     edges = np.linspace(0.0, HISTOGRAM_LARGEST, HISTOGRAM_BINS + 1)
     return SurfaceResult(
