@@ -67,14 +67,6 @@ def test_doctor_finds_a_folder_that_cannot_be_written(tmp_path):
     assert doctor.not_writable(tmp_path / "new" / "folder") == ""
 
 
-def test_licences_of_all_required_packages():
-    done = CliRunner().invoke(app, ["doctor", "--licences", "--json"])
-    rows = {row["package"]: row["licence"] for row in json.loads(done.stdout)}
-    assert {name.lower() for name, _, extra in doctor.requirements() if not extra} <= set(rows)
-    assert "llvmlite" in rows, "what Numba needs is required, too"
-    assert "not stated" not in rows.values()
-
-
 # -- log and crash -----------------------------------------------------------------------------------------------------
 
 

@@ -30,6 +30,7 @@ _HOMES = {
     "resume_system": "app.state.system",
     "run": "app.pipeline.run",
     "save_system": "app.state.system",
+    "synthetic": "lab",
 }
 
 __all__ = [
@@ -58,6 +59,7 @@ __all__ = [
     "resume_system",
     "run",
     "save_system",
+    "synthetic",
 ]
 
 if TYPE_CHECKING:
@@ -85,12 +87,14 @@ if TYPE_CHECKING:
     )
     from dudmap.io.exporting.exporters import export_run
     from dudmap.io.sequences import Sequence, open_sequence
+    from dudmap.lab import synthetic
 
 
 def __getattr__(name: str) -> object:
     """Import a public name when it is first used, so that importing dudmap loads neither numba nor cv2."""
     if name not in __all__ or name not in _HOMES:
         raise AttributeError(f"module 'dudmap' has no attribute {name!r}")
-    value = getattr(import_module(f"dudmap.{_HOMES[name]}"), name)
+    home = f"dudmap.{_HOMES[name]}"
+    value = import_module(f"{home}.{name}") if name == "synthetic" else getattr(import_module(home), name)
     globals()[name] = value
     return value

@@ -27,11 +27,10 @@ EXCEPTIONS = {
     "core/backends/device.py": "writes to the null device",
     "app/viewing/plots.py": "writes into memory",
     "app/state/run_lock.py": "the lock, which is no result",
-    "study/": "a study's folder is locked, and every run in it is finished by a rename",
-    "benchmark/": "tables for developers, made anew by their command",
+    "lab/study/": "a study's folder is locked, and every run in it is finished by a rename",
+    "lab/benchmark/": "tables for developers, made anew by their command",
     "cli/benchmark.py": "tables for developers, made anew by their command",
-    "cli/warmup.py": "a temporary folder",
-    "kernels/": "writes nothing but the cache of Numba",
+    "lab/warmup.py": "a temporary folder",
 }
 
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from dudmap.config import Config
-from dudmap.core.backends.descent import restricted_step
+from dudmap.core.formulas.damping import damped_step
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -118,7 +118,7 @@ def test_truncated_step_leaves_the_free_direction_alone():
     seen = GradientNoise(noise, np.zeros((6, 6)), (1.0, 0.0), 1.0).observability(H, H, R, 4.0)
     assert spans(seen.unobservable @ np.kron(np.eye(2), R).T, free[None])
     b = rng.normal(size=6)
-    assert abs(restricted_step(J.T @ J, b, seen.observable) @ free) < 1e-9
+    assert abs(damped_step(J.T @ J, b, seen.observable, 0.0) @ free) < 1e-9
 
 
 def test_the_noise_is_that_of_the_configured_filter():

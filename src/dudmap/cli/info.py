@@ -34,6 +34,8 @@ def info(
     Warnings name what looks wrong: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are
     read.
     """
+    from dataclasses import asdict
+
     from rich.table import Table
 
     from dudmap.app.pipeline.contact_sheet import save_overview
@@ -48,7 +50,7 @@ def info(
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:
-        answer(found.tree(), "", as_json=True)
+        answer(asdict(found), "", as_json=True)
         return
     console = plain_console()
     table = Table.grid(padding=(0, 2))

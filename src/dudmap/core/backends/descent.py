@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt steps of a registration on one level of the pyramid (Marquardt 1963), for every back end."""
+"""Levenberg-Marquardt steps of a registration on one level of the pyramid (Marquardt 1963)."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -7,15 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.parameters import NormalEquations
-from dudmap.core.geometry import se3
-
-SHORT_STEP = 4.0
-"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
-on the finest level whatever it costs."""
-FLOOR = 1e-9
-"""Share of the largest diagonal element that is always added, so that a direction without information stays still."""
-FACTOR, LEAST = 5.0, 1e-6
-"""The damping grows and shrinks by this factor, down to the least one."""
+from dudmap.core.formulas.damping import damped_step, judged, moved
 
 
 class DescentRules(NamedTuple):
@@ -57,42 +49,33 @@ class Descent(NamedTuple):
 def descend(
     linearize: Callable[[NDArray[np.float64]], NormalEquations],
     T_world_camera: NDArray[np.float64],
-    first: NormalEquations,
+    first: NormalEquations | None,
     rules: DescentRules,
 ) -> Descent:
     """Steps whose damping is scaled by the diagonal of H; one is accepted if it decreases the cost.
 
+    The CPU has the same loop as one compiled call (``cpu/registration.py``).
+
     Args:
         linearize: Gives the normal equations at a pose (4, 4).
         T_world_camera: (4, 4) first pose.
-        first: Normal equations there.
+        first: Normal equations there; None where they are not known yet.
         rules: Beginning and end.
     """
-    T, system, damping, used = T_world_camera, first, rules.damping, 0
+    T, damping, used = T_world_camera, rules.damping, int(first is None)
+    system = linearize(T) if first is None else first
     for _ in range(rules.limit):
-        diagonal = np.diag(system.H)
-        if not diagonal.max() > 0:
+        if not np.diag(system.H).max() > 0:
             break
-        damped = system.H + np.diag(damping * diagonal + FLOOR * diagonal.max())
-        step = restricted_step(damped, system.b, rules.basis)
-        T_trial, length = se3.retract(T, step), np.linalg.norm(step)
+        step = damped_step(system.H, system.b, rules.basis, damping)
+        T_trial, length = moved(T, step), float(np.linalg.norm(step))
         if length < rules.stop:  # too short to need another linearisation
             return Descent(T_trial, system, used, settled=True)
         trial = linearize(T_trial)
         used += 1
-        gain = abs(trial.cost - system.cost)
-        settled = bool(length < SHORT_STEP * rules.stop and gain < rules.stop_gain * system.cost)
-        if trial.cost < system.cost or length < rules.taken:
-            T, system, damping = T_trial, trial, max(damping / FACTOR, LEAST)
-        else:
-            damping *= FACTOR
+        accepted, damping, settled = judged(system.cost, trial.cost, length, damping, rules)
+        if accepted:
+            T, system = T_trial, trial
         if settled:
             return Descent(T, system, used, settled=True)
     return Descent(T, system, used, settled=False)
-
-
-def restricted_step(H: NDArray[np.float64], b: NDArray[np.float64], basis: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Solution (6,) of ``H step = -b`` that moves along the directions of a basis (6, m) only."""
-    if basis.shape[1] == len(b):
-        return np.asarray(-np.linalg.solve(H, b), dtype=np.float64)
-    return basis @ np.linalg.solve(basis.T @ H @ basis, -basis.T @ b)

@@ -113,19 +113,6 @@ class Backend(Protocol):
         """
         ...
 
-    def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
-    ) -> NDArray[np.uint8]:
-        """Mean colour (H, W, 3) uint8 of the surface within a voxel of each reading.
-
-        Args:
-            color: (H, W, 3) uint8.
-            depth: (H, W) float32, metres, 0 = none; pixels without a reading keep their colour.
-            focal: Focal length, pixels.
-            voxel_size: Metres.
-        """
-        ...
-
     def fuse(
         self,
         grid: VoxelGrid,
@@ -204,12 +191,12 @@ class Backend(Protocol):
         weights: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         T_world_camera: NDArray[np.float64],
-        first: NormalEquations,
+        first: NormalEquations | None,
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
-        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations; see
-        ``core/backends/descent.py``. Images and parameters as of ``linearize``."""
+        """Levenberg-Marquardt steps from a pose (4, 4) on, where ``first`` are the normal equations if they are known;
+        see ``descent.py``. Images and parameters as of ``linearize``."""
         ...
 
     def sample(

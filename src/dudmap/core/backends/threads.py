@@ -70,6 +70,12 @@ def submit(function: Callable[[], Result]) -> Callable[[], Result]:
     return lambda: result
 
 
+def also_in_other_threads(function: Callable[[], object], count: int) -> None:
+    """Have ``count`` other threads call a function that may be called late, when nothing is left to do."""
+    for _ in range(count):
+        _tasks().put(function)
+
+
 def _fulfil(future: Future[Result], function: Callable[[], Result]) -> None:
     try:
         future.set_result(function())
@@ -90,23 +96,25 @@ def run_bands(function: Callable[..., Any], ranges: Sequence[tuple[int, int]], *
         return [function(*range_, *items) for range_, *items in calls]
     results: list[Any] = [None] * len(calls)
     order = iter(range(len(calls)))  # shared by all threads; next() is atomic, so no band runs twice
-    finished: SimpleQueue[BaseException | None] = SimpleQueue()  # for each band: how it ended
+    finished: SimpleQueue[int] = SimpleQueue()  # number of bands that another thread has finished
+    errors: list[BaseException] = []
 
-    def work() -> None:
+    def work() -> int:
+        count = 0
         for n in order:
             range_, *items = calls[n]
             try:
                 results[n] = function(*range_, *items)
             except BaseException as error:
-                finished.put(error)
-            else:
-                finished.put(None)
+                errors.append(error)
+            count += 1
+        return count
 
     # the calling thread works too, and each other one is woken once, not once per band; one that comes late finds none
-    for _ in range(threads - 1):
-        _tasks().put(work)
-    work()
-    errors = [error for error in (finished.get() for _ in calls) if error is not None]
+    also_in_other_threads(lambda: finished.put(work()), threads - 1)
+    count = work()
+    while count < len(calls):
+        count += finished.get()
     if errors:
         raise errors[0]
     return results

@@ -65,17 +65,21 @@ def exp_all(twists: Matrix) -> Matrix:
 
 def exp_rotation(omega: Matrix) -> Matrix:
     """Rotation matrix (3, 3) of a rotation vector (3,), radians (Rodrigues)."""
-    x, y, z = (float(value) for value in omega)
+    return np.array(rodrigues(*(float(value) for value in omega))).reshape(3, 3)
+
+
+def rodrigues(x: float, y: float, z: float) -> tuple[float, ...]:
+    """Rotation matrix, row by row, of a rotation vector, radians; back ends compile it."""
     theta_squared = x * x + y * y + z * z
     a, b = 1 - theta_squared / 6, 0.5 - theta_squared / 24  # Taylor series: the closed forms are 0/0 at 0
     if theta_squared >= SMALL:
         theta = math.sqrt(theta_squared)
         a, b = math.sin(theta) / theta, (1 - math.cos(theta)) / theta_squared
-    return np.array([
-        [1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y],
-        [b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x],
-        [b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y)],
-    ])  # fmt: skip
+    return (
+        1 - b * (y * y + z * z), b * x * y - a * z, b * x * z + a * y,
+        b * x * y + a * z, 1 - b * (x * x + z * z), b * y * z - a * x,
+        b * x * z - a * y, b * y * z + a * x, 1 - b * (x * x + y * y),
+    )  # fmt: skip
 
 
 def log(T: Matrix) -> Matrix:

@@ -46,8 +46,9 @@ class MovingObjects:
     def update(self, view: FrameView, estimate: PoseEstimate) -> Callable[[], tuple[Mover, ...]]:
         """Take note of a tracked frame; the function that is returned finds its moving objects, by id.
 
-        They are found when somebody asks for them or for those of a later frame, at the latest ``MOST_WAITING`` frames
-        later, or at once where their shapes are fused.
+        They are found when somebody asks for them or for those of a later frame, or at once where their shapes are
+        fused. Of what nobody asks for, the last ``MOST_WAITING`` frames are kept: who asks for the first time gets
+        objects that were followed since then.
         """
         if self.tracker is None or estimate.labels is None:
             return tuple
@@ -62,7 +63,7 @@ class MovingObjects:
                 )
             frame.movers = tuple(fused)
         elif len(self._waiting) > MOST_WAITING:
-            self._movers(self._waiting[0])
+            self._waiting.popleft().movers = ()
         return partial(self._movers, frame)
 
     def _movers(self, frame: "_Frame") -> tuple[Mover, ...]:

@@ -6,9 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import PreprocessConfig, SensorConfig, TrackerConfig
-from dudmap.core.backends.descent import SHORT_STEP, Descent, DescentRules
+from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import NormalEquations, RegistrationParameters, SensorNoise, TruncationBand
+from dudmap.core.formulas.damping import SHORT_STEP
 from dudmap.core.formulas.residual import residual_weights
 from dudmap.core.frames.exposure import chained, exposed, fit_exposure
 from dudmap.core.frames.observation import Level
@@ -162,20 +163,25 @@ class Tracker:
             if limit == 0:
                 continue
             weights = np.ones_like(level.depth) if static_weights is None else static_weights[index]
-            lit = exposed(level, exposure)
-            system = self.linearize(volume, lit, T, weights, color_weight)
-            iterations += 1
+            lit, system = exposed(level, exposure), None
             if self.config.exposure and index == 0 and first_level == 0:
+                system = self.linearize(volume, lit, T, weights, color_weight)
                 change = fit_exposure(lit.intensity, system.residuals[1], weights)
+                iterations += 1
                 if abs(change[0] - 1) + abs(change[1]) > EXPOSURE_NOISE:
                     exposure = chained(exposure, change)
-                    lit = exposed(level, exposure)
-                    system = self.linearize(volume, lit, T, weights, color_weight)
-                    iterations += 1
+                    lit, system = exposed(level, exposure), None
             finest = first_level + index == len(self.config.iterations) - 1
+            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, COMPLETE), color_weight)
             if seen is None or not seen.is_complete:  # what the coarsest level shows, finer ones show too
-                seen = self._observability(volume, lit, T, weights, system, color_weight)
-            found = self._descend(volume, lit, T, weights, system, self._rules(limit, finest, seen), color_weight)
+                at_end = found.T_world_camera, weights, found.equations
+                seen = self._observability(volume, lit, *at_end, color_weight)
+                if not seen.is_complete:  # its steps went where noise led them
+                    iterations += found.iterations
+                    system = self.linearize(volume, lit, T, weights, color_weight)
+                    seen = self._observability(volume, lit, T, weights, system, color_weight)
+                    rules = self._rules(limit, finest, seen)
+                    found = self._descend(volume, lit, T, weights, system, rules, color_weight)
             T, system, settled = found.T_world_camera, found.equations, found.settled
             iterations += found.iterations
         if system is None:  # all levels are skipped: the initial pose is judged
@@ -222,11 +228,11 @@ class Tracker:
         level: Level,
         T_world_camera: NDArray[np.float64],
         weights: NDArray[np.float32],
-        system: NormalEquations,
+        system: NormalEquations | None,
         rules: DescentRules,
         color_weight: float | None,
     ) -> Descent:
-        """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds."""
+        """Levenberg-Marquardt steps on one level from a pose (4, 4) on, where ``system`` holds if it is known."""
         return volume.backend.register(
             volume.grid, level.depth, level.intensity, weights, level.camera.intrinsics, T_world_camera, system, rules,
             self.parameters(volume.band, color_weight),

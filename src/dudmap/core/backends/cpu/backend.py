@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import (
-    antialiasing,
     color_registration,
     filtering,
     integration,
@@ -18,7 +17,9 @@ from dudmap.core.backends.cpu import (
     sampling,
     visibility,
 )
-from dudmap.core.backends.descent import Descent, DescentRules, descend
+from dudmap.core.backends.cpu.registration import normal_equations
+from dudmap.core.backends.cpu.teams import run_team
+from dudmap.core.backends.descent import Descent, DescentRules
 from dudmap.core.backends.mirror import Mirror, on_host
 from dudmap.core.backends.parameters import (
     BLOCK,
@@ -34,7 +35,6 @@ from dudmap.core.backends.parameters import (
     SensorNoise,
     VoxelGrid,
     single,
-    to_lattice,
 )
 from dudmap.core.backends.threads import bands, run_bands
 
@@ -167,20 +167,6 @@ class CpuBackend:
             bands(depth.shape[0], PIXEL_ROWS),
         )
         return weights
-
-    def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
-    ) -> NDArray[np.uint8]:
-        """See ``Backend.footprint_colors``."""
-        rgb, (h, w) = np.ascontiguousarray(color), depth.shape
-        sums, out = np.empty((h + 1, w + 1), dtype=np.int64), np.empty_like(rgb)
-        antialiasing.sum_table(rgb, sums)
-        by_depth, tolerance = np.float32(focal * voxel_size), np.float32(antialiasing.SAME_SURFACE * voxel_size)
-        run_bands(
-            lambda start, stop: antialiasing.footprint_means(start, stop, depth, rgb, sums, by_depth, tolerance, out),
-            bands(h, PIXEL_ROWS),
-        )
-        return out
 
     def touched_cells(
         self,
@@ -326,13 +312,28 @@ class CpuBackend:
         weights: NDArray[np.float32],
         intrinsics: NDArray[np.float32],
         T_world_camera: NDArray[np.float64],
-        first: NormalEquations,
+        first: NormalEquations | None,
         rules: DescentRules,
         parameters: RegistrationParameters,
     ) -> Descent:
         """See ``Backend.register``."""
-        at = self._linearization(grid, depth, intensity, weights, intrinsics, parameters)
-        return descend(lambda T: at(to_lattice(T, grid.voxel_size, grid.origin)), T_world_camera, first, rules)
+        height, width = depth.shape
+        rows = -(-PIXELS_PER_BAND // width)
+        num_bands, limit = -(-height // rows), rules.limit
+        known = np.empty(registration.NUM_SUMS)
+        if first is not None:
+            known[registration.SYMMETRIC], known[21:27], known[registration.COST] = first.H, first.b, first.cost
+        residuals = np.empty((2, 2, height, width), dtype=np.float32)
+        T, sums, buffer, count, settled = run_team(
+            registration.descend, num_bands, rows, depth, intensity, weights, intrinsics, on_host(grid.window),
+            grid.shape, grid.origin, on_host(grid.geometry).reshape(-1), grid.voxel_size, grid.sdf_unit,
+            single(parameters), np.ascontiguousarray(T_world_camera), first is not None, known,
+            rules._replace(basis=np.ascontiguousarray(rules.basis)),
+            np.empty((limit + 1, 3, 4), dtype=np.float32), np.empty(limit + 1, dtype=np.int64), residuals,
+            np.empty((2, num_bands, registration.NUM_SUMS)),
+        )  # fmt: skip
+        equations = first if first is not None and buffer < 0 else normal_equations(sums, residuals[buffer])
+        return Descent(T, equations, count, settled)
 
     def _linearization(
         self,
@@ -359,7 +360,7 @@ class CpuBackend:
                 ),
                 ranges, list(sums),
             )  # fmt: skip
-            return registration.normal_equations(sums.sum(axis=0), residuals)
+            return normal_equations(sums.sum(axis=0), residuals)
 
         return at
 

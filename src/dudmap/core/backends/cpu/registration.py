@@ -1,4 +1,4 @@
-"""One linearisation of the direct SDF and intensity registration (thesis eq. 4.27-4.47).
+"""Direct SDF and intensity registration (thesis eq. 4.27-4.47): one linearisation, and the descent of a level.
 
 A row of pixels is worked through in three stages: vector arithmetic for addresses, loads of eight voxels into buffers,
 vector arithmetic for residuals and sums. No stage mixes loads with branches, so LLVM vectorises the first and the last
@@ -10,9 +10,11 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu.gathers import LANES
 from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
+from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
 from dudmap.core.backends.cpu.vectors import wide_vectors
-from dudmap.core.backends.parameters import ImageStack, NormalEquations
+from dudmap.core.backends.parameters import ImageStack, NormalEquations, to_lattice
 from dudmap.core.backends.threads import kernel
+from dudmap.core.formulas.damping import damped_step, judged, moved
 from dudmap.core.formulas.pixel import elements, rotate
 from dudmap.core.formulas.residual import normal_terms, trilinear, weigh
 from dudmap.core.formulas.voxel import intensity_of, sdf_steps
@@ -24,6 +26,11 @@ the map, weighted squared distances."""
 SYMMETRIC = np.zeros((6, 6), dtype=np.intp)
 """Index of each element of H among the sums, which hold its upper triangle row by row."""
 SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
+
+COST = 27
+"""Index of the cost among the sums."""
+
+_to_lattice = kernel(to_lattice)
 
 
 @kernel
@@ -45,7 +52,8 @@ def linearize_rows(
         geometry: (slots * 512,) int32 packed voxels.
         voxel_size, sdf_unit: Metres, and metres per step of the stored distance.
         parameters: RegistrationParameters.
-        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
+        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map, or without
+            a weight.
         sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
     wide_vectors()
@@ -59,7 +67,7 @@ def linearize_rows(
     px = np.empty(w, np.float32)
     py = np.empty(w, np.float32)
     pz = np.empty(w, np.float32)
-    inside = np.empty(w, np.float32)
+    wanted = np.zeros(padded, np.uint8)
 
     zero, one = np.float32(0), np.float32(1)
     by_unit = sdf_unit / voxel_size
@@ -79,12 +87,12 @@ def linearize_rows(
             rx, ry, rz = rotate(t, x, y, z)
             gx, gy, gz = rx + t[3], ry + t[7], rz + t[11]
             cells[u], voxels[u], crosses, within, fx[u], fy[u], fz[u] = locate(gx, gy, gz, last, size_y, size_z)
-            ok = within & (z > zero)
+            ok = within & (z > zero) & (weights[v, u] > zero)
             crossing[u] = crosses if ok else np.int32(0)
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
-            inside[u] = one if ok else zero
+            wanted[u] = ok
 
-        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
@@ -115,7 +123,7 @@ def linearize_rows(
             scale_c = by_255 * by_voxel
             kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
 
-            known = (low > 0) & (inside[u] > zero) & (darkest > zero)  # a corner in the air is not part of a surface
+            known = (low > 0) & (wanted[u] > 0) & (darkest > zero)  # a corner in the air is not part of a surface
             valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, weights[v, u], known, parameters)
             residuals[0, v, u] = r if known else np.float32(np.nan)
             residuals[1, v, u] = rc if valid else np.float32(np.nan)
@@ -188,9 +196,94 @@ def linearize_rows(
         sums[31] += chi
 
 
+@kernel
+def descend(
+    leads, team, rows, depth, intensity, weights, intrinsics, window, shape, origin, geometry, voxel_size, sdf_unit,
+    parameters, T_first, is_known, first, rules, poses, buffers, residuals, sums,
+):  # fmt: skip
+    """Levenberg-Marquardt steps of a level (the loop of ``descent.py``), for a team of threads (``teams.py``).
+
+    Args:
+        leads, team: As for ``run_team``; each step of the team is one linearisation.
+        rows: Image rows of a band.
+        depth, intensity, weights, intrinsics, window, shape, geometry, parameters: As for ``linearize_rows``.
+        origin: (3,) int64 coordinates of the window's first block.
+        voxel_size, sdf_unit: As for ``linearize_rows``, but float64.
+        T_first: (4, 4) pose, camera to world, at which the descent begins.
+        is_known: Whether ``first`` holds the sums at this pose; else they are calculated first.
+        first: (NUM_SUMS,) float64, changed here.
+        rules: DescentRules.
+        poses: (limit + 1, 3, 4) float32 out, pose of each linearisation in the window's lattice.
+        buffers: (limit + 1,) int64 out, which of two buffers each linearisation writes.
+        residuals: (2, 2, h, w) float32 out, two buffers of residuals.
+        sums: (2, bands, NUM_SUMS) float64 out, two buffers of sums.
+
+    Returns:
+        The last accepted pose (4, 4), its sums (NUM_SUMS,), the buffer of its residuals, -1 for those at the first
+        pose that were known, the number of linearisations, and whether a stop criterion was met.
+    """
+    num_bands, height = sums.shape[1], depth.shape[0]
+    unit, step_size = np.float32(voxel_size), np.float32(sdf_unit)
+    T, accepted, T_trial = T_first, first, T_first
+    kept, count, settled, damping, length = -1, 0, False, rules.damping, np.inf
+    while True:
+        if leads:
+            if count > 0 or is_known:
+                if count - (0 if is_known else 1) >= rules.limit:
+                    break
+                H, largest = np.empty((6, 6)), np.float64(0)
+                for i in range(6):
+                    for j in range(6):
+                        H[i, j] = accepted[SYMMETRIC[i, j]]
+                    largest = max(largest, H[i, i])
+                if not largest > 0:
+                    break
+                step = damped_step(H, accepted[21:27], rules.basis, damping)
+                T_trial, length = moved(T, step), np.sqrt(np.sum(step * step))
+                if length < rules.stop:  # too short to need another linearisation
+                    T, settled = T_trial, True
+                    break
+            poses[count] = _to_lattice(T_trial, voxel_size, origin)
+            buffers[count] = 1 if kept == 0 else 0
+            announce(team, count)
+            band, number = take(team, num_bands)
+        else:
+            band, number = wait_for_work(team, num_bands)
+            if band == NO_BAND:
+                break
+        while band != NO_BAND:
+            buffer = buffers[number]
+            out = sums[buffer, band]
+            out[:] = 0
+            linearize_rows(
+                band * rows, min(band * rows + rows, height), depth, intensity, weights, intrinsics, poses[number],
+                window, shape, geometry, unit, step_size, parameters, residuals[buffer], out,
+            )  # fmt: skip
+            done(team)
+            band, number = take(team, num_bands)
+        if leads:
+            wait_for_all(team, num_bands)
+            buffer = buffers[count]
+            total = np.zeros(NUM_SUMS)
+            for band in range(num_bands):
+                total += sums[buffer, band]
+            count += 1
+            if count == 1 and not is_known:
+                accepted, kept = total, buffer
+                continue
+            better, damping, settled = judged(accepted[COST], total[COST], length, damping, rules)
+            if better:
+                T, accepted, kept = T_trial, total, buffer
+            if settled:
+                break
+    if leads:
+        finish(team)
+    return T, accepted, kept, count, settled
+
+
 def normal_equations(sums: NDArray[np.float64], residuals: ImageStack) -> NormalEquations:
     """The normal equations of the sums (NUM_SUMS,) of all pixels."""
-    cost, num_inliers, readings, weight, chi_square = sums[27:].tolist()
+    cost, num_inliers, readings, weight, chi_square = sums[COST:].tolist()
     return NormalEquations(
         sums[SYMMETRIC], sums[21:27], cost, int(num_inliers), readings, weight, chi_square, residuals
     )

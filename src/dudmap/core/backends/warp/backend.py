@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu import raycasting
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.cpu.registration import NUM_SUMS, normal_equations
+from dudmap.core.backends.descent import Descent, DescentRules, descend
 from dudmap.core.backends.parameters import (
     BLOCK,
     DepthView,
@@ -30,6 +31,7 @@ from dudmap.core.backends.parameters import (
     RegistrationParameters,
     VoxelGrid,
     single,
+    to_lattice,
 )
 from dudmap.core.backends.warp import faults
 from dudmap.core.backends.warp.kernels import fusion, images, surface
@@ -128,6 +130,22 @@ class WarpBackend(CpuBackend):
             return FusedBlocks(slots, down(occupied))
 
     # -- read the map ------------------------------------------------------------------------------------------------
+
+    def register(
+        self,
+        grid: VoxelGrid,
+        depth: NDArray[np.float32],
+        intensity: NDArray[np.float32],
+        weights: NDArray[np.float32],
+        intrinsics: NDArray[np.float32],
+        T_world_camera: NDArray[np.float64],
+        first: NormalEquations | None,
+        rules: DescentRules,
+        parameters: RegistrationParameters,
+    ) -> Descent:
+        """See ``Backend.register``; 32 sums come down per step."""
+        at = self._linearization(grid, depth, intensity, weights, intrinsics, parameters)
+        return descend(lambda T: at(to_lattice(T, grid.voxel_size, grid.origin)), T_world_camera, first, rules)
 
     def _linearization(
         self,

@@ -1,0 +1,136 @@
+"""Threads that share the bands of consecutive steps inside one compiled call.
+
+One thread leads: it announces a step of some bands, works on them itself, and waits until all are done. The others
+take bands as long as there are any. A band is taken by adding 1 to a ticket that also holds the number of the step, so
+a thread that comes late finds nothing or the bands of a later step, and never holds up the others.
+"""
+
+import sys
+
+import numpy as np
+from numba import njit
+from numba.core import types
+from numba.extending import intrinsic
+
+from dudmap.core.backends.threads import also_in_other_threads, kernel, num_threads
+
+TICKET, DONE = 0, 8
+"""Places, on two cache lines, of the next ticket, step << 32 | band, and of the number of bands that are done."""
+FINISHED = -(1 << 62)
+"""Ticket after the last step."""
+NO_BAND = -1
+PATIENCE = 4096
+"""Times that a thread without work yields its core before it leaves, about a millisecond."""
+
+if sys.platform == "win32":
+    _yield_core = njit(lambda: None, cache=False)
+else:
+    _sched_yield = types.ExternalFunction("sched_yield", types.intc())
+
+    @kernel
+    def _yield_core():
+        _sched_yield()
+
+
+@intrinsic
+def _add(typing_context, array, index, value):
+    """Add to an element of an int64 array at once; its value before."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.atomic_rmw("add", builder.gep(data, [arguments[1]]), arguments[2], "seq_cst")
+
+    return types.int64(array, types.intp, types.int64), generate
+
+
+@intrinsic
+def _load(typing_context, array, index):
+    """An element of an int64 array that other threads write."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        return builder.load_atomic(builder.gep(data, [arguments[1]]), "seq_cst", 8)
+
+    return types.int64(array, types.intp), generate
+
+
+@intrinsic
+def _store(typing_context, array, index, value):
+    """Write an element of an int64 array that other threads read."""
+
+    def generate(context, builder, signature, arguments):
+        data = context.make_array(signature.args[0])(context, builder, arguments[0]).data
+        builder.store_atomic(arguments[2], builder.gep(data, [arguments[1]]), "seq_cst", 8)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, types.int64), generate
+
+
+@kernel
+def announce(team, step):
+    """Lead: offer the bands of the next step to all threads."""
+    _store(team, DONE, 0)
+    _store(team, TICKET, step << 32)
+
+
+@kernel
+def take(team, num_bands):
+    """The next band of the current step, or ``NO_BAND``, and the number of the step; ``FINISHED`` after the last."""
+    ticket = _load(team, TICKET)
+    if ticket < 0:
+        return NO_BAND, FINISHED
+    if ticket & 0xFFFFFFFF >= num_bands:
+        return NO_BAND, ticket >> 32
+    ticket = _add(team, TICKET, 1)
+    if ticket < 0:
+        return NO_BAND, FINISHED
+    band = ticket & 0xFFFFFFFF
+    return (band if band < num_bands else NO_BAND), ticket >> 32
+
+
+@kernel
+def done(team):
+    """A band is done."""
+    _add(team, DONE, 1)
+
+
+@kernel
+def wait_for_all(team, num_bands):
+    """Lead: wait until all bands of the step are done."""
+    while _load(team, DONE) < num_bands:
+        _yield_core()
+
+
+@kernel
+def wait_for_work(team, num_bands):
+    """Other threads: the next band, and the number of its step; ``NO_BAND`` where there is nothing more to do."""
+    for _ in range(PATIENCE):
+        band, step = take(team, num_bands)
+        if band != NO_BAND or step == FINISHED:
+            return band, step
+        _yield_core()
+    return NO_BAND, FINISHED
+
+
+@kernel
+def finish(team):
+    """Lead: there is no further step."""
+    _store(team, TICKET, FINISHED)
+
+
+def run_team(function, num_bands, *arguments):
+    """Result of a compiled ``function(leads, team, *arguments)``, which other threads run too while it does.
+
+    Args:
+        function: Kernel; ``leads`` is True in the thread that returns the result.
+        num_bands: Bands of each step; one band needs no other thread.
+        arguments: Of the function.
+    """
+    team = np.zeros(16, dtype=np.int64)
+    team[TICKET] = num_bands  # nothing to take before the first step
+    if num_bands > 1 and num_threads() > 1:
+        also_in_other_threads(lambda: function(False, team, *arguments), min(num_threads(), num_bands) - 1)
+    try:
+        return function(True, team, *arguments)
+    finally:
+        team[TICKET] = FINISHED

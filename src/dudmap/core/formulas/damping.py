@@ -1,0 +1,87 @@
+"""Levenberg-Marquardt steps of a rigid motion (Marquardt 1963): the step, the new pose, and whether it is accepted."""
+
+import numpy as np
+
+from dudmap.core.backends.threads import kernel
+from dudmap.core.geometry.se3 import rodrigues
+
+FLOOR = 1e-9
+"""Share of the largest diagonal element that is always added, so that a direction without information stays still."""
+FACTOR, LEAST = 5.0, 1e-6
+"""The damping grows and shrinks by this factor, down to the least one."""
+SHORT_STEP = 4.0
+"""A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
+on the finest level whatever it costs."""
+
+_rotation = kernel(rodrigues)
+
+
+@kernel
+def damped_step(H, b, basis, damping):
+    """Solution (6,) of ``(H + damping diag(H)) step = -b`` along the directions of a basis (6, m).
+
+    H is symmetric and positive semidefinite; directions in which nothing is known keep a step of 0.
+    """
+    n, m = basis.shape
+    largest = np.float64(0)
+    for i in range(n):
+        largest = max(largest, H[i, i])
+    A, y = np.zeros((m, m)), np.zeros(m)
+    for p in range(m):
+        for i in range(n):
+            y[p] -= basis[i, p] * b[i]
+            for q in range(m):
+                for j in range(n):
+                    added = damping * H[i, i] + FLOOR * largest if i == j else np.float64(0)
+                    A[p, q] += basis[i, p] * (H[i, j] + added) * basis[j, q]
+    for p in range(m):  # Cholesky factor in the lower triangle, and the forward substitution
+        for q in range(p + 1):
+            total = A[p, q]
+            for k in range(q):
+                total -= A[p, k] * A[q, k]
+            if q < p:
+                A[p, q] = total / A[q, q] if A[q, q] > 0 else np.float64(0)
+            else:
+                A[p, p] = np.sqrt(total) if total > 0 else np.float64(0)
+        for k in range(p):
+            y[p] -= A[p, k] * y[k]
+        y[p] = y[p] / A[p, p] if A[p, p] > 0 else np.float64(0)
+    for p in range(m - 1, -1, -1):
+        for k in range(p + 1, m):
+            y[p] -= A[k, p] * y[k]
+        y[p] = y[p] / A[p, p] if A[p, p] > 0 else np.float64(0)
+    step = np.zeros(n)
+    for i in range(n):
+        for p in range(m):
+            step[i] += basis[i, p] * y[p]
+    return step
+
+
+@kernel
+def moved(T_world_camera, step):
+    """Pose (4, 4) after a twist (v, omega) about the camera's centre, world axes."""
+    R = _rotation(step[3], step[4], step[5])
+    out = T_world_camera.copy()
+    for i in range(3):
+        for j in range(3):
+            out[i, j] = np.float64(0)
+            for k in range(3):
+                out[i, j] += R[3 * i + k] * T_world_camera[k, j]
+        out[i, 3] += step[i]
+    return out
+
+
+@kernel
+def judged(cost, trial, length, damping, rules):
+    """Whether a trial step is accepted, the next damping, and whether it is the last step.
+
+    Args:
+        cost, trial: Costs before and after the step.
+        length: Norm of the step, metres and radians.
+        damping: Of this step.
+        rules: DescentRules.
+    """
+    settled = length < SHORT_STEP * rules.stop and abs(trial - cost) < rules.stop_gain * cost
+    if trial < cost or length < rules.taken:
+        return True, max(damping / FACTOR, LEAST), settled
+    return False, damping * FACTOR, settled
