@@ -2,6 +2,9 @@
 
 Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
 comparison of vertices would weight a mesh by its triangle density.
+
+A mesh without faces (unless point clouds are accepted) or with NaN is a ``MapError``, a distance or a number of samples
+that is not positive a ``ConfigError``.
 """
 
 from collections.abc import Iterable
@@ -134,10 +137,6 @@ def compare_surfaces(
         ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
         samples: Number of points sampled on each surface.
         points: Accept point clouds, whose points serve as samples and which have no area.
-
-    Raises:
-        MapError: A mesh has no faces (without ``points``) or holds NaN.
-        ConfigError: A distance or the number of samples is not positive.
     """
     thresholds = tuple(thresholds)
     for name, value in (
@@ -177,12 +176,7 @@ def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
 
 
 def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
-    """The estimate with each vertex coloured by its distance to the reference, from blue at 0 to red at ``largest`` m.
-
-    Raises:
-        MapError: The reference has no faces (without ``points``) or holds NaN.
-        ConfigError: ``largest`` is not positive.
-    """
+    """The estimate, each vertex coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
     if not (np.isfinite(largest) and largest > 0):
         raise ConfigError(f"the distance at the end of the colour scale is {largest}; expected a positive number")
     distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)

@@ -1,4 +1,8 @@
-"""Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V)."""
+"""Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V).
+
+Trajectories that cannot be compared (no overlap in time, or fewer than three pairs) are a ``DatasetError``, arguments
+that are not acceptable a ``ConfigError``.
+"""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -136,9 +140,6 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
         estimate: Estimated poses.
         reference: True poses.
         max_difference: Largest difference of the timestamps of a pair, seconds.
-
-    Raises:
-        DatasetError: The trajectories do not overlap in time, or there are fewer than three pairs.
     """
     for name, trajectory in (("estimated", estimate), ("reference", reference)):
         if not len(trajectory):
@@ -174,10 +175,6 @@ def ate(
             rotations that align the orientations. ``origin``: A maps the first pose onto its partner, so that the
             error of a fixed camera is its drift from the start. ``none``: A is the identity.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, or fewer than three pairs.
-        ConfigError: ``align`` is not one of the three.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -213,10 +210,6 @@ def rpe(
         delta: The interval; a whole number for ``frames``.
         unit: ``s``, ``m`` or ``frames``.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, fewer than three pairs, or no two poses are ``delta`` apart.
-        ConfigError: ``delta`` or ``unit`` is not acceptable.
     """
     if unit not in get_args(Unit):
         raise ConfigError(f"the unit of delta is {unit!r}; expected one of {', '.join(get_args(Unit))}")
@@ -254,10 +247,6 @@ def trajectory_figures(
         reference: True poses, camera to world.
         align: Alignment of the ATE, see ``ate``.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, or fewer than three pairs.
-        ConfigError: ``align`` is not acceptable.
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)

@@ -43,13 +43,6 @@ class SensRecording(Recording):
     Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
     colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
     holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
-
-    Args:
-        path: The file.
-        camera: Intrinsics of the depth images that replace those of the file.
-
-    Raises:
-        DatasetError: The file is damaged, of another version, or compressed in a way that is not supported.
     """
 
     format = "ScanNet .sens"
@@ -131,13 +124,6 @@ class KlgRecording(Recording):
     Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
     the image size: the intrinsics must be given, and the size comes from them, else from the first JPEG image, else it
     is 640x480, which the logger always wrote.
-
-    Args:
-        path: The file.
-        camera: Intrinsics.
-
-    Raises:
-        DatasetError: No intrinsics are given, or the file is cut off or holds no frames.
     """
 
     format = "ElasticFusion .klg"
