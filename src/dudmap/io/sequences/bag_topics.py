@@ -88,7 +88,7 @@ def _best(
 ) -> "tuple[Connection, Connection]":
     """The pair of one camera, rather registered than not, rectified than raw, and raw data than compressed."""
 
-    def merit(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
+    def score(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair
         left, right = base(color.topic).split("/"), base(depth.topic).split("/")
         shared = next((k for k, (a, b) in enumerate(zip(left, right, strict=False)) if a != b), len(left))
@@ -103,10 +103,10 @@ def _best(
             base(color.topic) == color.topic,
         )
 
-    ranked = sorted(pairs, key=merit, reverse=True)
+    ranked = sorted(pairs, key=score, reverse=True)
     if not ranked:
         raise DatasetError(f"{bag} holds depth but no colour images beside them: {_listed(images)}")
-    if len(ranked) > 1 and merit(ranked[0]) == merit(ranked[1]):
+    if len(ranked) > 1 and score(ranked[0]) == score(ranked[1]):
         raise DatasetError(
             f"several topics of {bag} fit equally: {_listed(images)}; choose with --topics color=/...,depth=/..."
         )

@@ -27,7 +27,7 @@ FILES = (
 TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intrinsic.json", "intrinsic.json")
 """Files of one or two cameras; in the folder itself any JSON or YAML file that is named like one (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
-SHOWN = 10
+LARGEST_LIST = 10
 """Kinds of files that a message lists."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 NAMES = {
@@ -71,8 +71,8 @@ def unknown(folder: Path, why: str = "") -> DatasetError:
 def seen(folder: Path) -> str:
     """What lies in a folder: names with their numbers replaced by N, and how many there are of each."""
     kinds = Counter(re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
-    shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:SHOWN]]
-    return ", ".join(shown) + (" ..." if len(kinds) > SHOWN else "") if shown else "nothing"
+    shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:LARGEST_LIST]]
+    return ", ".join(shown) + (" ..." if len(kinds) > LARGEST_LIST else "") if shown else "nothing"
 
 
 def load(paths: Iterable[Path]) -> Intrinsics:
