@@ -14,7 +14,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def render(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: o.RunArgument,
     out: Annotated[Path, typer.Option(help="Video (.mp4, .avi), or folder for a recording in TUM layout.")],
     trajectory: Annotated[
         Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
