@@ -36,6 +36,8 @@ def render(
     from dudmap.app.views import rendering
     from dudmap.cli.progress import counted
     from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.io.exporting.gravity import up_of
+    from dudmap.io.exporting.options import ExportOptions
     from dudmap.io.exporting.run_content import RunContent
 
     if (trajectory is None) == (not orbit):
@@ -44,7 +46,7 @@ def render(
     if trajectory is not None:
         path = Trajectory.load(trajectory)
     else:
-        path = rendering.orbit(content, rendering.up_for_orbit(content, direction(up)), sweep, frames, fps)
+        path = rendering.orbit(content, up_of(content, ExportOptions(up=direction(up))), sweep, frames, fps)
     with counted("rendering", quiet=quiet or as_json) as progress:
         count = rendering.render_run(content, path, out, size=_size(size), fps=fps, progress=progress)
     answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)

@@ -198,7 +198,8 @@ class Job:
                 if state.record.dropped:
                     display.note(f"live: {state.record.dropped} of {self.options.max_frames} frames were dropped")
             except KeyboardInterrupt:
-                stopped = f"interrupted after {len(state.record.rows)} frames{_of_second(state.finished)}"
+                of_pass = " of the second pass" if state.finished else ""
+                stopped = f"interrupted after {len(state.record.rows)} frames{of_pass}"
                 raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
             except DudmapError as error:
                 stopped = str(error)
@@ -305,13 +306,8 @@ def _repeats(record: RunRecord) -> str:
     return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
-def _of_second(finished: object) -> str:
-    return " of the second pass" if finished else ""
-
-
 def _saved(finished: object) -> str:
-    whole = "the trajectory and the map of the first pass are"
-    return whole if finished else "the trajectory and the map up to there are"
+    return f"the trajectory and the map {'of the first pass' if finished else 'up to there'} are"
 
 
 def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":
