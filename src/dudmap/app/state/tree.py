@@ -321,7 +321,7 @@ class TreeReader:
 
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
         cls = schema.class_of(node["object"])
-        frozen = is_dataclass(cls) and cls.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+        frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009 - not in the stubs
         usable = type(current) is cls and id(current) not in self._taken and not frozen
         if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
             raise ValueError(f"{cls.__name__} is no class of plain objects")
