@@ -131,7 +131,7 @@ def floor_solids(floor: int, layout: int = 0) -> list[Primitive]:
             continue
         x, y = point + normal * (HALF - 0.32)
         if kind == 0:
-            out += [part.moved(pose((0, 0, z))) for part in plant(x, y, 0.22)]
+            out += [part.moved(pose((0, 0, z))) for part in plant((x, y), 0.22)]
         elif kind == 1:
             out.append(box((x, y, z + size[2]), (0.4, 0.4, 2 * size[2]), WOOD, turn))
         else:

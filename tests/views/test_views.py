@@ -223,7 +223,7 @@ def test_views_from_the_trajectory_are_the_static_scene(made, run, tmp_path):
 @pytest.mark.parametrize("ending", [".mp4", ".avi"])
 def test_videos_can_be_played(made, run, tmp_path, ending):
     path = tmp_path / f"orbit{ending}"
-    done = call("render", made[0] / "run", "--orbit", "--frames", 6, "--size", "96x64", "--out", path)
+    done = call("render", made[0] / "run", "--orbit", "--max-frames", 6, "--size", "96x64", "--out", path)
     assert done.exit_code == 0, done.output
     video = cv2.VideoCapture(str(path))
     images = [video.read()[1] for _ in range(6)]

@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, ColorOption, DepthOption, DepthUnitOption, FpsOption, TopicsOption
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.inspection import Inspection
@@ -20,14 +20,14 @@ SHOWN_GAPS = 5
 @app.command()
 def info(
     path: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="PATH")],
-    camera: CameraOption = None,
-    fps: FpsOption = None,
-    depth_unit: DepthUnitOption = None,
-    color: ColorOption = None,
-    depth: DepthOption = None,
-    topics: TopicsOption = None,
-    sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
-    as_json: JsonOption = False,
+    camera: o.CameraOption = None,
+    fps: o.FpsOption = None,
+    depth_unit: o.DepthUnitOption = None,
+    color: o.ColorOption = None,
+    depth: o.DepthOption = None,
+    topics: o.TopicsOption = None,
+    sheet: Annotated[Path | None, typer.Option(help="Write a contact sheet (PNG) of twelve frames.")] = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
 

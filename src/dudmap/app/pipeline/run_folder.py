@@ -144,11 +144,10 @@ def write_run_folder(
     (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
-    noise, calibration = slam.depth_noise.fitted(), slam.calibration
+    calibration = slam.calibration
     metrics |= record.metrics() | {
         "map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes, "mesh_vertices": 0, "mesh_triangles": 0,
         "maps": len(others) + 1, "calibration": calibration.tree(),
-        "depth_noise": {"base": round(noise.base, 6), "scale": round(noise.scale, 6)},
     }  # fmt: skip
 
     def save_mesh() -> None:

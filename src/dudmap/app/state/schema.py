@@ -54,7 +54,7 @@ core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabas
 core.places.prior_map:PriorMap core.places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews
 core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap core.result:FrameResult
 core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
-core.tracking.depth_noise:DepthNoise core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
+core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
 core.tracking.front_end:FrontEnd core.tracking.gradient_agreement:GradientAgreement
 core.tracking.image_consistency:ImageComparison,ImageConsistency core.tracking.motion_model:MotionModel
 core.tracking.observability:Observability,GradientNoise core.tracking.pose_prediction:PosePrediction,PosePredictor

@@ -1,30 +1,15 @@
-"""Walls, furniture and pictures of the built-in scenes."""
+"""Furniture and pictures of the built-in scenes."""
 
 import numpy as np
 
-from dudmap.lab.synthetic.scene import Material, Primitive, box, capsule, cylinder, ellipsoid, pose
+from dudmap.lab.synthetic.scene import Material, Primitive, Vector, box, capsule, cylinder, ellipsoid, pose
 
 WOOD = Material("wood", (0.9, 0.9))
 DARK_WOOD = Material("wood", (0.7, 0.7), tint=(0.6, 0.55, 0.5))
 METAL = Material("plain", tint=(0.55, 0.57, 0.6), variation=0.3)
 CARDBOARD = Material("cardboard", (1.6, 1.6))
-
-
-def shell(
-    x: tuple[float, float], y: tuple[float, float], top: float, walls: Material, floor: Material
-) -> list[Primitive]:
-    """Floor, ceiling and four walls, 0.2 m thick, around a box-shaped free space."""
-    (x0, x1), (y0, y1), d = x, y, 0.2
-    cx, cy, w, h = (x0 + x1) / 2, (y0 + y1) / 2, x1 - x0 + 2 * d, y1 - y0 + 2 * d
-    ceiling = Material("plaster", (0.4, 0.4), tint=(1.05, 1.05, 1.05))
-    return [
-        box((cx, cy, -d / 2), (w, h, d), floor),
-        box((cx, cy, top + d / 2), (w, h, d), ceiling),
-        box((x0 - d / 2, cy, top / 2), (d, h, top), walls),
-        box((x1 + d / 2, cy, top / 2), (d, h, top), walls),
-        box((cx, y0 - d / 2, top / 2), (w, d, top), walls),
-        box((cx, y1 + d / 2, top / 2), (w, d, top), walls),
-    ]
+MATERIALS = {"wood": WOOD, "dark wood": DARK_WOOD, "metal": METAL, "cardboard": CARDBOARD}
+"""Materials that every scene knows by name."""
 
 
 def table(center: tuple[float, float], size: tuple[float, float, float], material: Material) -> list[Primitive]:
@@ -54,7 +39,7 @@ def chair(center: tuple[float, float], yaw: float, material: Material) -> list[P
 
 
 def poster(
-    x: float, y: float, z: float, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
+    center: Vector, size: tuple[float, float], quarter: int, depth: float = 0.03, side: bool = False
 ) -> Primitive:
     """Picture on a wall (facing -y, or along x with ``side``), showing one quarter of the poster texture."""
     w, h = size
@@ -66,11 +51,11 @@ def poster(
         faces=False,
     )
     extent = (depth, w, h) if side else (w, depth, h)
-    return box((x, y, z), extent, material)
+    return box(center, extent, material)
 
 
-def shelf(x: float, y: float, width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
-    """Bookshelf standing at (x, y), open towards -y before the rotation by ``yaw`` degrees."""
+def shelf(center: tuple[float, float], width: float, rows: int, yaw: float = 0.0) -> list[Primitive]:
+    """Bookshelf standing at ``center``, open towards -y before the rotation by ``yaw`` degrees."""
     height, depth = 0.42 * rows, 0.3
     parts = [
         box((-width / 2 + 0.01, 0, height / 2), (0.02, depth, height), WOOD),
@@ -83,11 +68,12 @@ def shelf(x: float, y: float, width: float, rows: int, yaw: float = 0.0) -> list
         books = Material("books", (1.0, 0.25 / 0.36), (0.13 * row, 0.25 * row), variation=0.05)
         length = width * (0.62 if row % 2 else 0.86)
         parts.append(box((-width / 2 + 0.03 + length / 2, 0.02, 0.02 + 0.42 * row + 0.16), (length, 0.2, 0.32), books))
-    return [p.moved(pose((x, y, 0), yaw)) for p in parts]
+    return [p.moved(pose((*center, 0), yaw)) for p in parts]
 
 
-def plant(x: float, y: float, spread: float = 0.35) -> list[Primitive]:
+def plant(center: tuple[float, float], spread: float = 0.35) -> list[Primitive]:
     """Pot with seven stalks and leaves."""
+    x, y = center
     leaf = Material("grass", (2, 2))
     parts = [cylinder((x, y, 0), (x, y, 0.35), 0.17, Material("brick", (1.5, 1.5)))]
     for a in np.arange(7) * 0.9:

@@ -139,7 +139,7 @@ def _surfaces(first: float, last: float, far: float, rng: np.random.Generator) -
 
 
 def _picture(x: float, y: float, rng: np.random.Generator) -> Primitive:
-    return poster(x, y, rng.uniform(1.3, 1.7), (rng.uniform(0.5, 1.0), rng.uniform(0.4, 0.8)), int(rng.integers(4)))
+    return poster((x, y, rng.uniform(1.3, 1.7)), (rng.uniform(0.5, 1.0), rng.uniform(0.4, 0.8)), int(rng.integers(4)))
 
 
 def _furniture(door: float, wall: float, far: float, rng: np.random.Generator) -> list[Primitive]:
@@ -147,8 +147,8 @@ def _furniture(door: float, wall: float, far: float, rng: np.random.Generator) -
     x, y = door + rng.uniform(-0.6, 0.6), (wall + far) / 2
     inside: list[list[Primitive]] = [
         [*table((x, y), (1.2, 0.7, 0.74), WOOD), box((x, y, 0.85), (0.3, 0.25, 0.2), CARDBOARD, rng.uniform(0, 90))],
-        shelf(x, far + 0.2, 1.2, 5, 180),
-        [*plant(x, y), box((x + 0.7, y, 0.4), (0.5, 0.5, 0.8), CARDBOARD, rng.uniform(0, 90))],
+        shelf((x, far + 0.2), 1.2, 5, 180),
+        [*plant((x, y)), box((x + 0.7, y, 0.4), (0.5, 0.5, 0.8), CARDBOARD, rng.uniform(0, 90))],
     ]
     beside = door + DOOR / 2 + rng.uniform(0.3, 0.8)
     outside: list[Primitive] = [
