@@ -78,7 +78,7 @@ def run_live(
                 observer.start(slam, out, None)
             with closing(_arriving_frames(camera, recorder, slam, metrics.catch_up)) as frames:
                 for source in frames:
-                    process_source(source, slam, metrics, display, out if save_masks else None, None, observers)
+                    process_source(source, slam, metrics, display, out if save_masks else None, observers)
                     if max_frames is not None and len(metrics.rows) >= max_frames:
                         break
         except KeyboardInterrupt:

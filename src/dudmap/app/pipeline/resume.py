@@ -63,7 +63,7 @@ def resume(
             if stored.number is not None:
                 display = RunProgress(options.max_frames * options.passes, bar=progress)
                 masks = open_masks(options.masks, sequence)
-                job = Job(sequence, out, options, display, masks, observers=observers)
+                job = Job(sequence, out, options, display, masks, observers)
                 try:
                     store = RunStore(out, storing.every, display.note)
                     state = job.restored(reader, store)

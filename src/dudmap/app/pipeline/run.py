@@ -1,13 +1,13 @@
 """Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
-from collections.abc import Callable, Generator, Iterable, Iterator
+from collections.abc import Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dudmap.app.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, load_kernels, read_frame
+from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, in_order, load_kernels, read_frame
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.replay import in_real_time
@@ -22,7 +22,6 @@ if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.places.saved_map import SavedMap
-    from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
     from dudmap.io.sequences import Sequence
     from dudmap.io.sequences.masks import MaskFolder
@@ -47,7 +46,6 @@ def run(
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
     max_memory: int | None = None,
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
     storing: Storing | None = None,
     warnings: Iterable[str] = (),
@@ -89,7 +87,6 @@ def run(
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
             wait on disk. None keeps the whole map in memory. It changes no result.
-        observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
         storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
         warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
@@ -130,7 +127,7 @@ def run(
     )  # fmt: skip
     with locked(out):
         display = RunProgress(count * passes, bar=progress)
-        job = Job(sequence, out, options, display, open_masks(masks, sequence), observe, observers)
+        job = Job(sequence, out, options, display, open_masks(masks, sequence), observers)
         model = None if depth_model is None else DepthModel.load(Path(depth_model))
         prepare_run_folder(out, masks, save_masks=save_masks)
         store = None
@@ -157,7 +154,6 @@ class Job:
     options: RunOptions
     display: RunProgress
     masks: "MaskFolder | None" = None
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None
     observers: "tuple[RunObserver, ...]" = ()
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
@@ -226,19 +222,15 @@ class Job:
                 state.slam = self._next_system(state, first_pass=state.slam)
                 state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
                 state.number, state.next = number, 0
-            last = number == options.passes - 1
             for observer in self.observers:
                 if state.next:
                     observer.resume(state.slam, self.out, options.max_frames, state.next)
                 else:
                     observer.start(state.slam, self.out, options.max_frames)
-            mask_folder = self.out if options.save_masks and last else None
+            mask_folder = self.out if options.save_masks and number == options.passes - 1 else None
             with closing(self._frames(state)) as frames:
                 for frame in frames:
-                    process_source(
-                        frame, state.slam, state.record, self.display, mask_folder, self.observe if last else None,
-                        self.observers,
-                    )  # fmt: skip
+                    process_source(frame, state.slam, state.record, self.display, mask_folder, self.observers)
                     state.next = frame.number + 1
                     if store is not None:
                         store.frame(state, frame.read.frame)
@@ -327,7 +319,6 @@ def process_source(
     record: RunRecord,
     display: RunProgress,
     mask_folder: Path | None,
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None",
     observers: "tuple[RunObserver, ...]" = (),
 ) -> None:
     """Process one frame, count it, save its mask, and report it."""
@@ -340,11 +331,10 @@ def process_source(
         for observer in observers:
             observer.event("unreadable", frame=index, reason=str(read.frame))
         return
-    true_mask = read.true_mask
+    true_mask, given_mask = read.true_mask, read.given_mask
     if isinstance(true_mask, FrameError):
         display.note(f"frame {index}: the true mask is not scored, {true_mask}")
         true_mask = None
-    given_mask = read.given_mask
     if isinstance(given_mask, FrameError):
         display.note(f"frame {index}: the given mask is ignored, {given_mask}")
         given_mask = None
@@ -366,8 +356,6 @@ def process_source(
             save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
         except OSError as error:
             display.once(f"masks cannot be written: {error}; make room on the disk of the run folder")
-    if observe is not None:
-        observe(index, read, result)
     for observer in observers:
         try:
             observer.frame(index, read, result, 1000 * (end - start))
