@@ -55,7 +55,7 @@ def resume(
         with closing(reader):
             options, storing = stored.options, stored.options.storing
             with damaged(StateError, reader.path):
-                if storing is None:
+                if storing is None or options.max_frames is None:
                     raise ValueError("it does not say of which recording it is")
                 sequence = open_sequence(**storing.recording) if sequence is None else sequence
                 options = options.model_copy(update={"config": on_device(options.config, device)})

@@ -1,7 +1,7 @@
 """Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
-from collections.abc import Generator, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,7 +15,8 @@ from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
 from dudmap.app.state.database import StateReader
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.io.cameras import LiveCamera
 from dudmap.io.sequences import is_timed
 
 if TYPE_CHECKING:
@@ -147,14 +148,15 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run as it was ordered; for the attributes see ``run``."""
+    """A run as it was ordered; for the attributes see ``run``. The frames of a camera are what ``arriving`` gives."""
 
-    sequence: "Sequence"
+    sequence: "Sequence | LiveCamera"
     out: Path
     options: RunOptions
     display: RunProgress
     masks: "MaskFolder | None" = None
     observers: "tuple[RunObserver, ...]" = ()
+    arriving: "Callable[[Job, RunState], Generator[SourceFrame]] | None" = None
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
         """A new system for this recording."""
@@ -174,9 +176,6 @@ class Job:
         out, display, stopped, defect = self.out, self.display, "", False
         with ExitStack() as files, display:
             try:
-                if self.options.live:
-                    display.working("loading kernels")
-                    load_kernels(self._next_system(state), self.sequence, self.options.max_frames)
                 try:
                     self._process(state, store)
                 except DeviceError as error:
@@ -191,12 +190,15 @@ class Job:
                     display.note(_repeats(state.record))
                 if degenerate := state.record.counts["degenerate"]:
                     display.note(f"{degenerate} frames do not show all directions of motion: not fused")
-                if state.record.dropped:
-                    display.note(f"live: {state.record.dropped} of {self.options.max_frames} frames were dropped")
+                if dropped := state.record.dropped:
+                    total = dropped + len(state.record.rows) + len(state.record.unreadable)
+                    display.note(f"live: {dropped} of {total} frames were dropped")
             except KeyboardInterrupt:
-                of_pass = " of the second pass" if state.finished else ""
-                stopped = f"interrupted after {len(state.record.rows)} frames{of_pass}"
-                raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+                count, of_pass = len(state.record.rows), " of the second pass" if state.finished else ""
+                if self.arriving is None:
+                    stopped = f"interrupted after {count} frames{of_pass}"
+                    raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+                display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
             except DudmapError as error:
                 stopped = str(error)
                 raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
@@ -205,9 +207,11 @@ class Job:
                 raise
             finally:
                 report = self._finish(state, store, stopped, defect=defect)
-        record, count = state.record, self.options.max_frames
+        record, count = state.record, self.options.max_frames or len(state.record.rows)
         if record.rows and not len(report.trajectory):
             raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
+        if not record.rows and self.arriving is not None:
+            raise CameraError(f"no frame of the camera {self.sequence.name} was processed")
         if not record.rows:
             raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
         return report
@@ -234,13 +238,21 @@ class Job:
                     state.next = frame.number + 1
                     if store is not None:
                         store.frame(state, frame.read.frame)
+                    if len(state.record.rows) == options.max_frames:
+                        break
         if store is not None:
             store.end(state)
 
     def _frames(self, state: RunState) -> Generator[SourceFrame]:
         """The frames of a pass that are left."""
+        if self.arriving is not None:
+            return self.arriving(self, state)
         count, sequence, slam = self.options.max_frames, self.sequence, state.slam
+        assert count is not None
+        assert not isinstance(sequence, LiveCamera)
         if self.options.live:
+            self.display.working("loading kernels")
+            load_kernels(self._next_system(state), sequence, count)
             times, idle = sequence.timestamps[:count], state.record.catch_up
             return in_real_time(times, lambda index: read_frame(sequence, index, self.masks, slam), idle)
         return in_order(sequence, count, self.options.ahead, self.masks, slam, state.next)

@@ -56,7 +56,7 @@ class RunOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     config: Config
-    max_frames: int
+    max_frames: int | None
     save_masks: bool = False
     save_map: bool = True
     masks: Path | None = None
