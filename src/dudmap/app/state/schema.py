@@ -79,7 +79,7 @@ NOT_STORED = {
 follows from other attributes, and what is of one process or device alone."""
 BACKENDS = frozenset({"CpuBackend", "WarpBackend"})
 """Classes of back ends, which hold nothing that is part of the state: a new one may be of another device."""
-EVALUATED = {"FrameView": ("segmentation",)}
+EVALUATED = {"FrameView": ("segmentation",), "KeyframeDatabase": ("_unsettled",)}
 """Attributes that are functions without arguments, of which the result is stored."""
 CONSTANT = frozenset({"PlacedFeatures", "Preprocessor"})
 """Classes whose arrays never change once they are made: they need not be copied for a snapshot."""

@@ -171,6 +171,7 @@ class Atlas:
     def as_saved_map(self) -> SavedMap:
         """The main map and its keyframes; how well frames fit it is left to the caller."""
         self.complete()
+        self.keyframes.settle()
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 
