@@ -194,14 +194,14 @@ class Job:
                     total = dropped + len(state.record.rows) + len(state.record.unreadable)
                     display.note(f"live: {dropped} of {total} frames were dropped")
             except KeyboardInterrupt:
-                count, of_pass = len(state.record.rows), " of the second pass" if state.finished else ""
+                count, of_pass = len(state.record.rows), " of the second pass" if state.first_slam else ""
                 if self.arriving is None:
                     stopped = f"interrupted after {count} frames{of_pass}"
-                    raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+                    raise KeyboardInterrupt(f"{stopped}; {_saved(state.first_slam)} in {out}") from None
                 display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
             except DudmapError as error:
                 stopped = str(error)
-                raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
+                raise type(error)(f"{stopped}; {_saved(state.first_slam)} in {out}") from error
             except BaseException as error:
                 stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
                 raise
@@ -221,7 +221,7 @@ class Job:
         options = self.options
         for number in range(state.number, options.passes):
             if number > state.number:
-                state.finished = state.slam, state.record
+                state.first_slam, state.first_record = state.slam, state.record
                 masked = state.record.masked and 0
                 state.slam = self._next_system(state, first_pass=state.slam)
                 state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
@@ -275,8 +275,8 @@ class Job:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
         self.display.working("writing")
         slam, record = state.slam, state.record
-        if stopped and state.finished is not None:  # the first pass is complete, the second is not
-            slam, record = state.finished
+        if stopped and state.first_slam is not None:  # the first pass is complete, the second is not
+            slam, record = state.first_slam, state.first_record or record
         complete = False
         try:
             config, save_map = self.options.config, self.options.save_map
@@ -310,8 +310,8 @@ def _repeats(record: RunRecord) -> str:
     return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
-def _saved(finished: object) -> str:
-    return f"the trajectory and the map {'of the first pass' if finished else 'up to there'} are"
+def _saved(first_pass: object) -> str:
+    return f"the trajectory and the map {'of the first pass' if first_pass else 'up to there'} are"
 
 
 def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":

@@ -366,6 +366,7 @@ def _defaults(cls: type) -> dict[str, Any]:
         "BlockPager": {"_store": None, "_executor": None},
         "FrameStore": {"registered": None, "_file": FrameFile(), "_encoder": None, "_pending": deque()},
         "LoopCloser": {"_executor": None},
+        "RunRecord": {"_since": (0.0, 0.0)},
         "Observation": {"_halvings": [], "_recorded_halvings": []},
     }  # fmt: skip
     return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
