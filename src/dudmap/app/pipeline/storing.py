@@ -143,25 +143,25 @@ class RunStore:
 
     def begin(self, state: RunState) -> None:
         """Store the state before the first frame."""
-        self._take(state, {"pass": 0, "next": 0, "frame": ""}, wait=True)
+        self._take(state, "", wait=True)
 
     def frame(self, state: RunState, frame: "Frame | Exception") -> None:
         """A frame was processed; take a checkpoint if one is due."""
         if not isinstance(frame, Exception):
             self.checkpoints.add_file(self._out / "masks" / f"{frame.timestamp:.6f}.png")
         if self.checkpoints.is_due:
-            updated = datetime.now().isoformat(" ", "seconds")
-            place = {"pass": state.number, "next": state.next, "frame": images_fingerprint(frame), "updated": updated}
-            self._take(state, place)
+            self._take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:
         """All frames are processed, and the results will be written: store the last state unless the run was short."""
         if not self.checkpoints.is_short:
-            self._take(state, {"pass": state.number, "next": state.next, "frame": ""}, wait=True)
+            self._take(state, "", wait=True)
 
-    def _take(self, state: RunState, place: dict[str, Any], *, wait: bool = False) -> None:
+    def _take(self, state: RunState, frame: str, *, wait: bool = False) -> None:
         for record in filter(None, (state.record, state.first_record)):
             record.settle()
+        updated = datetime.now().isoformat(" ", "seconds")
+        place = {"pass": state.number, "next": state.next, "frame": frame, "updated": updated}
         self.checkpoints.take(state, place, wait=wait)
 
     def reopened(self) -> "RunStore":
