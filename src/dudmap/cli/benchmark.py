@@ -195,6 +195,26 @@ def first_second(
 
 
 @app.command()
+def calls(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording; default: a synthetic room with a person.")
+    ] = None,
+    max_frames: Annotated[int, typer.Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.calls import count_calls, summary
+    from dudmap.lab.benchmark.entries import Entry
+
+    room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
+    source = room.open() if recording is None else open_sequence(recording)
+    tree = summary(count_calls(source, o.read_config(None, None, assignments), max_frames))
+    answer(tree, ", ".join(f"{value:.0f} {name}" for name, value in tree.items()), as_json=as_json)
+
+
+@app.command()
 def faults(
     recording: Annotated[
         Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room with people.")

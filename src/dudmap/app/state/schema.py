@@ -23,11 +23,12 @@ core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,Rea
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
-core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:_State,_PairSystems,_System,Adjustment
+core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.collector:KeyframeCollector core.calibration.depth_estimator:DepthView
 core.calibration.depth_model:DepthModel core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
-core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair core.calibration.self_calibration:SelfCalibration
-core.color_calibration:ColorCalibration core.dynamics.background_model:BackgroundModel
+core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
+core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
+core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
 core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
