@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 CLASSES = """
-app.pipeline.metrics:RunRecord
+app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
@@ -71,6 +71,7 @@ NOT_STORED = {
     "FrameStore": ("registered", "_places", "_glimpses", "_file", "_encoder", "_pending", "archived"),
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
+    "RunRecord": ("_since",),
     "Observation": ("_halvings", "_recorded_halvings"),
     "SimilarityTest": ("_sift",),
     "Slam": ("device",),
@@ -192,11 +193,6 @@ def check_value(cls: type, name: str, value: object, like: object) -> None:
     if not (is_alike(value, like) if hint is Any else fits(value, hint)):
         expected = type(like).__name__ if hint is Any else getattr(hint, "__name__", hint)
         raise ValueError(f"found {type(value).__name__}; expected {expected}")
-
-
-def fits_fields(value: object) -> bool:
-    """Whether the attributes of a dataclass are what their annotations say."""
-    return all(fits(getattr(value, name), hint) for name, hint in _hints(type(value)).items())
 
 
 def is_alike(value: object, like: object) -> bool:
