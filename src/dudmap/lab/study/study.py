@@ -168,7 +168,8 @@ def write_report(
             report.heading(name)
             report.text(f"{error}.")
         if name == plan.responses[0]:
-            analysis.describe_confirmation(report, confirmation)
+            report.heading("Confirmation")
+            report.text(str(confirmation))
             if each is not None:
                 report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
                 report.table(each)
