@@ -105,7 +105,7 @@ def test_a_quadratic_response_is_found_believed_and_confirmed():
     factors = factors_of()
     table = runs_of(factors, DesignOptions("central-composite"), bowl, repeats=2, noise=2e-4)
     found = predict_optimum(table, factors, "ate")
-    assert found.judgement.reasons == ()
+    assert found.reasons == ()
     np.testing.assert_allclose(found.best.coded, [0.3, -0.5, 0], atol=0.1)
     assert lack_of_fit(found.surface).p > 0.05
     truth = bowl(*found.best.coded)

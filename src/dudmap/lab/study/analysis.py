@@ -37,14 +37,14 @@ class Prediction:
         best: Its optimum.
         point: Values of all factors at the optimum; those without numbers have their best level.
         best_point: Values of all factors at the best point of the design.
-        judgement: What speaks against the optimum before it is confirmed.
+        reasons: What speaks against the optimum before it is confirmed, each a sentence.
     """
 
     surface: "Surface"
     best: "Optimum"
     point: Point
     best_point: Point
-    judgement: "judgement.Judgement"
+    reasons: tuple[str, ...]
 
 
 def usable(table: Table, name: str, log: bool = False) -> Table:
@@ -211,11 +211,11 @@ def describe_surface(report: Report, predicted: Prediction, heading: str) -> Non
         else f"There is no single stationary point; eigenvalues {eigenvalues}."
     )
     report.text(f"Optimum within the bounds: {best.predicted:.4g} at {values_text(best.values)}.")
-    if predicted.judgement.credible:
+    if not predicted.reasons:
         report.text("Nothing in the runs speaks against it; a confirmation is still needed.")
     else:
         report.text("It must not be believed:")
-        report.items(predicted.judgement.reasons)
+        report.items(predicted.reasons)
 
 
 def values_text(values: Point | dict[str, float]) -> str:
