@@ -15,7 +15,7 @@ COMPILE := $(BIN)/uv pip compile --quiet --universal --python-version 3.11 --for
 # tests of one file share fixtures, so they stay in one process; the longest file takes a sixteenth of the time
 PYTEST := $(BIN)/pytest --numprocesses auto --maxprocesses 4 --dist loadfile
 
-.PHONY: demo test test-all ready check docs package processors soak fuzz fuzz-guided audit licences lock clean
+.PHONY: demo test test-all ready check docs package processors soak fuzz fuzz-guided audit lock clean
 
 demo: .venv/installed
 	$(BIN)/dudmap demo
@@ -76,9 +76,6 @@ fuzz-guided: .venv/developed
 audit: $(BIN)/python
 	$(PIP) install --quiet pip-audit
 	$(BIN)/pip-audit --requirement requirements/run.txt --require-hashes --disable-pip
-
-licences: .venv/installed
-	$(BIN)/dudmap doctor --licences
 
 lock: $(BIN)/python
 	$(PIP) install --quiet --upgrade uv

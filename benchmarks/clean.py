@@ -178,7 +178,8 @@ def score(name, sequence, twin, work: Path, passes: int, pictures: Path | None):
         if index not in poses:
             continue
         used = seen_elsewhere(index, sequence, twin, poses, views)
-        frame, moving, _, background = cleaner.clean(index)
+        background = cleaner.clean(index)
+        frame, moving = background.frame, background.moving
         truth = twin[index]
         missed = used & ~moving
         color = np.where(missed[..., None], frame.color, background.color)

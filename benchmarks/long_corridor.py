@@ -14,7 +14,7 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from dudmap.app.pipeline.environment import machine, peak_rss_mb
-from dudmap.cli.run import memory_size
+from dudmap.cli.options import memory_size
 from dudmap.config import Config
 from dudmap.core.map.memory_limit import MemoryLimit, resident_bytes
 from dudmap.core.slam import Slam

@@ -39,7 +39,7 @@ def main() -> None:
         pairs = []
         for index in cleaner.indices[::EVERY]:
             cleaned = cleaner.clean(index)
-            pairs.append(side_by_side(cleaned.frame.color, cleaned.background.color))
+            pairs.append(side_by_side(cleaned.frame.color, cleaned.color))
     first, *others = [Image.fromarray(pair) for pair in pairs]
     first.save(target, save_all=True, append_images=others, duration=EVERY * 1000 // 30, loop=0, quality=40, method=6)
     print(f"{target}: {len(pairs)} images, {target.stat().st_size / 1e6:.2f} MB")

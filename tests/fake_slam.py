@@ -6,7 +6,6 @@ from typing import ClassVar
 
 import numpy as np
 
-from dudmap.core.backends.parameters import SensorNoise
 from dudmap.core.geometry.calibration import Calibration
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
@@ -89,7 +88,6 @@ class FakeSlam:
         self.calibration = calibration or Calibration.registered(camera)
         self.volume, self.poses, self.frames, self.first_pass = FakeVolume(), [], [], first_pass
         self.device = "cpu"
-        self.depth_noise = SimpleNamespace(fitted=lambda: SensorNoise(0.001, 0.002))
 
     @property
     def trajectory(self):

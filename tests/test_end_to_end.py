@@ -25,7 +25,7 @@ EXCERPT = Path(__file__).parent / "fixtures" / "freiburg1_xyz"
 def demo(tmp_path_factory):
     """Run folder and metrics of the demo, cut after the person has crossed half of the room."""
     out = tmp_path_factory.mktemp("demo")
-    command = [sys.executable, "-m", "dudmap", "demo", "--frames", "80", "--out", str(out), "--json"]
+    command = [sys.executable, "-m", "dudmap", "demo", "--max-frames", "80", "--out", str(out), "--json"]
     result = subprocess.run(command, capture_output=True, text=True, check=False)  # peak memory of a process of its own
     assert result.returncode == 0, result.stderr
     return out, json.loads(result.stdout)

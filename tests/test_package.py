@@ -78,7 +78,7 @@ def test_the_wheel_works(unpacked):
     )
     assert Path(where.strip()).is_relative_to(unpacked)
     assert program(unpacked, "-m", "dudmap", "--version") == f"dudmap {dudmap.__version__}\n"
-    assert "--frames" in program(unpacked, "-m", "dudmap", "demo", "--help")
+    assert "--max-frames" in program(unpacked, "-m", "dudmap", "demo", "--help")
     assert "voxel_size" in program(unpacked, "-m", "dudmap", "config")
 
 

@@ -32,8 +32,7 @@ ATE_RMSE_M = {
     "pan_confusao": 0.0032,
     "ist_confusao": 0.0039,
 }
-"""ATE RMSE of the default configuration, metres: docs/benchmarks.md, section Recordings; fr1_rpy_static is not listed
-there and was measured when this test was written."""
+"""ATE RMSE of the default configuration, metres: docs/benchmarks.md, section Development recordings."""
 CUTS = [((0, 49), (67, 107)), ((0, 81), (153, 190))]
 """Frames of fr1_xyz_static, in pieces joined without a gap: the camera jumps by 11 and 16 cm."""
 CUT_ATE_M = 0.025

@@ -14,7 +14,7 @@ from dudmap.cli import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 DOCS = ROOT / "docs"
-SHOWN = ["first-mesh.md", "own-camera.md", "extending.md"]
+SHOWN = ["first-mesh.md", "live.md", "extending.md"]
 
 
 def blocks():
@@ -59,7 +59,7 @@ def test_every_command_with_its_options_is_on_the_site(site):
 
 
 def test_every_public_name_is_on_the_site(site):
-    page = text(site, "api")
+    page = text(site, "python")
     for name in dudmap.__all__:
         assert name == "__version__" or re.search(rf"\.{name}\b", page), name
 

@@ -12,6 +12,7 @@ from dudmap.core.result import FrameResult
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, DatasetError, MapError
 from dudmap.io.exporting import ros_messages as ros
+from dudmap.io.sequences.bag_images import color_of, depth_of
 
 
 def default_parameters() -> dict[str, Any]:
@@ -99,7 +100,7 @@ class Session:
         if stamp <= self._last:
             self.stale += 1
             return None
-        frame = Frame(stamp, ros.depth_of(depth), ros.color_of(color))
+        frame = Frame(stamp, depth_of(depth, 1000.0, "the depth image"), color_of(color, "the colour image"))
         if frame.depth.shape != frame.color.shape[:2]:
             sizes = [f"{image.shape[1]}x{image.shape[0]}" for image in (frame.depth, frame.color)]
             raise DatasetError(

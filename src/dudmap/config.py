@@ -127,8 +127,6 @@ class VolumeConfig(ConfigSection):
     max_readings: int = Field(default=48, ge=1, le=255)
     """Largest weight to which a reading can raise a voxel, in multiples of its own weight, so that the influence of
     readings of low weight fades once there are better ones."""
-    antialias: bool = False
-    """Average the colours of the pixels that a voxel covers, instead of taking that of the pixel at its centre."""
     weighting: Literal["constant", "angle"] = "angle"
     """Weight of an observation: 1 (constant) or cos(theta) / err(z) (angle; thesis eq. 4.20)."""
     min_weight: int = Field(default=3, ge=1, le=255)

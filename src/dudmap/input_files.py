@@ -146,11 +146,7 @@ TOO_DEEP = f"it is nested too deeply, by more than {DEEPEST} levels"
 
 
 def _shallow(tree: Any) -> Any:  # noqa: ANN401 - any JSON value
-    """The tree, if what goes through it by recursion is safe.
-
-    Raises:
-        ValueError: It is not.
-    """
+    """The tree, if what goes through it by recursion is safe."""
     level = [tree]
     for _ in range(DEEPEST):
         parts = (one.values() if isinstance(one, dict) else one for one in level)

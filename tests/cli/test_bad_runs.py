@@ -14,8 +14,8 @@ from exported_runs import make_run
 from run_folders import write_run
 
 READING = {
-    "export": ["export", "RUN", "--to", "out.ply"],
-    "render": ["render", "RUN", "--orbit", "--frames", "2", "--out", "out.avi"],
+    "export": ["export", "RUN", "--out", "out.ply"],
+    "render": ["render", "RUN", "--orbit", "--max-frames", "2", "--out", "out.avi"],
     "clean": ["clean", "recording", "out", "--run", "RUN"],
     "report": ["report", "RUN"],
     "view": ["view", "RUN"],
@@ -84,13 +84,13 @@ def test_a_mesh_without_triangles(where):
     points = np.zeros((3, 3), np.float32)
     Mesh(points, np.empty((0, 3), np.int32), points.astype(np.uint8), points).save(where / "whole" / "mesh.ply")
     for target in ("out.ply", "out.glb", "out.pcd", "out.npz"):
-        assert "has no triangles, so there is nothing to export" in sentence(["export", "whole", "--to", target])
+        assert "has no triangles, so there is nothing to export" in sentence(["export", "whole", "--out", target])
     done = CliRunner().invoke(app, ["report", "whole"])
     assert done.exit_code == 0, done.output  # the report shows the rest
     assert '"mesh": null' in (where / "whole" / "report.html").read_text(encoding="utf-8")
 
 
 def test_an_unknown_ending_lists_the_known_ones(where):
-    line = sentence(["export", "whole", "--to", "map.blend"])
+    line = sentence(["export", "whole", "--out", "map.blend"])
     assert all(name in line for name in EXPORTERS)
     assert "the ending must be one of .mp4, .avi" in sentence(["render", "whole", "--orbit", "--out", "map.mov"])

@@ -64,14 +64,14 @@ def test_every_reporting_command_has_json():
 
 CALLS = {
     "run": ["run", "recording", "--out", "a"],
-    "demo": ["demo", "--frames", 2, "--out", "b"],
+    "demo": ["demo", "--max-frames", 2, "--out", "b"],
     "live": ["live", "--camera", "replay:recording", "--out", "c"],
     "report": ["report", "seen"],
-    "export": ["export", "run", "--to", "map.glb"],
-    "render": ["render", "run", "--orbit", "--frames", 2, "--size", "32x24", "--out", "orbit.avi"],
+    "export": ["export", "run", "--out", "map.glb"],
+    "render": ["render", "run", "--orbit", "--max-frames", 2, "--size", "32x24", "--out", "orbit.avi"],
     "clean": ["clean", "recording", "cleaned", "--run", "run"],
     "info": ["info", "recording"],
-    "synth": ["synth", "made", "--scene", "plane", "--frames", 1, "--size", "32x24"],
+    "synth": ["synth", "made", "--scene", "plane", "--max-frames", 1, "--size", "32x24"],
     "evaluate trajectory": ["evaluate", "run", "--reference", "recording"],
     "evaluate mesh": ["evaluate", "mesh", "run/mesh.ply", "run/mesh.ply", "--samples", 100, "--no-error-mesh"],
     "evaluate masks": ["evaluate", "masks", "run", "recording"],
@@ -143,6 +143,7 @@ FAKED = {
         ["benchmark", "speed", "--out", "speed"],
         {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
+    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
         {
@@ -230,7 +231,7 @@ def test_wrong_usage_of_every_command_is_exit_code_2(words):
 
 MISSING = {
     "run": ["run", "nowhere"], "view": ["view", "nowhere"], "report": ["report", "nowhere"],
-    "merge": ["merge", "nowhere", "there"], "export": ["export", "nowhere", "--to", "a.ply"],
+    "merge": ["merge", "nowhere", "there"], "export": ["export", "nowhere", "--out", "a.ply"],
     "render": ["render", "nowhere", "--orbit", "--out", "a.mp4"], "clean": ["clean", "nowhere", "out"],
     "live": ["live", "--camera", "none"], "info": ["info", "nowhere"], "calibrate": ["calibrate", "nowhere"],
     "demo": ["demo", "--set", "no.such=1"], "synth": ["synth", "out", "--scene", "moon"],
@@ -341,3 +342,20 @@ def test_completion_can_be_installed():
     environment = os.environ | {"_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION": "1"}  # there may be no shell above
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, env=environment, check=False)
     assert "complete -o default" in done.stdout, done.stderr
+
+
+# -- help --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("words", ALL)
+def test_help_fits_80_columns_uncut(words):
+    done = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, [*words.split(), "--help"])
+    assert done.exit_code == 0
+    assert "…" not in done.output
+
+
+def test_help_of_run_is_grouped():
+    text = CliRunner(env={"COLUMNS": "80", "TERMINAL_WIDTH": "80"}).invoke(app, ["run", "--help"]).output
+    groups = re.findall(r"^╭─ (.*?) ─", text, flags=re.MULTILINE)
+    assert groups[2:] == ["Input", "Output", "Map", "Calibration", "Live and viewing", "Advanced"]
+    assert groups[:2] == ["Arguments", "Options"]  # the latter holds --help alone

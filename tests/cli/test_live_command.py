@@ -48,7 +48,9 @@ def test_ctrl_c_writes_the_results_of_a_real_run(tmp_path):
     """The whole program on a synthetic room: interrupted when the first frames are through."""
     dudmap = [sys.executable, "-c", "from dudmap.cli import main; main()"]
     room = tmp_path / "room"
-    subprocess.run([*dudmap, "synth", room, "--frames", "150", "--size", "160x120"], check=True, capture_output=True)
+    subprocess.run(
+        [*dudmap, "synth", room, "--max-frames", "150", "--size", "160x120"], check=True, capture_output=True
+    )
     out, file = tmp_path / "out", tmp_path / "walk.mcap"
     run = subprocess.Popen(
         [*dudmap, "live", "--camera", f"replay:{room}", "--out", out, "--record", file],

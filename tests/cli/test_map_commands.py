@@ -68,7 +68,7 @@ def test_maps_that_cannot_be_used(slam, recording, tmp_path):
     assert "is one of the runs to be merged" in sentence("merge", "empty", "desk", "--out", "empty")
     assert "is named twice" in sentence("merge", "empty", "desk", "empty", "--out", "world")
     assert "holds no map.npz and no keyframes.npz" in sentence("merge", "empty", "desk", "--world", "--out", "world")
-    message = sentence("export", "empty", "--to", "run.txt")
+    message = sentence("export", "empty", "--out", "run.txt")
     assert "must be one of" in message
     assert ".mcap" in message
     assert not (tmp_path / "runs").exists()

@@ -397,11 +397,11 @@ def test_incomplete_and_newer_run_folders(tmp_path):
 
 def test_command(run, tmp_path):
     done = CliRunner().invoke(
-        app, ["export", str(run), "--to", str(tmp_path / "a.glb"), "--drop-pieces-below", "0.1", "--up", "0,-1,0"]
+        app, ["export", str(run), "--out", str(tmp_path / "a.glb"), "--drop-pieces-below", "0.1", "--up", "0,-1,0"]
     )
     assert done.exit_code == 0, done.output
     assert (tmp_path / "a.glb").is_file()
-    done = CliRunner().invoke(app, ["export", str(run), "--to", str(tmp_path / "a.glb"), "--crop", "1,2"])
+    done = CliRunner().invoke(app, ["export", str(run), "--out", str(tmp_path / "a.glb"), "--crop", "1,2"])
     assert done.exit_code == 1
     assert "expected 6 numbers separated by commas" in done.stderr
 

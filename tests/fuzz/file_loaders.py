@@ -59,9 +59,9 @@ def camera_files(folder):
 
 
 def load_camera_file(path):
-    from dudmap.io.sequences import camera_json
+    from dudmap.io.sequences import camera_files
 
-    camera_json.load([path]).camera(64, 48)
+    camera_files.load([path]).camera(64, 48)
 
 
 def load_intrinsics(path):

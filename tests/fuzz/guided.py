@@ -37,7 +37,7 @@ with atheris.instrument_imports(include=["dudmap", "rosbags"]):
     import dudmap.evaluation.files
     import dudmap.io.exporting.run_content
     import dudmap.io.sequences
-    import dudmap.io.sequences.camera_json
+    import dudmap.io.sequences.camera_files
     import dudmap.io.sequences.masks
 
     dudmap.io.sequences.readers()

@@ -13,7 +13,7 @@ from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.app.pipeline.storing import Storing
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.system import differences, take_snapshot
+from dudmap.app.state.system import take_snapshot
 from dudmap.cli import app
 from dudmap.config import Config
 from dudmap.core.backends.cpu.backend import CpuBackend
@@ -22,6 +22,7 @@ from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic.folder import write_folder
 from small_maps import CAMERA, voxels
+from state_differences import differences
 
 SAVED_AFTER, FRAMES = 4, 7
 KIND = {"cpu": CpuBackend, "warp-cpu": WarpBackend}

@@ -70,7 +70,7 @@ def test_integrate_equals_the_running_average_of_the_thesis():
 
 
 def test_integrate_with_angle_weights_and_a_band_that_grows_with_the_noise():
-    config = VolumeConfig(voxel_size=0.05, truncation_noise=3.0, truncation_voxels=2, carve_rate=1, antialias=False)
+    config = VolumeConfig(voxel_size=0.05, truncation_noise=3.0, truncation_voxels=2, carve_rate=1)
     sensor = SensorConfig(sigma_base=0.001, sigma_scale=0.06)
     volume = TsdfVolume(CAMERA, config, sensor, depth_max=4.0)
     frames, Ts = [wall(distance, seed, bump=0.08) for seed, distance in enumerate((0.8, 0.85, 0.8))], poses(3)
@@ -117,7 +117,7 @@ def test_weights_are_the_cosine_over_the_error(tilt_deg):
 
 def test_far_blocks_that_take_turns_hold_what_they_would_without():
     """Two walls: in front of the nearer one the noise is finer than the voxels, in front of the other it is not."""
-    config = VolumeConfig(voxel_size=0.05, weighting="constant", carving=False, antialias=False)
+    config = VolumeConfig(voxel_size=0.05, weighting="constant", carving=False)
     sensor = SensorConfig(sigma_base=0.001, sigma_scale=0.03)  # three sigma are four voxels at 1.47 m
     frame, volumes = wall(1.2), []
     frame.depth[:, 32:] += 1.3

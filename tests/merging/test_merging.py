@@ -7,6 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from dudmap.app.viewing.report import write_report
+from dudmap.app.viewing.run_files import RunFiles
+from dudmap.app.viewing.stored_view import frames_of
 from dudmap.config import Config, VolumeConfig
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -213,13 +216,18 @@ def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path
     a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", other, [0.0, 1.0, 2.0])
     report = merge_runs(a, b, tmp_path / "ab")
     assert sorted(path.name for path in report.out.iterdir()) == [
-        "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "trajectory-2.txt", "trajectory.txt",
+        "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "metrics.json", "trajectory-2.txt",
+        "trajectory.txt",
     ]  # fmt: skip
     tree = json.loads((report.out / "merge.json").read_text())
     assert tree == report.tree
     np.testing.assert_allclose(
         Trajectory.load(report.out / "trajectory-2.txt").Ts_world_camera[1], report.pair.T_a_b, atol=1e-6
     )
+    shown = RunFiles.load(report.out)
+    assert [frame.timestamp for frame in frames_of(shown)] == [0.0, 1.0]
+    assert len(shown.mesh.faces) == tree["mesh_triangles"]
+    assert "5 of 5 frames were tracked" in write_report(report.out, tmp_path / "report.html").read_text()
     merged = SavedMap.load(report.out)
     assert len(merged.keyframes) == len(room.saved.keyframes) + len(other.saved.keyframes)
     again = merge_runs(report.out, run_folder(tmp_path / "c", third, [5.0]), tmp_path / "abc")

@@ -61,7 +61,7 @@ def test_a_wall_before_a_camera_that_rests_or_moves_is_no_fault():
 
 
 def test_the_command_repeats_the_table():
-    done = CliRunner().invoke(app, ["benchmark", "wrong-input", "--width", "80", "--frames", "6", "--json"])
+    done = CliRunner().invoke(app, ["benchmark", "wrong-input", "--width", "80", "--max-frames", "6", "--json"])
     assert done.exit_code == 0, done.output
     runs = json.loads(done.stdout)["runs"]
     assert {run["name"] for run in runs} == set(SPOILT)

@@ -8,7 +8,8 @@ import time
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.replay import Arrival, WaitingRoom, live, replay
+from dudmap.app.pipeline.frame_source import SourceFrame
+from dudmap.app.pipeline.replay import WaitingRoom, in_real_time, replay
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import DatasetError
@@ -40,8 +41,8 @@ def replayed(timestamps, reading_s):
         return f"frame {index}"
 
     replay(np.asarray(timestamps), read, offered.append, clock.wait, clock.now)
-    assert all(arrival.item == f"frame {arrival.number}" for arrival in offered)
-    return [arrival.number for arrival in offered], [arrival.time - 50 for arrival in offered]
+    assert all(arrival.read == f"frame {arrival.number}" for arrival in offered)
+    return [arrival.number for arrival in offered], [arrival.arrival - 50 for arrival in offered]
 
 
 def test_frames_arrive_when_their_times_tell():
@@ -69,9 +70,9 @@ def test_a_replay_ends_when_told():
 def test_only_frames_of_the_last_moment_wait():
     room = WaitingRoom()
     for number, arrived in enumerate([0.0, 0.2, 0.26, 0.29, 0.32]):
-        room.put(Arrival(number, "", arrived))
+        room.put(SourceFrame(number, "", arrival=arrived))
     assert room.take().number == 2, "that at 0.2 is too old"
-    room.put(Arrival(5, "", 9.0))
+    room.put(SourceFrame(5, "", arrival=9.0))
     room.close()
     assert room.take().number == 5
     assert room.take() is None
@@ -80,16 +81,16 @@ def test_only_frames_of_the_last_moment_wait():
 
 def test_a_consumer_waits_for_the_next():
     room, taken = WaitingRoom(), []
-    thread = threading.Thread(target=lambda: taken.append(room.take().item))
+    thread = threading.Thread(target=lambda: taken.append(room.take().read))
     thread.start()
-    room.put(Arrival(0, "late", 0.0))
+    room.put(SourceFrame(0, "late"))
     thread.join(timeout=5)
     assert taken == ["late"]
 
 
 def test_a_frame_that_takes_twice_as_long_drops_none():
     numbers = []
-    for arrival in live(0.05 * np.arange(8), str):
+    for arrival in in_real_time(0.05 * np.arange(8), str):
         numbers.append(arrival.number)
         time.sleep(0.1 if arrival.number == 3 else 0)
     assert numbers == list(range(8))
@@ -97,7 +98,7 @@ def test_a_frame_that_takes_twice_as_long_drops_none():
 
 def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
     arrivals = []
-    for arrival in live(0.01 * np.arange(30), str):
+    for arrival in in_real_time(0.01 * np.arange(30), str):
         arrivals.append(arrival)
         if arrival.number < 20:
             time.sleep(0.035)
@@ -106,7 +107,7 @@ def test_a_slow_consumer_skips_frames_and_gets_the_last_one():
     assert indices[-1] == 29
     assert all(np.diff(indices) >= 1)
     assert len(indices) < 25
-    assert isinstance(arrivals[0], Arrival)
+    assert isinstance(arrivals[0], SourceFrame)
 
 
 def test_other_work_is_done_while_no_frame_waits():
@@ -117,7 +118,7 @@ def test_other_work_is_done_while_no_frame_waits():
         return bool(left and left.pop())
 
     arrived = []
-    for arrival in live(np.array([0.0, 0.2, 0.26, 0.3]), str, idle):
+    for arrival in in_real_time(np.array([0.0, 0.2, 0.26, 0.3]), str, idle):
         arrived.append(arrival.number)
         time.sleep(0.2 if arrival.number == 1 else 0)  # then frames 2 and 3 wait
     assert arrived == [0, 1, 2, 3]
@@ -127,8 +128,8 @@ def test_other_work_is_done_while_no_frame_waits():
 
 def test_stopping_early_stops_the_sensor():
     before = threading.active_count()
-    frames = live(np.array([0.0, 60.0]), str)
-    assert next(frames).item == "0"
+    frames = in_real_time(np.array([0.0, 60.0]), str)
+    assert next(frames).read == "0"
     frames.close()
     assert threading.active_count() == before
 
@@ -138,7 +139,7 @@ def test_an_error_of_the_reader_reaches_the_consumer():
         raise DatasetError("the disk is gone")
 
     with pytest.raises(DatasetError, match="the disk is gone"):
-        list(live(np.arange(3.0), read))
+        list(in_real_time(np.arange(3.0), read))
 
 
 @pytest.fixture

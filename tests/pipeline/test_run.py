@@ -45,7 +45,6 @@ def test_the_run_folder(slam, recording, tmp_path):
     expected = {
         "sequence": "desk", "complete": True, "frames": 8, "tracked": 7, "fused": 6, "skipped_similar": 1, "lost": 1,
         "unreadable": 0, "map_blocks": 3, "map_bytes": 12345, "mesh_vertices": 3, "mesh_triangles": 1,
-        "depth_noise": {"base": 0.001, "scale": 0.002},
         "lost_frames": [{"timestamp": 100.2, "reason": "too few inliers"}],
     }  # fmt: skip
     assert {key: metrics[key] for key in expected} == expected

@@ -6,15 +6,13 @@ from contextlib import closing
 import numpy as np
 import pytest
 
-from dudmap.app.state.block_keys import MAP_SHIFT, MAX_MAPS, block_coords, block_keys
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.system import differences, restore, take_snapshot
+from dudmap.app.state.system import restore, take_snapshot
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.voxel_blocks import COORDINATE_BITS, MAX_COORDINATE
 from dudmap.errors import DudmapError, StateError
+from state_differences import differences
 
 TINY = Camera(fx=65.6, fy=65.6, cx=39.5, cy=31.5, width=80, height=64)
 
@@ -64,30 +62,12 @@ def assert_same(tmp_path, a, b):
     assert differences(*snapshots) == []
 
 
-def test_morton_codes_interleave_the_bits_of_the_coordinates():
-    coords = np.random.default_rng(0).integers(-MAX_COORDINATE, MAX_COORDINATE, (500, 3)).astype(np.int32)
-    for code, block in zip(morton.encode(coords, COORDINATE_BITS).tolist(), coords.tolist(), strict=True):
-        bits = [f"{value + MAX_COORDINATE:018b}" for value in block]
-        assert code == int("".join(x + y + z for x, y, z in zip(*bits, strict=True)), 2)
-    for number in (0, 1, MAX_MAPS - 1):
-        keys = block_keys(number, coords)
-        np.testing.assert_array_equal(block_coords(keys), coords)
-        np.testing.assert_array_equal(keys >> MAP_SHIFT, number)
-
-
-def test_blocks_beyond_the_keys_are_refused():
-    for far in (MAX_COORDINATE, -MAX_COORDINATE - 1):
-        with pytest.raises(StateError, match="from where the map began"):
-            block_keys(0, np.array([[0, far, 0]], np.int32))
-
-
 def test_only_changed_blocks_and_parts_of_arrays_are_written(tmp_path):
     grown = Grown(tmp_path / "state.db")
     for _ in range(4):
         grown.grow()
     grown.store()
-    rows = {row[0]: row[3] for row in grown.database._execute("SELECT * FROM blocks")}
-    assert len(rows) == grown.volume.num_blocks
+    assert grown.database._execute("SELECT count(*) FROM blocks").fetchone()[0] == grown.volume.num_blocks
     chunks = len(grown.database._chunks)
     frame = grown.volume.num_integrated
     grown.grow()
@@ -111,8 +91,10 @@ def test_a_block_that_is_gone_leaves_the_database(tmp_path):
     for _ in range(30):  # the wall has moved away: its blocks are carved and released
         grown.volume.integrate(wall(3.0), np.eye(4))
     grown.store()
-    keys = {row[0] for row in grown.database._execute("SELECT key FROM blocks")}
-    assert keys == set(block_keys(0, grown.volume.blocks.slot_coords[grown.volume.active_slots]).tolist())
+    places = set(grown.database._execute("SELECT slot, x, y, z FROM blocks"))
+    slots = grown.volume.active_slots
+    rows = np.column_stack([slots, grown.volume.blocks.slot_coords[slots]]).tolist()
+    assert places == set(map(tuple, rows))
     assert len(grown.volume.blocks._released) > 0
     assert before
     assert_same(tmp_path, grown.state, read(tmp_path / "state.db")[0])
@@ -135,11 +117,6 @@ def test_others_read_while_it_is_written(tmp_path):
     old = restore(reader, {"volume": TsdfVolume(TINY)})  # of one checkpoint, although another was written in between
     assert old["volume"].num_integrated == 1
     assert read(tmp_path / "state.db")[0]["volume"].num_integrated == 2
-    keys, _, voxels = StateReader(tmp_path / "state.db").blocks(0)
-    middle = [int(key) & ((1 << MAP_SHIFT) - 1) for key in keys[10:20]]
-    part, _, some = StateReader(tmp_path / "state.db").blocks(0, middle[0], middle[-1])
-    np.testing.assert_array_equal(part, keys[10:20])
-    np.testing.assert_array_equal(some, voxels[10:20])
 
 
 class Failing:
@@ -216,7 +193,7 @@ def test_a_damaged_database_is_refused_in_one_sentence_or_read_as_it_was(tmp_pat
     assert not any("\n" in sentence for sentence in sentences)
 
 
-@pytest.mark.parametrize("column", ["meta.value", "chunks.content", "state.tree", "blocks.slot", "blocks.voxels"])
+@pytest.mark.parametrize("column", ["meta.value", "chunks.content", "state.tree", "blocks.x", "blocks.voxels"])
 @pytest.mark.parametrize("value", [None, "text"])
 def test_a_value_of_another_type_is_damage(tmp_path, column, value):
     grown = Grown(tmp_path / "state.db")
@@ -245,7 +222,7 @@ def test_what_is_no_state_is_named(tmp_path):
         StateReader(tmp_path / "other.db")
     database = StateDatabase(tmp_path / "new.db")
     database._execute("PRAGMA user_version = 99")
-    with pytest.raises(StateError, match="version 99 of the format; this version reads 2"):
+    with pytest.raises(StateError, match="version 99 of the format; this version reads 3"):
         StateReader(tmp_path / "new.db")
     StateDatabase(tmp_path / "empty.db")
     with pytest.raises(StateError, match="holds no checkpoint yet"):

@@ -5,12 +5,13 @@ import pytest
 
 from dudmap import resume_system, save_system
 from dudmap.app.state.database import StateDatabase, StateReader
-from dudmap.app.state.system import differences, take_snapshot
+from dudmap.app.state.system import take_snapshot
 from dudmap.config import Config
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.places import frame_thinning
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
+from state_differences import differences
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 SETTINGS = ["loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0.5", "similarity.max_translation=1e-9"]

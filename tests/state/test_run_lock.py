@@ -12,7 +12,7 @@ import pytest
 
 from dudmap.app.pipeline.resume import resume
 from dudmap.app.pipeline.run import run
-from dudmap.app.pipeline.storing import Storing
+from dudmap.app.pipeline.storing import RunOptions, Storing
 from dudmap.app.state.database import StateDatabase
 from dudmap.app.state.identity import code_fingerprint, recording_fingerprint
 from dudmap.app.state.run_lock import NAME, RunLock
@@ -99,9 +99,8 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
     assert not (out / "state.db").exists()
     with pytest.raises(StateError, match=r"is finished \(4 frames\); there is nothing to resume"):
         resume(out)
-    options = {"recording": {"path": str(recording)}, "report": False, "every": None, "count": 4, "masks": None,
-               "save_masks": False, "save_map": True, "ahead": 2, "passes": 1, "config": Config().model_dump_json(),
-               "max_memory": None, "localize": False}  # fmt: skip
+    ordered = RunOptions(config=Config(), max_frames=4, ahead=2, storing=Storing({"path": str(recording)}))
+    options = ordered.model_dump(mode="json")
     about = {"options": options, "recording": recording_fingerprint(sequence),
              "code": "of yesterday", "versions": {"dudmap": "0.0"}, "pass": 0, "next": 0, "frame": ""}  # fmt: skip
     database = StateDatabase(out / "state.db")
@@ -111,7 +110,7 @@ def test_why_a_folder_cannot_be_continued(slam, tmp_path):
     database.write_meta({"code": code_fingerprint(), "recording": "of another room"})
     with pytest.raises(StateError, match="the recording desk is not as it was when the run"):
         resume(out)
-    database.write_meta({"recording": recording_fingerprint(sequence), "options": options | {"count": "4"}})
+    database.write_meta({"recording": recording_fingerprint(sequence), "options": options | {"max_frames": "four"}})
     with pytest.raises(StateError, match="is damaged or not the state of a run"):
         resume(out)
     database.write_meta({"options": options, "next": 3, "frame": "of another frame"})

@@ -8,7 +8,7 @@ import pytest
 from delayed_color import DELAY, FAULTS, find_early
 from dudmap import resume_system, save_system
 from dudmap.app.state.database import StateDatabase
-from dudmap.app.state.system import differences, take_snapshot
+from dudmap.app.state.system import take_snapshot
 from dudmap.config import Config
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
@@ -16,6 +16,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.places.pose_graph import Edge
 from dudmap.core.slam import Slam
 from dudmap.lab import synthetic
+from state_differences import differences
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 

@@ -326,7 +326,7 @@ def test_command_line_of_sensors(tmp_path):
 
     from dudmap.cli.synth import app
 
-    arguments = [str(tmp_path / "out"), "--scene", "box", "--size", "64x48", "--frames", "2", "--quiet"]
+    arguments = [str(tmp_path / "out"), "--scene", "box", "--size", "64x48", "--max-frames", "2", "--quiet"]
     chosen = ["--sensor", "kinect_v2", "--fault", "color_delay=0.03", "--fault", "multipath=0"]
     result = CliRunner().invoke(app, [*arguments, *chosen])
     assert result.exit_code == 0, result.output

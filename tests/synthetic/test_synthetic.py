@@ -374,7 +374,17 @@ def test_command_line(tmp_path):
 
     from dudmap.cli.synth import app
 
-    arguments = [str(tmp_path / "out"), "--scene", "box", "--size", "64x48", "--frames", "2", "--movers", "ball,person"]
+    arguments = [
+        str(tmp_path / "out"),
+        "--scene",
+        "box",
+        "--size",
+        "64x48",
+        "--max-frames",
+        "2",
+        "--movers",
+        "ball,person",
+    ]
     result = CliRunner().invoke(app, [*arguments, "--quiet"])
     assert result.exit_code == 0, result.output
     assert len(open_sequence(tmp_path / "out")) == 2

@@ -1,6 +1,5 @@
 """The viewers show what the run gives, never hold it up for long, and say in one sentence why they cannot start."""
 
-import io
 import socket
 import sys
 import threading
@@ -8,10 +7,8 @@ import types
 
 import numpy as np
 import pytest
-import trimesh
 from typer.testing import CliRunner
 
-from dudmap.app.viewing.glb import glb
 from dudmap.app.viewing.live_view import LiveView
 from dudmap.app.viewing.mesh_feed import MeshFeed
 from dudmap.app.viewing.picking import first_hit
@@ -121,18 +118,6 @@ def test_a_new_map_replaces_the_old_one():
     changes = feed.changes(second.volume, now=True)
     assert changes.reset
     assert any(mesh is not None for mesh in changes.chunks.values())
-
-
-def test_a_glb_is_read_back_by_another_program():
-    mesh = wall()
-    scene = trimesh.load(io.BytesIO(glb(mesh)), file_type="glb", process=False)
-    (loaded,) = scene.geometry.values()
-    np.testing.assert_array_equal(loaded.vertices, mesh.vertices)
-    np.testing.assert_array_equal(loaded.faces, mesh.faces)
-    # colours are stored linear; 220 of 255 in sRGB is 0.716 of the intensity
-    linear = np.asarray(loaded.visual.vertex_attributes["color"] if "color" in loaded.visual.vertex_attributes else
-                        loaded.visual.vertex_colors, dtype=float)  # fmt: skip
-    assert linear[:, 0].max() / (65535 if linear.max() > 255 else 255) == pytest.approx(0.716, abs=0.01)
 
 
 def test_the_point_under_the_pointer():

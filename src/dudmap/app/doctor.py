@@ -7,10 +7,10 @@ import shutil
 import sys
 import tempfile
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
-from importlib.metadata import PackageNotFoundError, metadata, requires, version
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, requires, version
 from pathlib import Path
-from typing import Any, Literal
+from typing import Literal
 
 from dudmap import __version__
 
@@ -41,10 +41,6 @@ class Check:
     found: str
     mend: str = ""
 
-    def tree(self) -> dict[str, Any]:
-        """Dictionary of text."""
-        return asdict(self)
-
 
 def checks() -> Iterator[Check]:
     """All checks, quick ones only: nothing is compiled, and nothing outside of this machine is asked."""
@@ -68,15 +64,14 @@ def _python() -> Check:
 
 def _packages() -> Iterator[Check]:
     for name, lowest, extra in requirements():
+        found = installed(name)
         if extra:
             continue
-        found = installed(name)
         if found is None:
             yield Check(name, "bad", "not installed", f"pip install '{name}>={lowest}'")
         elif numbers(found) < numbers(lowest):
-            yield Check(
-                name, "bad", f"{found}; {lowest} or newer is needed", f"pip install --upgrade '{name}>={lowest}'"
-            )
+            mend = f"pip install --upgrade '{name}>={lowest}'"
+            yield Check(name, "bad", f"{found}; {lowest} or newer is needed", mend)
         else:
             yield Check(name, "good", found)
 
@@ -169,14 +164,11 @@ def _extras() -> Iterator[Check]:
 
 
 def _port() -> Check:
-    import socket
+    from dudmap.app.viewing.page_access import port_problem
 
-    with socket.socket() as probe:
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind(("127.0.0.1", PORT))
-        except OSError as error:
-            return Check("viewer port", "note", f"{PORT}: {error.strerror}", "name another one with --port")
+    problem = port_problem("127.0.0.1", PORT)
+    if problem:
+        return Check("viewer port", "note", f"{PORT}: {problem}", "name another one with --port")
     return Check("viewer port", "good", f"{PORT} is free on this machine")
 
 
@@ -193,14 +185,14 @@ def not_writable(folder: Path) -> str:
 
 
 def requirements() -> list[tuple[str, str, str]]:
-    """Name, lowest version and extra (empty: required) of the packages that dudmap says it uses."""
-    found = []
+    """Name, lowest version and extra (empty: required) of the packages that dudmap says it uses on this system."""
+    found: dict[tuple[str, str], str] = {}
     for line in requires("dudmap") or []:
         name = re.match(r"[A-Za-z0-9._-]+", line)
         lowest, extra = re.search(r">=\s*([\d.]+)", line), re.search(r"extra == ['\"]([\w-]+)['\"]", line)
-        if name is not None:
-            found.append((name[0], lowest[1] if lowest else "0", extra[1] if extra else ""))
-    return found
+        if name is not None and ("sys_platform" not in line or f"'{sys.platform}'" in line):
+            found[name[0], extra[1] if extra else ""] = lowest[1] if lowest else "0"
+    return [(name, lowest, extra) for (name, extra), lowest in found.items()]
 
 
 def installed(name: str) -> str | None:
@@ -215,39 +207,3 @@ def numbers(text: str) -> tuple[int, ...]:
     """Leading numbers of a version, for comparison."""
     release = re.match(r"\d+(?:\.\d+)*", text)
     return tuple(int(part) for part in release[0].split(".")) if release else ()
-
-
-@dataclass(frozen=True)
-class Licence:
-    """Licence of a package, as its own metadata states it."""
-
-    package: str
-    version: str
-    licence: str
-
-
-def licences() -> list[Licence]:
-    """Licences of all packages that dudmap needs, also of those that these need; extras are left out."""
-    queue, seen = [name for name, _, extra in requirements() if not extra], {}
-    while queue:
-        name = queue.pop()
-        key = re.sub(r"[-_.]+", "-", name).lower()
-        if key in seen or installed(name) is None:  # the latter: only for another system or version of Python
-            continue
-        seen[key] = Licence(key, version(name), licence_of(name))
-        for line in requires(name) or []:
-            match = re.match(r"[A-Za-z0-9._-]+", line)
-            if match is not None and "extra ==" not in line:
-                queue.append(match[0])
-    return [seen[key] for key in sorted(seen)]
-
-
-def licence_of(name: str) -> str:
-    """Licence of an installed package: its SPDX expression, else its classifiers, else the first line of its text."""
-    about: Any = metadata(name)
-    expression = about.get("License-Expression")
-    if expression:
-        return expression
-    marks = [line.rpartition(" :: ")[2] for line in about.get_all("Classifier", []) if line.startswith("License")]
-    text = (about.get("License") or "").strip().splitlines()
-    return ", ".join(marks) or (text[0][:60] if text else "not stated")

@@ -9,9 +9,9 @@ from typing import Annotated, Any
 import typer
 
 from dudmap.app.terminal import say
+from dudmap.cli import options as o
 from dudmap.cli.benchmark_gpu import gpu
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.progress import counted
+from dudmap.cli.output import answer, counted
 from dudmap.lab.benchmark.suites import SUITES
 
 app = typer.Typer(
@@ -26,30 +26,24 @@ SystemsOption = Annotated[
         "--systems", help="Comma-separated: dudmap, thesis, threshold, none, em, or paths of .toml configurations."
     ),
 ]
-JobsOption = Annotated[
-    int, typer.Option("--jobs", min=1, help="Number of runs at a time; times per frame are reliable with 1 only.")
-]
 QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
 
 
 def suite_command(
     context: typer.Context,
     systems: SystemsOption = "dudmap",
-    out: Annotated[Path | None, typer.Option("--out", help="Default: runs/benchmark/<suite>.")] = None,
-    data: Annotated[
-        Path | None, typer.Option("--data", help="Folder of the recordings; nothing is downloaded.")
-    ] = None,
-    jobs: JobsOption = 1,
+    out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
+    data: Annotated[Path | None, typer.Option(help="Folder of the recordings; nothing is downloaded.")] = None,
+    jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     score: Annotated[
         list[str] | None,
         typer.Option(
-            "--score",
             metavar="NAME=FOLDER",
             help="Score results of another system, FOLDER/<sequence>/trajectory.txt and mesh.ply; repeatable.",
         ),
     ] = None,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.lab.benchmark.report import named_folders, run_suite
@@ -81,29 +75,26 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 @app.command()
 def sensors(
-    out: Annotated[Path, typer.Option("--out", help="Output folder for sensors.md, .csv and .json.")] = Path(
+    out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = Path(
         "runs/benchmark/sensors"
     ),
-    only: Annotated[str, typer.Option("--only", help="Comma-separated sensors; default: all.")] = "",
-    jobs: JobsOption = 1,
+    only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
+    jobs: o.JobsOption = 1,
     quick: QuickOption = False,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure the same synthetic room with faulty sensors and named cameras, with colour, without it, and by default.
 
     The default must be within 5 % of the better of the other two columns.
     """
     from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.config import Config
     from dudmap.lab.benchmark.color_columns import color_table, measure_columns
     from dudmap.lab.benchmark.suites import sensor_entries
     from dudmap.lab.benchmark.table import save
 
     entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
-    rows = measure_columns(entries, Config().override(assignments or []), jobs, _print_outcome)
+    rows = measure_columns(entries, o.read_config(None, None, assignments), jobs, _print_outcome)
     text = color_table(rows)
     save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
     _answer({"rows": rows}, text, out, as_json=as_json)
@@ -111,23 +102,20 @@ def sensors(
 
 @app.command()
 def random(
-    count: Annotated[int, typer.Option("--count", min=1, help="Number of worlds.")] = 40,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the worlds.")] = 0,
-    only: Annotated[str, typer.Option("--only", help="Comma-separated numbers of worlds, instead of --count.")] = "",
-    out: Annotated[Path, typer.Option("--out", help="Output folder for the rows and the report.")] = Path(
+    count: Annotated[int, typer.Option(min=1, help="Number of worlds.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the worlds.")] = 0,
+    only: Annotated[str, typer.Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
+    out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = Path(
         "runs/benchmark/random"
     ),
-    jobs: JobsOption = 1,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    jobs: o.JobsOption = 1,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure random worlds with random sensors: distribution of the ATE, silent failures, and the worst worlds.
 
     Every world is written to the folder as soon as it is measured; an interrupted run of the same code continues.
     """
-    from dudmap.config import Config
     from dudmap.errors import ConfigError
     from dudmap.lab.benchmark.random_worlds import measure_worlds, report
 
@@ -135,7 +123,7 @@ def random(
         numbers = [int(number) for number in only.split(",") if number] or list(range(count))
     except ValueError:
         raise ConfigError(f"cannot understand --only {only!r}; expected numbers of worlds, such as 3,17") from None
-    rows = measure_worlds(seed, numbers, Config().override(assignments or []), out, jobs, _print_world)
+    rows = measure_worlds(seed, numbers, o.read_config(None, None, assignments), out, jobs, _print_world)
     text = report(rows, seed)
     (out / f"seed-{seed}.md").write_text(text, encoding="utf-8")
     _answer({"rows": rows}, text, out, as_json=as_json)
@@ -152,20 +140,17 @@ def bias(
     recording: Annotated[
         Path | None, typer.Argument(help="Static recording with true poses; default: exact synthetic rooms.")
     ] = None,
-    stride: Annotated[int, typer.Option("--stride", min=1, help="Register every so many frames.")] = 4,
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of synthetic rooms.")] = 3,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    stride: Annotated[int, typer.Option(min=1, help="Register every so many frames.")] = 4,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of synthetic rooms.")] = 3,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure how far each term of the registration pulls a frame from its true pose."""
-    from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
     from dudmap.lab import synthetic
     from dudmap.lab.benchmark.bias import bias_table, measure_pulls
 
-    config = Config().override(assignments or [])
+    config = o.read_config(None, None, assignments)
     if recording is not None:
         worlds = {recording.name: lambda: open_sequence(recording)}
     else:
@@ -188,18 +173,15 @@ def bias(
 
 @app.command("first-second")
 def first_second(
-    seeds: Annotated[int, typer.Option("--seeds", min=1, help="Number of worlds of each scene.")] = 3,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of worlds of each scene.")] = 3,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
-    from dudmap.config import Config
     from dudmap.lab import synthetic
     from dudmap.lab.benchmark.first_second import FRAMES, first_second_table, measure_first_second
 
-    config = Config().override(assignments or [])
+    config = o.read_config(None, None, assignments)
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
     runs = [
         measure_first_second(synthetic.sequence(scene, movers=(), frames=FRAMES, noise="none", seed=seed), config)
@@ -213,37 +195,54 @@ def first_second(
 
 
 @app.command()
+def calls(
+    recording: Annotated[
+        Path | None, typer.Argument(help="Recording; default: a synthetic room with a person.")
+    ] = None,
+    max_frames: Annotated[int, typer.Option(min=42, help="Number of frames; the first 40 are not counted.")] = 60,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
+) -> None:
+    """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
+    from dudmap.io.sequences import open_sequence
+    from dudmap.lab.benchmark.calls import count_calls, summary
+    from dudmap.lab.benchmark.entries import Entry
+
+    room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
+    source = room.open() if recording is None else open_sequence(recording)
+    tree = summary(count_calls(source, o.read_config(None, None, assignments), max_frames))
+    answer(tree, ", ".join(f"{value:.0f} {name}" for name, value in tree.items()), as_json=as_json)
+
+
+@app.command()
 def faults(
     recording: Annotated[
         Path | None, typer.Argument(help="Recording with true poses; default: a synthetic room with people.")
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", min=20, help="Number of frames of the recording.")] = 120,
-    width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
-    seed: Annotated[int, typer.Option("--seed", min=0, help="Seed of the synthetic room.")] = 0,
-    only: Annotated[str, typer.Option("--only", help="Comma-separated faults; default: all.")] = "",
-    out: Annotated[Path | None, typer.Option("--out", help="Also write the table to this file (Markdown).")] = None,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    max_frames: Annotated[int, typer.Option(min=20, help="Number of frames of the recording.")] = 120,
+    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of the synthetic room.")] = 0,
+    only: Annotated[str, typer.Option(help="Comma-separated faults; default: all.")] = "",
+    out: Annotated[Path | None, typer.Option(help="Also write the table to this file (Markdown).")] = None,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Inject every fault of a stream into a recording; fail if a wrong pose is called tracked, or none comes back."""
-    from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
     from dudmap.lab.benchmark.stream_faults import default_room, fault_row, measure_stream_faults, table_head
 
-    config = Config().override(assignments or [])
-    source = default_room(frames, width, seed) if recording is None else open_sequence(recording)
-    lines, failed, rows = [table_head(source.name, frames)], 0, []
+    config = o.read_config(None, None, assignments)
+    source = default_room(max_frames, width, seed) if recording is None else open_sequence(recording)
+    lines, failed, rows = [table_head(source.name, max_frames)], 0, []
     say(lines[0], err=as_json)
-    for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], frames):
+    for run, clean in measure_stream_faults(source, config, [name for name in only.split(",") if name], max_frames):
         lines.append(fault_row(run, clean))
         outcome = run.outcome(clean)
         rows.append({"fault": run.fault, "outcome": outcome, "rejected": run.rejected, "lost": run.lost})
         failed += outcome.startswith("FAILED")
         say(lines[-1], err=as_json)
     if as_json:
-        answer({"recording": source.name, "frames": frames, "faults": rows}, "", as_json=True)
+        answer({"recording": source.name, "frames": max_frames, "faults": rows}, "", as_json=True)
     if out is not None:
         out.parent.mkdir(parents=True, exist_ok=True)
         out.write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -257,9 +256,9 @@ def wrong_input(
     recording: Annotated[
         Path | None, typer.Argument(help="Recording with true poses; default: a synthetic desk and room.")
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", min=4, help="Number of frames from the start.")] = 40,
-    width: Annotated[int, typer.Option("--width", min=80, help="Width of the synthetic images, pixels.")] = 320,
-    as_json: JsonOption = False,
+    max_frames: Annotated[int, typer.Option(min=4, help="Number of frames from the start.")] = 40,
+    width: Annotated[int, typer.Option(min=80, help="Width of the synthetic images, pixels.")] = 320,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
     from dudmap.config import Config
@@ -269,11 +268,11 @@ def wrong_input(
 
     config, runs = Config(), []
     if recording is not None:
-        runs += measure_wrong_input(open_sequence(recording), config, SPOILT, frames)
+        runs += measure_wrong_input(open_sequence(recording), config, SPOILT, max_frames)
     else:  # too small a scale shows at a desk, too large a one in a room
         at_desk = [name for name in SPOILT if name != LARGE]
-        runs += measure_wrong_input(default_room(frames, width, 0, "desk"), config, at_desk, frames)
-        runs += measure_wrong_input(default_room(frames, width, 0), config, [LARGE], frames)
+        runs += measure_wrong_input(default_room(max_frames, width, 0, "desk"), config, at_desk, max_frames)
+        runs += measure_wrong_input(default_room(max_frames, width, 0), config, [LARGE], max_frames)
     failed = [run.name for run in runs if run.fails]
     answer({"runs": [run._asdict() for run in runs], "failed": failed}, spoilt_table(runs), as_json=as_json)
     if failed:
@@ -283,24 +282,19 @@ def wrong_input(
 
 @app.command()
 def gate(
-    figures: Annotated[Path, typer.Option("--figures", help="File of recorded figures and margins.")] = Path(
-        "tests/gate.toml"
-    ),
-    fixtures: Annotated[Path, typer.Option("--fixtures", help="Folder with the real excerpt freiburg1_xyz.")] = Path(
+    figures: Annotated[Path, typer.Option(help="File of recorded figures and margins.")] = Path("tests/gate.toml"),
+    fixtures: Annotated[Path, typer.Option(help="Folder with the real excerpt freiburg1_xyz.")] = Path(
         "tests/fixtures"
     ),
     record: Annotated[bool, typer.Option("--record", help="Record the measured figures; margins are kept.")] = False,
-    assignments: Annotated[
-        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Set a parameter; repeatable.")
-    ] = None,
-    as_json: JsonOption = False,
+    assignments: o.SetOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Fail if accuracy on a small fixed set of recordings is worse than recorded."""
-    from dudmap.config import Config
     from dudmap.lab.benchmark import gate as gates
 
     old = gates.load_figures(figures) if figures.is_file() or not record else None
-    rows = gates.measure_gate(gates.gate_entries(fixtures), Config().override(assignments or []))
+    rows = gates.measure_gate(gates.gate_entries(fixtures), o.read_config(None, None, assignments))
     if record:
         gates.save_figures(figures, rows, old["margins"] if old else None)
         text = f"recorded in {figures}; review the difference before committing it"
@@ -319,12 +313,10 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option("--out", help="Output folder for heat maps and figures.")] = Path(
-        "runs/benchmark/limits"
-    ),
-    jobs: JobsOption = 1,
+    out: Annotated[Path, typer.Option(help="Output folder for heat maps and figures.")] = Path("runs/benchmark/limits"),
+    jobs: o.JobsOption = 1,
     quick: QuickOption = False,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
@@ -362,7 +354,7 @@ def limits(
 
 @app.command()
 def speed(
-    out: Annotated[Path, typer.Option("--out", help="Output folder for speed.md and speed.json.")] = Path(
+    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = Path(
         "runs/benchmark/speed"
     ),
     long: Annotated[
@@ -370,15 +362,13 @@ def speed(
     ] = False,
     open3d: Annotated[
         Path | None,
-        typer.Option(
-            "--open3d", metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."
-        ),
+        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."),
     ] = None,
     recording: Annotated[
-        Path | None, typer.Option("--recording", help="Recording of that comparison; default: a synthetic room.")
+        Path | None, typer.Option(help="Recording of that comparison; default: a synthetic room.")
     ] = None,
     quick: QuickOption = False,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
     from dudmap.app.pipeline.environment import machine, versions

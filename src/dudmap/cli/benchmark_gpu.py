@@ -9,32 +9,25 @@ import typer
 
 from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text
-from dudmap.cli.output import JsonOption, answer
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 
 def gpu(
-    device: Annotated[str, typer.Option("--device", help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames of each run.")] = 120,
-    voxels: Annotated[
-        str, typer.Option("--voxels", help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")
-    ] = "2,1,0.5,0.25",
+    device: Annotated[str, typer.Option(help="Device beside the CPU: auto, cuda or cuda:N.")] = "auto",
+    max_frames: Annotated[int, typer.Option(min=2, help="Number of frames of each run.")] = 120,
+    voxels: Annotated[str, typer.Option(help="Comma-separated voxel sizes, cm.", metavar="NUMBERS")] = "2,1,0.5,0.25",
     sizes: Annotated[
-        str, typer.Option("--sizes", help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
+        str, typer.Option(help="Comma-separated image sizes of the synthetic room; empty leaves it out.")
     ] = "640x480,1280x720",
-    recording: Annotated[
-        list[Path] | None, typer.Option("--recording", help="Also measure this recording; repeatable.")
-    ] = None,
+    recording: Annotated[list[Path] | None, typer.Option(help="Also measure this recording; repeatable.")] = None,
     open3d: Annotated[
         Path | None,
-        typer.Option(
-            "--open3d", metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."
-        ),
+        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, whose dense SLAM is measured."),
     ] = None,
-    out: Annotated[Path, typer.Option("--out", help="Output folder for gpu.md and gpu.json.")] = Path(
-        "runs/benchmark/gpu"
-    ),
+    out: Annotated[Path, typer.Option(help="Output folder for gpu.md and gpu.json.")] = Path("runs/benchmark/gpu"),
     quick: Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")] = False,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Measure a GPU and the CPU beside it: time by stage and kernel, and memory.
 
@@ -47,16 +40,18 @@ def gpu(
     rows, python = [], find_open3d(open3d)
     steps, shapes = measurements.numbers(voxels, sizes)
     if quick:
-        steps, shapes, frames = steps[:1], [(320, 240)], min(frames, 12)
-    for name, each in measurements.recordings(shapes, frames, recording or []):
+        steps, shapes, max_frames = steps[:1], [(320, 240)], min(max_frames, 12)
+    for name, each in measurements.recordings(shapes, max_frames, recording or []):
         for step in steps:
             for one in measurements.devices(device):
                 say(f"measuring {name}, {100 * step:g} cm, {one}", err=True)
-                rows.append(measurements.measure(name, each, frames, step, one))
+                rows.append(measurements.measure(name, each, max_frames, step, one))
         if python is not None:
             other = measurements.devices(device)[0].upper()
             say(f"measuring {name}, Open3D's dense SLAM", err=True)
-            rows += measurements.measure_open3d(python, name, each, frames, steps, "CPU:0" if other == "CPU" else other)
+            rows += measurements.measure_open3d(
+                python, name, each, max_frames, steps, "CPU:0" if other == "CPU" else other
+            )
     text = measurements.table(rows)
     out.mkdir(parents=True, exist_ok=True)
     write_text(out / "gpu.md", text)

@@ -5,19 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import (
-    CameraOption,
-    ColorOption,
-    ConfigOption,
-    DepthOption,
-    DepthUnitOption,
-    FpsOption,
-    PresetOption,
-    SetOption,
-    TopicsOption,
-    read_config,
-)
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from rich.table import Table
@@ -31,21 +20,21 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def calibrate(
     sequence: Annotated[Path, typer.Argument(help="Recording of a static scene: folder, file or archive.")],
-    out: Annotated[Path | None, typer.Option("--out", help="Write the calibration to this TOML file.")] = None,
-    config: ConfigOption = None,
-    assignments: SetOption = None,
-    preset: PresetOption = None,
-    camera: CameraOption = None,
-    fps: FpsOption = None,
-    depth_unit: DepthUnitOption = None,
-    color: ColorOption = None,
-    depth: DepthOption = None,
-    topics: TopicsOption = None,
+    out: Annotated[Path | None, typer.Option(help="Write the calibration to this TOML file.")] = None,
+    config: o.ConfigOption = None,
+    assignments: o.SetOption = None,
+    preset: o.PresetOption = None,
+    camera: o.CameraOption = None,
+    fps: o.FpsOption = None,
+    depth_unit: o.DepthUnitOption = None,
+    color: o.ColorOption = None,
+    depth: o.DepthOption = None,
+    topics: o.TopicsOption = None,
     calibration: Annotated[
-        Path | None, typer.Option("--calibration", help="Calibration to start from: TOML file of an earlier one.")
+        Path | None, typer.Option(help="Calibration to start from: TOML file of an earlier one.")
     ] = None,
-    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
-    as_json: JsonOption = False,
+    max_frames: o.MaxFramesOption = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Estimate geometry, lens and timing of the colour camera relative to the depth camera.
 
@@ -60,7 +49,7 @@ def calibrate(
     recording = open_sequence(sequence, camera, fps, depth_unit, color=color, depth=depth, topics=topics)
     given = recording.calibration if calibration is None else Calibration.load(calibration)
     given = given or Calibration.registered(recording.camera)
-    estimate = calibrate_sequence(recording, read_config(config, preset, assignments or []), given, max_frames)
+    estimate = calibrate_sequence(recording, o.read_config(config, preset, assignments), given, max_frames)
     if out is not None:
         estimate.calibration.save(out)
     if as_json:

@@ -5,19 +5,8 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import (
-    CameraOption,
-    ColorOption,
-    ConfigOption,
-    DepthOption,
-    DepthUnitOption,
-    FpsOption,
-    PresetOption,
-    QuietOption,
-    SetOption,
-    read_config,
-)
+from dudmap.cli import options as o
+from dudmap.cli.output import answer, counted
 from dudmap.errors import DatasetError
 
 app = typer.Typer(add_completion=False)
@@ -28,30 +17,26 @@ def clean(
     sequence: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")],
     out: Annotated[Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.")],
     run: Annotated[
-        Path | None,
-        typer.Option("--run", help="Run over this recording with --save-masks; by default one is made in OUT/run."),
+        Path | None, typer.Option(help="Run over this recording with --save-masks; by default one is made in OUT/run.")
     ] = None,
-    config: ConfigOption = None,
-    assignments: SetOption = None,
-    preset: PresetOption = None,
-    camera: CameraOption = None,
-    fps: FpsOption = None,
-    depth_unit: DepthUnitOption = None,
-    color: ColorOption = None,
-    depth: DepthOption = None,
-    passes: Annotated[
-        int, typer.Option("--passes", min=1, max=2, help="Passes of the run that is made; 2 finds more.")
-    ] = 2,
-    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    config: o.ConfigOption = None,
+    assignments: o.SetOption = None,
+    preset: o.PresetOption = None,
+    camera: o.CameraOption = None,
+    fps: o.FpsOption = None,
+    depth_unit: o.DepthUnitOption = None,
+    color: o.ColorOption = None,
+    depth: o.DepthOption = None,
+    passes: Annotated[int, typer.Option(min=1, max=2, help="Passes of the run that is made; 2 finds more.")] = 2,
+    max_frames: o.MaxFramesOption = None,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Replace what moves in every frame of a recording by the map and by what other frames show there."""
     from dataclasses import asdict
 
     from dudmap.app.pipeline.run import run as run_sequence
     from dudmap.app.views.cleaning import clean_recording
-    from dudmap.cli.progress import counted
     from dudmap.io.exporting.run_content import RunContent
     from dudmap.io.sequences import open_sequence
 
@@ -59,7 +44,7 @@ def clean(
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
     if run is None:
-        parameters = read_config(config, preset, assignments or [])
+        parameters = o.read_config(config, preset, assignments)
         run_sequence(
             recording, parameters, out / "run",
             max_frames=max_frames, save_masks=True, passes=passes, progress=not (quiet or as_json), calibrate=True,

@@ -5,7 +5,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer, preset_names
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from dudmap.config import Config
@@ -15,10 +16,8 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def config(
-    preset: Annotated[
-        str, typer.Option("--preset", help="default or thesis.", autocompletion=preset_names)
-    ] = "default",
-    as_json: JsonOption = False,
+    preset: Annotated[str, typer.Option(help="default or thesis.", autocompletion=o.preset_names)] = "default",
+    as_json: o.JsonOption = False,
 ) -> None:
     """Print all parameters with their meanings as TOML, the format of --config."""
     from dudmap.config import Config

@@ -5,20 +5,9 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption
-from dudmap.cli.run import (
-    HostOption,
-    PortOption,
-    QuietOption,
-    ReportOption,
-    RerunOption,
-    SetOption,
-    ViewOption,
-    free_folder,
-    print_report,
-    read_config,
-)
-from dudmap.cli.view import TokenOption, observers
+from dudmap.cli import options as o
+from dudmap.cli.output import free_folder, print_report
+from dudmap.cli.view import observers
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
@@ -35,17 +24,17 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def demo(
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/demo.")] = None,
-    frames: Annotated[int, typer.Option("--frames", min=2, help="Number of frames.")] = 120,
-    assignments: SetOption = None,
-    report: ReportOption = True,
-    view: ViewOption = False,
-    host: HostOption = "127.0.0.1",
-    port: PortOption = 8080,
-    token: TokenOption = None,
-    rerun: RerunOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/demo.")] = None,
+    max_frames: o.FramesOption = 120,
+    assignments: o.SetOption = None,
+    report: o.ReportOption = True,
+    view: o.ViewOption = False,
+    host: o.HostOption = "127.0.0.1",
+    port: o.PortOption = 8080,
+    token: o.TokenOption = None,
+    rerun: o.RerunOption = None,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Render a short recording with a walking person and run on it.
 
@@ -55,8 +44,8 @@ def demo(
     from dudmap.app.pipeline.run import run
     from dudmap.lab.synthetic import sequence
 
-    config = read_config(None, None, assignments or [])
-    recording = sequence(scene="room", movers=("person",), frames=frames, noise="kinect", seed=0)
+    config = o.read_config(None, None, assignments)
+    recording = sequence(scene="room", movers=("person",), frames=max_frames, noise="kinect", seed=0)
     out = out or free_folder(Path("runs") / "demo")
     keeper = MostDynamicFrame()
     with observers(report=report, page=(host, port, token) if view else None, rerun=rerun) as watching:

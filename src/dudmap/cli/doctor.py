@@ -1,6 +1,7 @@
 """``dudmap doctor``: check the installation."""
 
 import json
+from dataclasses import asdict
 from typing import Annotated
 
 import typer
@@ -15,17 +16,11 @@ MARKS = {"good": ("good", "green"), "note": ("note", "yellow"), "bad": ("bad ", 
 @app.command()
 def doctor(
     as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object instead of a list.")] = False,
-    licences: Annotated[
-        bool, typer.Option("--licences", "--licenses", help="List the licences of all required packages instead.")
-    ] = False,
 ) -> None:
     """Check the installation and say what to do: versions, processor, threads, GPU, caches, extras, port of the page.
 
     Ends with 1 if something stops the program. Notes only limit a part of it.
     """
-    if licences:
-        _print_licences(as_json)
-        return
     from rich.text import Text
 
     from dudmap.app.doctor import checks
@@ -33,7 +28,7 @@ def doctor(
     found = list(checks())
     works = all(check.state != "bad" for check in found)
     if as_json:
-        say(json.dumps({"works": works, "checks": [check.tree() for check in found]}))
+        say(json.dumps({"works": works, "checks": [asdict(check) for check in found]}))
     else:
         console = plain_console(soft_wrap=True)
         for check in found:
@@ -43,14 +38,3 @@ def doctor(
         console.print("dudmap works here" if works else "dudmap does not work here before this is mended")
     if not works:
         raise typer.Exit(1)
-
-
-def _print_licences(as_json: bool) -> None:
-    from dudmap.app.doctor import licences
-
-    rows = licences()
-    if as_json:
-        say(json.dumps([{"package": r.package, "version": r.version, "licence": r.licence} for r in rows]))
-        return
-    for row in rows:
-        say(f"{row.package:<24} {row.version:<12} {row.licence}")

@@ -6,11 +6,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
-from typer.core import TyperGroup
 
 from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text
-from dudmap.cli.output import JsonOption
+from dudmap.cli import options as o
+from dudmap.cli.output import DefaultGroup
 from dudmap.errors import ConfigError, DatasetError, DudmapError
 
 if TYPE_CHECKING:
@@ -21,18 +21,8 @@ Figures = dict[str, Any]
 """Figures by name and unit; None for a figure that could not be computed."""
 
 
-class EvaluateGroup(TyperGroup):
-    """Command group in which ``evaluate RUN`` is short for ``evaluate trajectory RUN``."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:  # noqa: ANN401 - Typer's own types moved between versions
-        """Insert the default command where the arguments name none."""
-        if args and args[0] not in self.commands and args[0] != "--help":
-            args = ["trajectory", *args]
-        return super().parse_args(ctx, args)
-
-
 app = typer.Typer(
-    cls=EvaluateGroup,
+    cls=DefaultGroup,
     add_completion=False,
     no_args_is_help=True,
     help="Score a trajectory, a mesh or dynamic masks against the ground truth.\n\n"
@@ -41,8 +31,7 @@ app = typer.Typer(
 
 PlotsOption = Annotated[bool, typer.Option("--plots", help="Also write plots (PNG).")]
 OutOption = Annotated[
-    Path | None,
-    typer.Option("--out", help="Output folder for figures and plots; default: the folder of the estimate."),
+    Path | None, typer.Option("--out", help="Output folder for figures and plots; default: the folder of the estimate.")
 ]
 GapOption = Annotated[
     float, typer.Option("--max-difference", help="Largest time difference of associated poses, s.", metavar="S")
@@ -54,16 +43,12 @@ def trajectory(
     estimate: Annotated[
         Path, typer.Argument(help="Run folder, or trajectory in TUM format.", metavar="RUN|TRAJECTORY")
     ],
-    reference: Annotated[
-        Path | None,
-        typer.Option("--reference", help="True trajectory in TUM format, or the recording."),
-    ] = None,
+    reference: Annotated[Path | None, typer.Option(help="True trajectory in TUM format, or the recording.")] = None,
     align: Annotated[
-        str,
-        typer.Option("--align", help="se3: least-squares rigid alignment; origin: first poses aligned; none."),
+        str, typer.Option(help="se3: least-squares rigid alignment; origin: first poses aligned; none.")
     ] = "se3",
     max_difference: GapOption = 0.02,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
     plots: PlotsOption = False,
     out: OutOption = None,
 ) -> None:
@@ -112,17 +97,14 @@ def mesh(
         typer.Option("--distances", help="Distances for precision and recall, comma-separated, m.", metavar="M,M,..."),
     ] = "0.01,0.02,0.05",
     ghost_distance: Annotated[
-        float,
-        typer.Option(
-            "--ghost-distance", help="Estimated surface farther than this from the true one counts as ghost, m."
-        ),
+        float, typer.Option(help="Estimated surface farther than this from the true one counts as ghost, m.")
     ] = 0.05,
-    samples: Annotated[int, typer.Option("--samples", help="Number of sampled points per surface.")] = 300_000,
+    samples: Annotated[int, typer.Option(help="Number of sampled points per surface.")] = 300_000,
     points: Annotated[bool, typer.Option("--points", help="Accept point clouds, which have no area.")] = False,
     error_mesh: Annotated[
         bool, typer.Option("--error-mesh/--no-error-mesh", help="Write mesh_error.ply, coloured by the error.")
     ] = True,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
     plots: PlotsOption = False,
     out: OutOption = None,
 ) -> None:
@@ -191,7 +173,7 @@ def masks(
     per_frame: Annotated[
         bool, typer.Option("--per-frame", help="Add the figures of every frame to the JSON output.")
     ] = False,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
     plots: PlotsOption = False,
     out: OutOption = None,
 ) -> None:

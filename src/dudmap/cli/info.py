@@ -5,8 +5,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import CameraOption, ColorOption, DepthOption, DepthUnitOption, FpsOption, TopicsOption
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.inspection import Inspection
@@ -20,20 +20,22 @@ SHOWN_GAPS = 5
 @app.command()
 def info(
     path: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="PATH")],
-    camera: CameraOption = None,
-    fps: FpsOption = None,
-    depth_unit: DepthUnitOption = None,
-    color: ColorOption = None,
-    depth: DepthOption = None,
-    topics: TopicsOption = None,
-    sheet: Annotated[Path | None, typer.Option("--sheet", help="Write a contact sheet (PNG) of twelve frames.")] = None,
-    as_json: JsonOption = False,
+    camera: o.CameraOption = None,
+    fps: o.FpsOption = None,
+    depth_unit: o.DepthUnitOption = None,
+    color: o.ColorOption = None,
+    depth: o.DepthOption = None,
+    topics: o.TopicsOption = None,
+    sheet: Annotated[Path | None, typer.Option(help="Write a contact sheet (PNG) of twelve frames.")] = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Say what a recording holds: format, frames, rates, both cameras, depth, ground truth, gaps.
 
     Warnings name what looks wrong: depth scale, intrinsics, times, sparse depth, unreadable frames. Twelve frames are
     read.
     """
+    from dataclasses import asdict
+
     from rich.table import Table
 
     from dudmap.app.pipeline.contact_sheet import save_overview
@@ -48,7 +50,7 @@ def info(
     if sheet is not None:
         save_overview(sheet, frames)
     if as_json:
-        answer(found.tree(), "", as_json=True)
+        answer(asdict(found), "", as_json=True)
         return
     console = plain_console()
     table = Table.grid(padding=(0, 2))

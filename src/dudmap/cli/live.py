@@ -5,23 +5,9 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, camera_names
-from dudmap.cli.run import (
-    ConfigOption,
-    HostOption,
-    LogOption,
-    PortOption,
-    PresetOption,
-    QuietOption,
-    ReportOption,
-    RerunOption,
-    SetOption,
-    ViewOption,
-    free_folder,
-    print_report,
-    read_config,
-)
-from dudmap.cli.view import TokenOption, observers
+from dudmap.cli import options as o
+from dudmap.cli.output import free_folder, print_report
+from dudmap.cli.view import observers
 
 app = typer.Typer(add_completion=False)
 
@@ -31,35 +17,33 @@ def live(
     camera: Annotated[
         str | None,
         typer.Option(
-            "--camera",
             help="realsense, oak, orbbec, iphone, openni, replay:PATH (a recording at its own rate), or realsense:FILE "
             "(a recording of the driver); default: the first camera that is connected.",
             metavar="NAME",
-            autocompletion=camera_names,
+            autocompletion=o.camera_names,
         ),
     ] = None,
     record: Annotated[
-        Path | None, typer.Option("--record", help="MCAP file for all frames that arrive.", metavar="FILE.mcap")
+        Path | None, typer.Option(help="MCAP file for all frames that arrive.", metavar="FILE.mcap")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Run folder; default: runs/<camera>.")] = None,
-    config: ConfigOption = None,
-    assignments: SetOption = None,
-    preset: PresetOption = None,
+    out: Annotated[Path | None, typer.Option(help="Run folder; default: runs/<camera>.")] = None,
+    config: o.ConfigOption = None,
+    assignments: o.SetOption = None,
+    preset: o.PresetOption = None,
     calibration: Annotated[
-        Path | None,
-        typer.Option("--calibration", help="calibration.toml of an earlier run with this camera; default: its own."),
+        Path | None, typer.Option(help="calibration.toml of an earlier run with this camera; default: its own.")
     ] = None,
-    max_frames: Annotated[int | None, typer.Option("--max-frames", min=1, help="Stop after this many frames.")] = None,
-    save_masks: Annotated[bool, typer.Option("--save-masks", help="Write the dynamic mask of every frame.")] = False,
-    report: ReportOption = True,
-    view: ViewOption = False,
-    host: HostOption = "127.0.0.1",
-    port: PortOption = 8080,
-    token: TokenOption = None,
-    rerun: RerunOption = None,
-    log: LogOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    max_frames: o.MaxFramesOption = None,
+    save_masks: o.SaveMasksOption = False,
+    report: o.ReportOption = True,
+    view: o.ViewOption = False,
+    host: o.HostOption = "127.0.0.1",
+    port: o.PortOption = 8080,
+    token: o.TokenOption = None,
+    rerun: o.RerunOption = None,
+    log: o.LogOption = None,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Estimate the trajectory and a mesh of the static scene while a camera moves; Ctrl-C ends and writes the results.
 
@@ -69,7 +53,7 @@ def live(
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.io.cameras import open_camera
 
-    parameters = read_config(config, preset, assignments or [])
+    parameters = o.read_config(config, preset, assignments)
     given = None if calibration is None else Calibration.load(calibration)
     source = open_camera(camera)
     with observers(report=report, page=(host, port, token) if view else None, rerun=rerun, log=log) as watching:

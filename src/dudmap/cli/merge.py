@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from dudmap.app.terminal import say
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import QuietOption, free_folder
+from dudmap.cli import options as o
+from dudmap.cli.output import answer, free_folder
 
 app = typer.Typer(add_completion=False)
 
@@ -18,16 +18,14 @@ def merge(
         list[Path], typer.Argument(help="Run folders; the world frame of the first is kept.", metavar="RUN...")
     ],
     out: Annotated[
-        Path | None, typer.Option("--out", help="New folder; default: runs/<A>-<B>, or runs/world with more runs.")
+        Path | None, typer.Option(help="New folder; default: runs/<A>-<B>, or runs/world with more runs.")
     ] = None,
     world: Annotated[
         bool, typer.Option("--world", help="Write map parts and tiles also for two runs, as for more.")
     ] = False,
-    workers: Annotated[
-        int, typer.Option("--workers", help="Processes, with more than two runs or --world.", min=1)
-    ] = 1,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    jobs: Annotated[int, typer.Option(help="Processes, with more than two runs or --world.", metavar="N", min=1)] = 1,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Join maps whose views overlap, and refuse where geometry or colour disagree.
 
@@ -54,7 +52,7 @@ def merge(
             if not (quiet or as_json):
                 say(sentence, err=True)
 
-        fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=workers, note=note)
+        fleet = merge_fleet(runs, out or free_folder(Path("runs") / "world"), workers=jobs, note=note)
         found = fleet.tree
         for sentence in fleet.sentences:
             say(f"dudmap: {sentence}", err=True)

@@ -1,15 +1,24 @@
-"""What commands have in common: the answer on stdout, as text or as JSON, and what the shell completes."""
+"""What commands have in common: the answer on stdout, as text or as JSON, progress, and groups of commands."""
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
-import typer
+from typer.core import TyperGroup
 
 from dudmap.app.terminal import say
 
-JsonOption = Annotated[bool, typer.Option("--json", help="Print the result as one JSON object, and nothing else.")]
+
+class DefaultGroup(TyperGroup):
+    """Command group whose first command is meant where none is named: ``dudmap evaluate RUN``."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
+        """Insert the first command where the arguments name none."""
+        if args and args[0] not in self.commands and args[0] != "--help":
+            args = [next(iter(self.commands)), *args]
+        return super().parse_args(ctx, args)
 
 
 def answer(tree: Mapping[str, Any], text: str, *, as_json: bool, quiet: bool = False) -> None:
@@ -35,22 +44,36 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds
     return value
 
 
-def preset_names(incomplete: str) -> list[str]:
-    """Presets that begin so, for the shell."""
-    from dudmap.presets import PRESETS
+@contextmanager
+def counted(name: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
+    """Bar on stderr, if that is a terminal; gives a function that takes the number of finished frames and of all."""
+    from rich.progress import Progress
 
-    return [name for name in PRESETS if name.startswith(incomplete)]
+    from dudmap.app.terminal import plain_console
+
+    console = plain_console(stderr=True)
+    with Progress(console=console, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
-def parameter_names(incomplete: str) -> list[str]:
-    """Parameters that begin so, with the sign that follows, for the shell."""
-    from dudmap.config import keys
+def free_folder(wanted: Path) -> Path:
+    """The folder itself if it is new or empty, else the first of ``<name>-2``, ``<name>-3``, ... that is."""
+    folder, number = wanted, 1
+    while folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+        number += 1
+        folder = wanted.with_name(f"{wanted.name}-{number}")
+    return folder
 
-    return [f"{key}=" for key in keys() if key.startswith(incomplete)]
 
+def print_report(metrics: dict[str, object], out: Path, *, quiet: bool, as_json: bool) -> None:
+    """Print the metrics of a run to stdout: as one JSON object, as a table, or not at all."""
+    if as_json:
+        answer(metrics, "", as_json=True)
+    elif not quiet:
+        from dudmap.app.pipeline.progress import summary
+        from dudmap.app.terminal import plain_console
 
-def camera_names(incomplete: str) -> list[str]:
-    """Kinds of cameras that begin so, for the shell."""
-    from dudmap.io.cameras import CAMERAS
-
-    return [name for name in CAMERAS if name.startswith(incomplete)]
+        console = plain_console()
+        console.print(summary(metrics))
+        console.print(f"written to {out}", soft_wrap=True)

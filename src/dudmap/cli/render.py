@@ -1,14 +1,12 @@
 """``dudmap render``: the map of a run seen along a trajectory."""
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dudmap.cli.export import UpOption, direction
-from dudmap.cli.output import JsonOption, answer
-from dudmap.cli.run import QuietOption
+from dudmap.cli import options as o
+from dudmap.cli.output import answer, counted
 from dudmap.errors import ConfigError
 
 app = typer.Typer(add_completion=False)
@@ -17,24 +15,23 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def render(
     run: Annotated[Path, typer.Argument(help="Run folder.")],
-    out: Annotated[Path, typer.Option("--out", help="Video (.mp4, .avi), or folder for a recording in TUM layout.")],
+    out: Annotated[Path, typer.Option(help="Video (.mp4, .avi), or folder for a recording in TUM layout.")],
     trajectory: Annotated[
-        Path | None, typer.Option("--trajectory", help="Camera poses in TUM format, in the world of the run.")
+        Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
     ] = None,
     orbit: Annotated[bool, typer.Option("--orbit", help="A camera that circles about the middle of the map.")] = False,
     sweep: Annotated[
-        float, typer.Option("--sweep", min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
+        float, typer.Option(min=0, max=360, help="Width of the orbit; 360 for a circle.", metavar="DEGREES")
     ] = 60.0,
-    frames: Annotated[int, typer.Option("--frames", min=1, help="Number of frames of the orbit.")] = 120,
-    fps: Annotated[float, typer.Option("--fps", min=0.1, help="Frames per second.")] = 30.0,
-    size: Annotated[str | None, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = None,
-    up: UpOption = None,
-    quiet: QuietOption = False,
-    as_json: JsonOption = False,
+    max_frames: o.FramesOption = 120,
+    fps: Annotated[float, typer.Option(min=0.1, help="Frames per second.")] = 30.0,
+    size: Annotated[str | None, typer.Option(help="Image size in pixels.", metavar="WxH")] = None,
+    up: o.UpOption = None,
+    quiet: o.QuietOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Render the map as a camera would see it: a video, or a recording without anything that moves."""
     from dudmap.app.views import rendering
-    from dudmap.cli.progress import counted
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.io.exporting.run_content import RunContent
 
@@ -44,16 +41,9 @@ def render(
     if trajectory is not None:
         path = Trajectory.load(trajectory)
     else:
-        path = rendering.orbit(content, rendering.up_for_orbit(content, direction(up)), sweep, frames, fps)
+        path = rendering.orbit(content, rendering.up_for_orbit(content, o.direction(up)), sweep, max_frames, fps)
     with counted("rendering", quiet=quiet or as_json) as progress:
-        count = rendering.render_run(content, path, out, size=_size(size), fps=fps, progress=progress)
+        count = rendering.render_run(
+            content, path, out, size=None if size is None else o.image_size(size), fps=fps, progress=progress
+        )
     answer({"frames": count, "out": out}, f"{count} frames written to {out}", as_json=as_json, quiet=quiet)
-
-
-def _size(text: str | None) -> tuple[int, int] | None:
-    if text is None:
-        return None
-    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
-    if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
-        raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
-    return int(match[1]), int(match[2])

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 app = typer.Typer(add_completion=False)
 
@@ -13,10 +14,8 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def report(
     run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
-    out: Annotated[
-        Path | None, typer.Option("--out", help="HTML file; default: report.html in the run folder.")
-    ] = None,
-    as_json: JsonOption = False,
+    out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html in the run folder.")] = None,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Write report.html: map and trajectory in 3D, images, masks, plots, figures, configuration, what was lost and why.
 

@@ -1,13 +1,13 @@
 """``dudmap study``: designed experiments over configurations, the thesis' chapter 6, and a search that is judged."""
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
-from typer.core import TyperGroup
 
 from dudmap.app.terminal import say
-from dudmap.cli.output import JsonOption, answer
+from dudmap.cli import options as o
+from dudmap.cli.output import DefaultGroup, answer
 from dudmap.extras import STUDY, need
 
 if TYPE_CHECKING:
@@ -17,18 +17,8 @@ if TYPE_CHECKING:
     from dudmap.lab.study.executor import Executor
 
 
-class StudyGroup(TyperGroup):
-    """Command group whose first command is meant where none is named: ``dudmap study DESIGN.toml``."""
-
-    def parse_args(self, ctx: Any, args: list[str]) -> Any:  # noqa: ANN401 - Typer's own types moved between versions
-        """Put the name of the first command before a design file."""
-        if args and not args[0].startswith("-") and args[0] not in self.commands:
-            args = [next(iter(self.commands)), *args]
-        return super().parse_args(ctx, args)
-
-
 app = typer.Typer(
-    cls=StudyGroup,
+    cls=DefaultGroup,
     add_completion=False,
     no_args_is_help=True,
     help="Run a designed experiment over configurations and analyse it: dudmap study DESIGN.toml, or a command below.",
@@ -58,7 +48,7 @@ def run(
     keep: KeepOption = False,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Run the study of a design file; the word run may be left out."""
     from dudmap.lab.study.plan import load_plan
@@ -77,8 +67,8 @@ def thesis(
     recordings: Annotated[
         list[Path] | None, typer.Argument(help="Recordings; default: a synthetic room with a walking person.")
     ] = None,
-    table: Annotated[str, typer.Option("--table", help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
-    frames: Annotated[int | None, typer.Option("--frames", min=1, help="Use only the first frames.")] = None,
+    table: Annotated[str, typer.Option(help="Table of chapter 6: 6.1, 6.2 or 6.3.")] = "6.1",
+    max_frames: o.MaxFramesOption = None,
     published: Annotated[
         bool, typer.Option("--published", help="Analyse the printed values of table 6.1; nothing is run.")
     ] = False,
@@ -88,7 +78,7 @@ def thesis(
     keep: KeepOption = False,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Repeat the sensitivity study of the thesis (chapter 6)."""
     from dudmap.lab.study.study import run_study
@@ -99,7 +89,7 @@ def thesis(
         out = out or Path("runs/study/thesis-published")
         outcome = published_report(out)
     else:
-        plan = thesis_plan(table, recordings or (), frames)
+        plan = thesis_plan(table, recordings or (), max_frames)
         out = out or Path("runs/study") / f"thesis-{table}"
         report = _shown_with(cost_per_core_hour)
         outcome = run_study(plan, out, _executor(jobs, cluster), max_runs=max_runs, keep=keep, report=report)
@@ -114,7 +104,7 @@ def tune(
     max_runs: MaxRunsOption = 1000,
     cluster: ClusterOption = "",
     cost_per_core_hour: PriceOption = 0.0,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Search for a configuration on the recordings of a design file, and judge it on others it never saw."""
     from dudmap.lab.study.plan import load_plan

@@ -1,13 +1,12 @@
 """``dudmap synth``: render a synthetic recording with exact ground truth."""
 
-import re
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
-from dudmap.errors import ConfigError
+from dudmap.cli import options as o
+from dudmap.cli.output import answer, counted
 
 app = typer.Typer(add_completion=False)
 
@@ -15,13 +14,10 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def synth(
     out: Annotated[Path, typer.Argument(help="Output folder, in TUM layout with ground truth.")],
-    scene: Annotated[
-        str, typer.Option("--scene", help="room, corridor, desk, yard, textureless, plane or box.")
-    ] = "room",
+    scene: Annotated[str, typer.Option(help="room, corridor, desk, yard, textureless, plane or box.")] = "room",
     camera_path: Annotated[
         str | None,
         typer.Option(
-            "--camera-path",
             help="handheld, slow, fast, still, pan, orbit, dolly, follow, or a trajectory file in TUM format.",
             metavar="FILE|NAME",
         ),
@@ -29,59 +25,48 @@ def synth(
     movers: Annotated[
         list[str] | None,
         typer.Option(
-            "--movers",
             help="person, people, wanderer, carried_box, removed_box, ball, balloon, creeper, stopping_cart, "
-            "starting_cart, door; comma-separated or repeated; none for a static scene.",
+            "starting_cart, door; comma-separated or repeated; none for a static scene."
         ),
     ] = None,
-    speed: Annotated[float | None, typer.Option("--speed", help="Speed of the movers.", metavar="M_PER_S")] = None,
+    speed: Annotated[float | None, typer.Option(help="Speed of the movers.", metavar="M_PER_S")] = None,
     coverage: Annotated[
-        float | None,
-        typer.Option(
-            "--coverage", help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE"
-        ),
+        float | None, typer.Option(help="Share of the image covered by a stream of people, 0 to 0.95.", metavar="SHARE")
     ] = None,
     start_dynamic: Annotated[
         bool, typer.Option("--start-dynamic", help="Movers are in view from the first frame on.")
     ] = False,
     situation: Annotated[
         str | None,
-        typer.Option(
-            "--situation",
-            help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away.",
-        ),
+        typer.Option(help="people_at_start, follow, blocked, kidnapped, stops, starts, put_down or taken_away."),
     ] = None,
-    frames: Annotated[int, typer.Option("--frames", help="Number of frames.")] = 120,
-    fps: Annotated[float, typer.Option("--fps", help="Frames per second.")] = 30.0,
+    max_frames: o.FramesOption = 120,
+    fps: Annotated[float, typer.Option(help="Frames per second.")] = 30.0,
     sensor: Annotated[
         str | None,
         typer.Option(
-            "--sensor",
             help="A camera with its noise, faults and view: kinect_v1, kinect_v2, realsense_d435, realsense_l515 or "
-            "iphone_lidar.",
+            "iphone_lidar."
         ),
     ] = None,
     noise: Annotated[
         str | None,
         typer.Option(
-            "--noise",
             help="Noise of depth and colour: kinect (default without --sensor), realsense, d435, kinect_v2, l515, "
-            "iphone, or none.",
+            "iphone, or none."
         ),
     ] = None,
-    seed: Annotated[int, typer.Option("--seed", help="Seed of path, appearance and noise.", min=0)] = 0,
-    size: Annotated[str, typer.Option("--size", help="Image size in pixels.", metavar="WxH")] = "640x480",
+    seed: Annotated[int, typer.Option(help="Seed of path, appearance and noise.", min=0)] = 0,
+    size: Annotated[str, typer.Option(help="Image size in pixels.", metavar="WxH")] = "640x480",
     motion_blur: Annotated[
-        float | None,
-        typer.Option("--motion-blur", help="Exposure time as a share of the frame interval, by default 0."),
+        float | None, typer.Option(help="Exposure time as a share of the frame interval, by default 0.")
     ] = None,
     exposure_change: Annotated[
-        float, typer.Option("--exposure-change", help="Relative amplitude of a slow oscillation of the exposure.")
+        float, typer.Option(help="Relative amplitude of a slow oscillation of the exposure.")
     ] = 0.0,
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            "--fault",
             metavar="NAME=VALUE",
             help="A fault of the sensor, on top of --sensor, such as color_delay=0.025; repeatable. "
             "The names are in docs/synthetic.md; an unknown one lists them.",
@@ -89,7 +74,7 @@ def synth(
     ] = None,
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Write into a folder that is not empty.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", help="No progress bar, no summary.")] = False,
-    as_json: JsonOption = False,
+    as_json: o.JsonOption = False,
 ) -> None:
     """Render a synthetic recording with exact ground truth.
 
@@ -103,12 +88,12 @@ def synth(
     from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
     model = find_camera(sensor) if sensor is not None else None
-    width, height = _size(size)
+    width, height = o.image_size(size)
     sequence = synthetic.sequence(
         scene=scene,
         movers=_names(movers),
         camera_path=camera_path,
-        frames=frames,
+        frames=max_frames,
         fps=fps,
         noise=noise,
         speed=speed,
@@ -124,8 +109,6 @@ def synth(
     )
     import time
 
-    from dudmap.cli.progress import counted
-
     start, count = time.perf_counter(), len(sequence)
     with counted("rendering", quiet=quiet or as_json) as progress:
         write_folder(sequence, out, overwrite=overwrite, progress=lambda done: progress(done, count))
@@ -139,10 +122,3 @@ def _names(movers: list[str] | None) -> list[str] | None:
         return None
     found = [name.strip() for text in movers for name in text.split(",") if name.strip()]
     return [] if found == ["none"] else found
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
-    if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
-        raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
-    return int(match[1]), int(match[2])

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from dudmap.app.terminal import say
+from dudmap.cli import options as o
 from dudmap.errors import DudmapError
 
 if TYPE_CHECKING:
@@ -17,24 +18,15 @@ if TYPE_CHECKING:
 
 app = typer.Typer(add_completion=False)
 
-TokenOption = Annotated[
-    str | None,
-    typer.Option(
-        "--token",
-        help="Secret part of the page's address; default: none on this machine, a random one with another --host.",
-        metavar="TEXT",
-    ),
-]
-
 
 @app.command()
 def view(
     run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
     host: Annotated[
-        str, typer.Option("--host", help="Address to serve at; 0.0.0.0 lets other machines see the page.")
+        str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see the page.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option("--port", help="Port to serve at.", min=1, max=65535)] = 8080,
-    token: TokenOption = None,
+    port: Annotated[int, typer.Option(help="Port to serve at.", min=1, max=65535)] = 8080,
+    token: o.TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""
     from dudmap.app.viewing.stored_view import open_run

@@ -5,15 +5,15 @@ from typing import Annotated
 
 import typer
 
-from dudmap.cli.output import JsonOption, answer
+from dudmap.cli import options as o
+from dudmap.cli.output import answer
 
 app = typer.Typer(add_completion=False)
 
 
 @app.command()
 def warmup(
-    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False,
-    as_json: JsonOption = False,
+    quiet: Annotated[bool, typer.Option("--quiet", help="Print nothing.")] = False, as_json: o.JsonOption = False
 ) -> None:
     """Compile all kernels in advance.
 

@@ -1,7 +1,7 @@
 """Result of processing one frame."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -73,6 +73,18 @@ class FrameResult:
     repeats: Repeats = ""
     checks: Mapping[str, float] = field(default_factory=dict)
     unobservable: NDArray[np.float64] = field(default_factory=lambda: np.empty((0, 6)))
+
+    def __repr__(self) -> str:
+        """The state without the images."""
+        reason = f": {self.lost_reason}" if self.lost_reason else ", fused" if self.fused else ""
+        return f"FrameResult({self.timestamp:.6f} s, {self.state}{reason}, {self.dynamic_share:.1%} dynamic)"
+
+    def without_details(self) -> "FrameResult":
+        """Pose and mask alone, as of a frame that repeats this one."""
+        return replace(
+            self, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False, find_movers=None,
+            corrected=False, blind=False, calibrated=False, uncertain="", checks={},
+        )  # fmt: skip
 
     @property
     def movers(self) -> tuple[Mover, ...]:

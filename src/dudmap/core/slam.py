@@ -29,10 +29,8 @@ from dudmap.core.mapper import Mapper
 from dudmap.core.objects.moving_objects import MovingObjects
 from dudmap.core.objects.object_tracker import Mover
 from dudmap.core.places.atlas import Atlas
-from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.loop_closing import LoopCloser
 from dudmap.core.places.loop_verification import LoopQuery
-from dudmap.core.places.place_recognition import KeyframeDatabase
 from dudmap.core.places.redundancy import RedundantViews
 from dudmap.core.places.relocalizer import Relocalizer
 from dudmap.core.places.saved_map import SavedMap
@@ -41,8 +39,6 @@ from dudmap.core.slam_results import SlamResults
 from dudmap.core.stage_timer import StageTimer
 from dudmap.core.tracking.checks import MAX_DRIFT
 from dudmap.core.tracking.color_motion import ColorMotion
-from dudmap.core.tracking.depth_noise import INTERVAL as NOISE_INTERVAL
-from dudmap.core.tracking.depth_noise import DepthNoise
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.frame_view import FrameView
 from dudmap.core.tracking.front_end import FrontEnd
@@ -94,14 +90,13 @@ class Slam(SlamResults):
         self.config = config = config or Config()
         start = calibration if first_pass is None else first_pass.calibration
         given = None if start is None or start.is_registered(replace(camera, distortion=())) else start
-        voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
         adaptive = config.volume.adaptive or (saved_map is not None and saved_map.volume.config.adaptive)
         self.device = resolve(config.device, adaptive=adaptive)
         backend = make_backend(self.device)
-        self.preprocess = Preprocessor(camera, config.preprocess, backend, given, voxel_size)
+        self.preprocess = Preprocessor(camera, config.preprocess, backend, given)
         self.camera = self.preprocess.camera
         self.first_camera = camera
-        self.prior_map = None if first_pass is None else first_pass.as_prior_map()
+        self.prior_map = prior = None if first_pass is None else first_pass.as_prior_map()
         self.stream = StreamCheck(config.tracker.max_speed)
         self.tracker = Tracker(config.tracker, config.sensor, config.preprocess.smoothing_px)
         self.motion = MotionModel(config.tracker, timed=timed)
@@ -109,23 +104,14 @@ class Slam(SlamResults):
         self.detector = DynamicDetector(config.dynamics, config.sensor)
         self.monitor = QualityMonitor(config, self.motion)
         self.front_end = FrontEnd(config, self.tracker, self.detector, self.motion, self.monitor, self.color_motion)
-        known_poses = {}
-        keyframes, frame_store, submap = KeyframeDatabase(config.relocalization, self.camera, config.sensor), None, 0
-        if self.prior_map is None:
-            frame_store = None if localize else FrameStore.of(config, self.camera)
-        else:
-            known_poses, keyframes = self.prior_map.Ts_world_camera, self.prior_map.keyframes
-            submap = self.prior_map.submap
-            self.detector.import_from(self.prior_map.detector, known_poses)
-        self.predictor = PosePredictor(config, self.motion, self.tracker, known_poses)
-        self.atlas = Atlas(self._make_volume, keyframes, frame_store, submap)
+        self.predictor = PosePredictor(config, self.motion, self.tracker, prior.Ts_world_camera if prior else {})
+        self.atlas = Atlas.of(config, self.camera, self._make_volume, prior, keep_frames=not localize)
         self.color_calibration = ColorCalibration(config, self.camera, start, self.atlas, self.color_motion, live=live)
         self.bootstrap = Bootstrap()
-        self.relocalizer = Relocalizer(config, self.atlas, None if self.prior_map is None else self.prior_map.volume)
+        self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self._last: FrameResult | None = None  # of the last frame, for one that repeats it
         self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
-        self.depth_noise = DepthNoise(config.sensor, config.preprocess.depth_max)
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
@@ -133,6 +119,8 @@ class Slam(SlamResults):
             config, self.camera, self.atlas, self.bootstrap, self.predictor, self.color_motion, self.redundancy,
             localize=localize,
         )  # fmt: skip
+        if prior is not None:
+            self.detector.import_from(prior.detector, prior.Ts_world_camera)
         if saved_map is not None:
             self.atlas.go_on_in(saved_map, self.camera, max_blocks)
             self.monitor.restore(saved_map.registrations)
@@ -189,7 +177,10 @@ class Slam(SlamResults):
             DatasetError: The arrays have another shape or type.
             FrameError: The images do not fit the camera or each other; the frame changed nothing.
         """
-        view = self.prepare(self._given(frame, arrays), dynamic_mask)
+        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
+            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
+        frame = Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
+        view = self.prepare(frame, dynamic_mask)
         with view.timer("check"):
             rejection = self.stream.rejection(view.observation)
         if rejection:
@@ -201,7 +192,8 @@ class Slam(SlamResults):
         if self.reference.is_empty:
             return self._start_map(view)
         view = replace(view, blind=self._is_blind(view))
-        self._continue_rebuilding(view)
+        with view.timer("rebuild"):
+            self.atlas.continue_rebuilding()
         prediction = self.predictor.predict(self.reference, view, self.front_end.last_dynamic)
         self.mapper.revise_start(view, prediction)
         estimate = self.front_end.register(self.reference, view, prediction)
@@ -215,28 +207,18 @@ class Slam(SlamResults):
         self.mapper.recolor_first_frame(view, estimate)
         self._accept(view, estimate)
         uncertain = unobserved(estimate.tracking.unobservable) or self.predictor.doubt(view, prediction, estimate)
-        with view.timer("similarity"):
-            fuse = not (view.blind or uncertain or self.localize)
-            fuse = fuse and not self.redundancy.is_redundant(self.atlas.volume, view, estimate)
+        fuse = self._is_news(view, estimate, uncertain)
         mask = self._dynamic_mask(view, estimate)
-        self._learn_noise(view, estimate, mask)
-        find_movers = self.objects.update(view, estimate)
         self.mapper.extend(view, estimate, mask, fuse=fuse)
         T_world_camera, corrected = self._close_loop(view, estimate, mask)
         calibrated = self._calibrate(view, T_world_camera, mask, corrected=corrected)
         return self._result(
             view, estimate, mask, T_world_camera=T_world_camera, fused=fuse, relocalized=relocalized is not None,
-            corrected=corrected, find_movers=find_movers, uncertain=uncertain, calibrated=calibrated,
-            checks=verdict.figures,
+            corrected=corrected, find_movers=self.objects.update(view, estimate), uncertain=uncertain,
+            calibrated=calibrated, checks=verdict.figures,
         )  # fmt: skip
 
     # -- steps of process ---------------------------------------------------------------------------------------------
-
-    def _given(self, frame: Frame | FrameView | None, arrays: FrameArrays) -> Frame | FrameView:
-        """The frame as it was given, or made of arrays."""
-        if (frame is None) != (set(arrays) == {"depth", "rgb", "timestamp"}) or (frame is not None and arrays):
-            raise ConfigError("Slam.process takes either a frame, or all three of depth=, rgb= and timestamp=")
-        return Frame.from_arrays(**arrays, depth_scale=self.camera.depth_scale) if frame is None else frame
 
     def _reject(self, view: FrameView, rejection: Rejection) -> FrameResult:
         """Report a frame that the stream has spoilt."""
@@ -270,12 +252,6 @@ class Slam(SlamResults):
         if not self.reference.is_empty and self.motion.has_paused(view.timestamp):
             self.front_end.lose(view.timestamp)
         return view
-
-    def _continue_rebuilding(self, view: FrameView) -> None:
-        """Go on with the maps that are being rebuilt since a loop was closed or submaps were joined."""
-        if self.atlas.rebuildings:
-            with view.timer("rebuild"):
-                self.atlas.continue_rebuilding()
 
     def _is_blind(self, view: FrameView) -> bool:
         """Whether the colours of a frame say nothing, though those of the first frame of the map did."""
@@ -338,11 +314,11 @@ class Slam(SlamResults):
         self.atlas.add_pose(view.timestamp, estimate.T_world_camera)
         self.predictor.update(view, estimate)
 
-    def _learn_noise(self, view: FrameView, estimate: PoseEstimate, dynamic_mask: NDArray[np.bool_]) -> None:
-        """Compare the static readings of some frames with the map for the noise of the sensor, which is reported."""
-        if len(self.atlas.poses) % NOISE_INTERVAL == 0:
-            with view.timer("noise"):
-                self.depth_noise.update(self.reference, view.observation, estimate.T_world_camera, ~dynamic_mask)
+    def _is_news(self, view: FrameView, estimate: PoseEstimate, uncertain: str) -> bool:
+        """Whether a tracked frame is to be fused: its pose is certain, and the map does not know yet what it shows."""
+        with view.timer("similarity"):
+            known = view.blind or uncertain or self.localize
+            return not (known or self.redundancy.is_redundant(self.atlas.volume, view, estimate))
 
     def _dynamic_mask(self, view: FrameView, estimate: PoseEstimate) -> NDArray[np.bool_]:
         """Dynamic pixels (H, W) of a frame."""
@@ -415,10 +391,7 @@ class Slam(SlamResults):
             repeats=self.stream.repeats, rejected=rejected,
         )  # fmt: skip
         if not rejected:
-            self._last = replace(
-                result, fused=False, skipped_similar=False, labels=None, tracking=None, relocalized=False,
-                find_movers=None, corrected=False, blind=False, calibrated=False, uncertain="", checks={},
-            )  # fmt: skip
+            self._last = result.without_details()
         return result
 
     def _make_volume(self) -> TsdfVolume:

@@ -97,6 +97,7 @@ class SlamResults:
     def as_prior_map(self) -> PriorMap:
         """The largest submap and what else a second pass over the same recording needs."""
         self.atlas.complete()
+        self.atlas.keyframes.settle()
         main = self.atlas.by_size()[0]
         poses = {pose.timestamp: pose.T_world_camera for pose in self.atlas.poses if pose.submap == main}
         return PriorMap(self.atlas.volumes[main], main, poses, self.atlas.keyframes, self.detector)

@@ -3,13 +3,14 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.app.pipeline.environment import machine, versions
 from dudmap.app.pipeline.run_folder import prepare_run_folder
 from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry.trajectory import Trajectory
@@ -41,8 +42,9 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     """Join the maps of two run folders into a new run folder, in the world frame of the first.
 
     The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
-    runs in the common world frame (trajectory.txt, trajectory-2.txt, ...) and merge.json: the runs, the relative pose
-    and the figures of all checks. Nothing is written if the maps are not to be joined.
+    runs in the common world frame (trajectory.txt, trajectory-2.txt, ...), merge.json: the runs, the relative pose
+    and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is
+    written if the maps are not to be joined.
 
     Raises:
         MapError: The maps are not to be joined; the message says why.
@@ -64,10 +66,19 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     if (a / "config.toml").is_file():
         write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
     tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": of_a + of_b} | pair.tree()
-    tree |= {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
-    tree |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
+    sizes = {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
+    sizes |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
     finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
-    tree |= {"finer_blocks_left_out": sum(finer)}
+    tree |= sizes | {"finer_blocks_left_out": sum(finer)}
+    poses = sum(len(Trajectory.load(out / name)) for name in tree["trajectories"])
+    metrics: dict[str, Any] = {
+        "sequence": f"{a.name} and {b.name}",
+        "complete": True,
+        "frames": poses,
+        "tracked": poses,
+    }
+    metrics |= sizes | {"camera": asdict(merged.volume.camera), "versions": versions(), "machine": machine()}
+    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
     write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
     return MergeReport(out, pair, tree)
 

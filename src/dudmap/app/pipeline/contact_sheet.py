@@ -1,25 +1,25 @@
 """Overview images: of one processed frame with mask, residuals and map, or of the frames of a recording."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
+from dudmap.app.viewing.snapshot import RESIDUAL_RANGE, depth_colors, mask_overlay, residual_colors
+from dudmap.atomic_file import write_bytes
 from dudmap.core.frames.frame import Frame
 from dudmap.errors import DudmapError
 
 if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-    from matplotlib.image import AxesImage
-
     from dudmap.core.map.volume import RaycastResult
 
-RESIDUAL_RANGE = 0.05
-"""Residual at the end of the colour scale, metres."""
 LIGHT = np.array([-0.3, -0.6, -0.75]) / np.linalg.norm([-0.3, -0.6, -0.75])
 """Unit vector towards the light of the shaded view, camera frame."""
+TITLE = 28
+"""Height of the text above a picture, pixels."""
 
 
 def save_sheet(
@@ -45,31 +45,23 @@ def save_sheet(
     Raises:
         DudmapError: The file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(15, 8), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2, 3)
-    far = float(np.percentile(frame.depth[frame.depth > 0], 99)) if np.any(frame.depth > 0) else 1.0
-    _show(axes[0, 0], "colour", frame.color)
-    depth = _show(axes[0, 1], "depth", np.ma.masked_equal(frame.depth, 0), cmap="viridis", limits=(0, far))
-    figure.colorbar(depth, ax=axes[0, 1], label="m", shrink=0.7)
-    _show(axes[0, 2], "dynamic mask: estimated (red)", _overlaid(frame.color, dynamic_mask))
+    far, title = _far([frame]), "dynamic mask: estimated (red)"
+    overlay = mask_overlay(frame.color, dynamic_mask)
     if true_mask is not None and true_mask.any():
-        axes[0, 2].contour(true_mask, levels=[0.5], colors="lime", linewidths=1)
-        axes[0, 2].set_title("dynamic mask: estimated (red), true (green outline)")
-    shown = np.ma.masked_invalid(residuals)
-    limit = RESIDUAL_RANGE
-    distance = _show(axes[1, 0], "residuals: signed distance to the map", shown, cmap="RdBu", limits=(-limit, limit))
-    figure.colorbar(distance, ax=axes[1, 0], label="m", shrink=0.7)
-    _show(axes[1, 1], "rendered map: colour", np.where(view.depth[..., None] > 0, view.color, 255))
-    _show(axes[1, 2], "rendered map: shape", shaded(view, T_world_camera))
-    try:
-        with atomic_file(path) as file:
-            figure.savefig(file, dpi=80, format="png")
-    except OSError as error:
-        raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
+        outline, _ = cv2.findContours(true_mask.astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(overlay, outline, -1, (0, 255, 0), 1)
+        title += ", true (green outline)"
+    brightness = 0.25 + 0.7 * np.clip(view.normals @ (T_world_camera[:3, :3] @ LIGHT), 0, 1)
+    known, limit = view.depth[..., None] > 0, f"{100 * RESIDUAL_RANGE:.0f} cm"
+    pictures = [
+        ("colour", frame.color),
+        (f"depth, blue 0 to red {far:.1f} m", depth_colors(frame.depth, far)),
+        (title, overlay),
+        (f"residuals, blue -{limit} to red {limit}", residual_colors(residuals)),
+        ("rendered map: colour", np.where(known, view.color, 255)),
+        ("rendered map: shape", np.where(known, 255 * brightness[..., None], 255).repeat(3, axis=2)),
+    ]
+    _save(path, np.vstack([_row(pictures[:3], 480, 3), _row(pictures[3:], 480, 3)]))
 
 
 def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
@@ -82,51 +74,37 @@ def save_overview(path: str | Path, frames: "list[tuple[int, Frame]]") -> None:
     Raises:
         DudmapError: There is no frame, or the file cannot be written.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     if not frames:
         raise DudmapError(f"no frame can be read, so there is nothing to draw in {path}")
-    columns, rows = min(6, len(frames)), -(-len(frames) // 6)
-    figure = Figure(figsize=(3 * columns, 4.8 * rows), layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots(2 * rows, columns, squeeze=False)
-    readings = np.concatenate([frame.depth[frame.depth > 0] for _, frame in frames])
-    far = float(np.percentile(readings, 99)) if len(readings) else 1.0
-    for axis in axes.ravel():
-        axis.set_axis_off()
-    drawn = []
-    for place, (number, frame) in enumerate(frames):
-        row, column = divmod(place, columns)
-        _show(axes[2 * row, column], f"{number}: {frame.timestamp:.2f} s", frame.color)
-        shown = np.ma.masked_equal(frame.depth, 0)
-        drawn.append(_show(axes[2 * row + 1, column], "", shown, cmap="viridis", limits=(0, far)))
-    figure.colorbar(drawn[0], ax=axes.ravel().tolist(), label="m", shrink=0.5)
+    columns, far, rows = min(6, len(frames)), _far([frame for _, frame in frames]), []
+    for start in range(0, len(frames), columns):
+        part = frames[start : start + columns]
+        rows.append(_row(((f"{n}: {frame.timestamp:.2f} s", frame.color) for n, frame in part), 240, columns))
+        label = f"blue 0 to red {far:.1f} m"
+        rows.append(_row(((label, depth_colors(frame.depth, far)) for _, frame in part), 240, columns))
+    _save(path, np.vstack(rows))
+
+
+def _far(frames: list[Frame]) -> float:
+    """Depth at the end of the colour scale, metres."""
+    readings = np.concatenate([frame.depth[frame.depth > 0] for frame in frames])
+    return float(np.percentile(readings, 99)) if len(readings) else 1.0
+
+
+def _row(pictures: Iterable[tuple[str, NDArray]], width: int, columns: int) -> NDArray[np.uint8]:
+    """Pictures (h, w, 3) of one width side by side, each below its title, on a white row of a number of columns."""
+    scaled = [(title, cv2.resize(np.asarray(image, np.uint8), (width, width * image.shape[0] // image.shape[1])))
+              for title, image in pictures]  # fmt: skip
+    row = np.full((TITLE + max(len(image) for _, image in scaled), columns * width, 3), 255, np.uint8)
+    for column, (title, image) in enumerate(scaled):
+        left = column * width
+        row[TITLE : TITLE + len(image), left : left + width] = image
+        cv2.putText(row, title, (left + 4, TITLE - 9), cv2.FONT_HERSHEY_SIMPLEX, 0.45, (0, 0, 0), 1, cv2.LINE_AA)
+    return row
+
+
+def _save(path: str | Path, image: NDArray[np.uint8]) -> None:
     try:
-        with atomic_file(path) as file:
-            figure.savefig(file, dpi=80, format="png")
+        write_bytes(Path(path), cv2.imencode(".png", image[..., ::-1])[1].tobytes())
     except OSError as error:
         raise DudmapError(f"cannot write the image {path}: {error.strerror or error}") from error
-
-
-def shaded(view: "RaycastResult", T_world_camera: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Grey image (H, W, 3) of the surface of a view, lit from beside the camera; white where there is no surface."""
-    light = T_world_camera[:3, :3] @ LIGHT
-    brightness = 0.25 + 0.7 * np.clip(view.normals @ light, 0, 1)
-    grey = np.where(view.depth > 0, 255 * brightness, 255).astype(np.uint8)
-    return np.repeat(grey[..., None], 3, axis=-1)
-
-
-def _overlaid(color: NDArray[np.uint8], mask: NDArray[np.bool_]) -> NDArray[np.uint8]:
-    out = color.copy()
-    out[mask] = out[mask] // 2 + np.array([127, 0, 0], dtype=np.uint8)
-    return out
-
-
-def _show(
-    axes: "Axes", title: str, image: NDArray, cmap: str | None = None, limits: tuple[float, float] | None = None
-) -> "AxesImage":
-    axes.set_title(title)
-    axes.set_axis_off()
-    low, high = limits or (None, None)
-    return axes.imshow(image, interpolation="nearest", cmap=cmap, vmin=low, vmax=high)

@@ -2,6 +2,7 @@
 
 import json
 import platform
+import re
 import sys
 import time
 import traceback
@@ -11,9 +12,6 @@ from typing import Any
 
 from dudmap.atomic_file import write_bytes
 from dudmap.errors import InternalError
-
-SECRET = "--token"
-"""Option whose value is left out of the report."""
 
 
 def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, Any]] = ()) -> InternalError:
@@ -36,23 +34,16 @@ def report_crash(error: BaseException, folder: Path, events: Iterable[dict[str, 
 
 def report_text(error: BaseException, events: Iterable[dict[str, Any]]) -> str:
     """Content of the report."""
+    command = re.sub(r"(--token[= ])\S+", r"\1...", " ".join(sys.argv))
     parts = [
         f"dudmap stopped by a defect of its own, {time.strftime('%Y-%m-%d %H:%M:%S %z')}",
-        f"command: {' '.join(_command(sys.argv))}",
+        f"command: {command}",
         f"versions: {json.dumps(_versions())}",
         "".join(traceback.format_exception(error)),
         "last events of the run, newest at the end:",
         *(json.dumps(event) for event in events),
     ]
     return "\n".join(parts) + "\n"
-
-
-def _command(arguments: list[str]) -> list[str]:
-    out = []
-    for k, argument in enumerate(arguments):
-        hidden = k > 0 and arguments[k - 1] == SECRET
-        out.append("..." if hidden else f"{SECRET}=..." if argument.startswith(f"{SECRET}=") else argument)
-    return out
 
 
 def _versions() -> dict[str, Any]:

@@ -5,17 +5,19 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.places.features import SiftExtractor, match_descriptors, reduced_grey
 from dudmap.errors import FrameError
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
+    from dudmap.core.geometry.camera import Camera
     from dudmap.io.sequences import Sequence
 
 PAIRS, GAP = 12, 10
 """Pairs of frames that are compared, and how many frames apart: a third of a second, in which a hand turns 5 to 20
 degrees."""
 NEAR = 0.015
-"""Largest distance of a matched point from the common affine motion, as a share of its depth: 3 sigma of a Kinect."""
+"""Largest distance of a matched point from the common affine motion, as a share of the depth: 3 sigma of a Kinect."""
 POINTS = 500
 """Features of an image of half the size."""
 LEAST_POINTS, LEAST_PAIRS = 20, 6
@@ -25,8 +27,8 @@ AGREEMENT, SHARE = 0.15, 0.6
 WRONG = 0.2
 """Smallest error of a focal length that is said: that of right ones was up to 0.12 on five real recordings, and one
 that was 20 % too short on purpose was found 25 % too short."""
-TRIALS, DISTANCES = 300, 4000
-"""Random samples of four matches, and random pairs of points whose distances are compared."""
+DISTANCES = 4000
+"""Random pairs of points whose distances are compared."""
 
 
 def focal_error(sequence: "Sequence") -> float | None:
@@ -41,7 +43,7 @@ def focal_error(sequence: "Sequence") -> float | None:
             frames = [sequence[int(index)], sequence[min(int(index) + GAP, len(sequence) - 1)]]
         except FrameError:
             continue
-        first, second = _matched(frames, sequence, rng)
+        first, second = _matched(frames, sequence.camera)
         if len(first) < LEAST_POINTS:
             continue
         a, b = rng.integers(len(first), size=(2, DISTANCES))
@@ -58,21 +60,15 @@ def focal_error(sequence: "Sequence") -> float | None:
     return median if agreeing >= max(LEAST_PAIRS, SHARE * len(factors)) else None
 
 
-def _matched(
-    frames: "list[Frame]", sequence: "Sequence", rng: np.random.Generator
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _matched(frames: "list[Frame]", camera: "Camera") -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Points (N, 3) of two frames with the same appearance that fit one affine motion, each in its camera."""
     import cv2
 
-    camera, sift = sequence.camera, cv2.SIFT.create(POINTS)  # pyright: ignore[reportAttributeAccessIssue]
-    half = [cv2.resize(frame.color, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA) for frame in frames]
-    seen = [sift.detectAndCompute(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), None) for image in half]
-    if any(descriptors is None for _, descriptors in seen):
-        return np.empty((0, 3)), np.empty((0, 3))
-    matches = cv2.BFMatcher(crossCheck=True).match(seen[0][1], seen[1][1])
-    points = []
-    for (keypoints, _), frame, side in zip(seen, frames, ("queryIdx", "trainIdx"), strict=True):
-        u, v = 2 * np.array([keypoints[getattr(match, side)].pt for match in matches]).reshape(-1, 2).T + 0.5
+    sift, points = SiftExtractor(POINTS), []
+    seen = [sift.extract(reduced_grey(frame.color, frame.color.shape[1] // 2)) for frame in frames]
+    pairs = match_descriptors(seen[0].descriptors, seen[1].descriptors, 1.0, mutual=True)
+    for frame, features, rows in zip(frames, seen, pairs.T, strict=True):
+        u, v = 2 * features.pixels[rows].T + 0.5
         row, column = (
             np.clip(np.rint(x).astype(int), 0, size - 1) for x, size in zip((v, u), frame.depth.shape, strict=True)
         )
@@ -80,11 +76,7 @@ def _matched(
         points.append(np.stack([(u - camera.cx) / camera.fx * z, (v - camera.cy) / camera.fy * z, z], axis=1))
     valid = (points[0][:, 2] > 0) & (points[1][:, 2] > 0)
     first, second = points[0][valid], points[1][valid]
-    best = np.zeros(len(first), bool)
-    homogeneous = np.column_stack([first, np.ones(len(first))])
-    for _ in range(TRIALS if len(first) >= LEAST_POINTS else 0):
-        four = rng.choice(len(first), 4, replace=False)
-        motion = np.linalg.lstsq(homogeneous[four], second[four])[0]
-        near = np.linalg.norm(homogeneous @ motion - second, axis=1) < NEAR * second[:, 2]
-        best = near if near.sum() > best.sum() else best
-    return first[best], second[best]
+    if len(first) < LEAST_POINTS:
+        return first[:0], second[:0]
+    _, _, fits = cv2.estimateAffine3D(first, second, ransacThreshold=NEAR * float(np.median(second[:, 2])))
+    return first[fits[:, 0] > 0], second[fits[:, 0] > 0]

@@ -1,10 +1,9 @@
-"""Sources of frames and masks: read ahead in order, or replayed in real time."""
+"""Frames and masks of a recording, read ahead in order."""
 
 import time
 from collections import deque
 from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import closing
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
@@ -48,13 +47,13 @@ class SourceFrame(NamedTuple):
         number: Number of the frame in the recording.
         read: Result of reading it.
         dropped: Number of frames dropped since the previous one.
-        arrival: Time of arrival in a live run, seconds of ``time.perf_counter``; None otherwise.
+        arrival: Time of arrival in a live run, seconds of ``time.perf_counter``; 0 otherwise.
     """
 
     number: int
     read: FrameRead
     dropped: int = 0
-    arrival: float | None = None
+    arrival: float = 0.0
 
 
 def read_ahead(
@@ -71,7 +70,7 @@ def read_ahead(
     try:
         for index in range(start, count + ahead):
             if index < count:
-                pending.append(reader.submit(_read, sequence, index, masks, slam))
+                pending.append(reader.submit(read_frame, sequence, index, masks, slam))
             if index >= start + ahead:
                 yield pending.popleft().result()
     finally:
@@ -87,25 +86,10 @@ def in_order(
         yield SourceFrame(index, read)
 
 
-def in_real_time(
-    sequence: "Sequence", count: int, masks: "MaskFolder | None", slam: "Slam", idle: Callable[[], bool]
-) -> "Generator[SourceFrame]":
-    """Frames of a recording at the rate of the sensor, prepared by the thread that reads them; dropped where there is
-    no time. For ``idle`` see ``replay.arrivals``."""
-    from dudmap.app.pipeline.replay import live
-
-    last = -1
-    frames = live(sequence.timestamps[:count], lambda index: _read(sequence, index, masks, slam), idle)
-    with closing(frames) as arrivals:
-        for arrival in arrivals:
-            yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
-            last = arrival.number
-
-
 def load_kernels(slam: "Slam", sequence: "Sequence", count: int) -> None:
     """Compile or load all kernels by processing the first frames with a system that is discarded afterwards."""
     for index in range(min(count, 3)):
-        frame = _read(sequence, index).frame
+        frame = read_frame(sequence, index).frame
         if not isinstance(frame, FrameError):
             slam.process(frame)
 
@@ -119,7 +103,10 @@ def prepared(frame: Frame | FrameError, slam: "Slam | None", ms: float = 0.0) ->
     return FrameRead(frame, None, ms, prepared=view)
 
 
-def _read(sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None) -> FrameRead:
+def read_frame(
+    sequence: "Sequence", index: int, masks: "MaskFolder | None" = None, slam: "Slam | None" = None
+) -> FrameRead:
+    """A frame of a recording with its masks, prepared for processing where there is a system."""
     start = time.perf_counter()
     try:
         frame: Frame | FrameError = sequence[index]

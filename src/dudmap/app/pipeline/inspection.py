@@ -1,5 +1,6 @@
 """What a recording holds, and what looks wrong in it, from its lists and a few of its frames."""
 
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -100,10 +101,6 @@ class Inspection:
             return None
         return self.rate * (1 - self.repeats["frame"] - self.repeats[stream])
 
-    def tree(self) -> dict[str, Any]:
-        """Nested dictionary of numbers, lists and words, for JSON."""
-        return asdict(self)
-
 
 def sample(sequence: "Sequence", count: int = SAMPLES) -> "tuple[list[tuple[int, Frame]], list[str]]":
     """Numbers and frames of an evenly spread selection, and the reasons of those that cannot be read."""
@@ -176,16 +173,15 @@ def inspect(
         ground_truth=0 if truth is None else len(truth),
         unreadable=list(unreadable or []),
     )
-    named = found.sources.get("intrinsics", "").endswith(BY_NAME) and calibration is None
     found.warnings = [
-        *(_focal_warnings(sequence) if named else []),
+        *_focal_warnings(sequence, found.sources),
         *_depth_warnings(found, readings),
         *image_warnings([frame for _, frame in frames]),
         *_camera_warnings("depth camera", camera),
         *([] if calibration is None else _camera_warnings("colour camera", calibration.camera)),
         *_time_warnings(sequence.timestamps, colors),
         *_truth_warnings(sequence.timestamps, truth),
-        *_pairing_warnings(sequence),
+        *_pairing_warnings(sequence, found.sources),
     ]
     return found
 
@@ -202,19 +198,16 @@ def _rate(times: NDArray[np.float64]) -> float | None:
 
 def _gaps(times: NDArray[np.float64]) -> list[tuple[float, float]]:
     steps = np.diff(times)
-    if not len(steps):
-        return []
-    return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > GAP * np.median(steps))]
+    limit = GAP * np.median(steps) if len(steps) else 0.0
+    return [(float(times[k]), float(steps[k])) for k in np.flatnonzero(steps > limit)]
 
 
-def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[str]:
-    out = []
+def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> Iterator[str]:
     if found.unreadable:
-        out.append(
-            f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
-        )
+        yield f"{len(found.unreadable)} of {SAMPLES} sampled frames cannot be read; the first: {found.unreadable[0]}"
     if found.median_depth is None:
-        return [*out, "the sampled frames hold no depth reading"]
+        yield "the sampled frames hold no depth reading"
+        return
     median, (near, far) = found.median_depth, np.percentile(readings, (5, 95))
     implausible = (median < SEEN[0] and near < NEAREST) or (median > SEEN[1] and far > FARTHEST)
     if implausible or not NEAR <= median <= FAR:
@@ -222,70 +215,63 @@ def _depth_warnings(found: Inspection, readings: NDArray[np.float32]) -> list[st
         fitting = [scale for scale in SCALES if USUAL[0] <= units / scale <= USUAL[1] and scale != found.depth_scale]
         proposal = f"; {' or '.join(f'{scale:g}' for scale in sorted(fitting))} would be plausible" if fitting else ""
         unit = f"{1 / fitting[0]:.4g}, which is {fitting[0]:g} per metre" if fitting else "METRES"
-        out.append(
+        yield (
             f"the depth scale looks wrong: with {found.depth_scale:g} units per metre nine tenths of the readings lie "
             f"from {near:.2g} to {far:.2g} m, and the median depth is {median:.3g} m{proposal}: "
             f"give --depth-unit {unit}"
         )
     if found.valid_depth < FEW_READINGS:
-        out.append(f"only {found.valid_depth:.0%} of the pixels have a depth reading")
-    return out
+        yield f"only {found.valid_depth:.0%} of the pixels have a depth reading"
 
 
-def _camera_warnings(name: str, camera: "Camera") -> list[str]:
-    out = []
-    angles = [
-        np.degrees(2 * np.arctan(size / 2 / f)) for size, f in ((camera.width, camera.fx), (camera.height, camera.fy))
-    ]
-    if not all(FIELD_OF_VIEW[0] <= angle <= FIELD_OF_VIEW[1] for angle in angles):
-        out.append(f"a field of view of {angles[0]:.0f} x {angles[1]:.0f} degrees")
+def _camera_warnings(name: str, camera: "Camera") -> Iterator[str]:
+    problems, sizes = [], np.array([camera.width, camera.height])
+    angles = np.degrees(2 * np.arctan(sizes / 2 / [camera.fx, camera.fy]))
+    if angles.min() < FIELD_OF_VIEW[0] or angles.max() > FIELD_OF_VIEW[1]:
+        problems.append(f"a field of view of {angles[0]:.0f} x {angles[1]:.0f} degrees")
     for axis, center, size in (("x", camera.cx, camera.width), ("y", camera.cy, camera.height)):
         if abs(center + 0.5 - size / 2) > OFF_CENTER * size:
-            out.append(f"a principal point c{axis} of {center:g} in an image of {size} pixels")
+            problems.append(f"a principal point c{axis} of {center:g} in an image of {size} pixels")
     if abs(camera.fx - camera.fy) > UNEQUAL_FOCAL * max(camera.fx, camera.fy):
-        out.append(f"focal lengths of {camera.fx:g} and {camera.fy:g}")
-    return [f"the intrinsics of the {name} look wrong: {what}; give the right ones with --camera" for what in out]
+        problems.append(f"focal lengths of {camera.fx:g} and {camera.fy:g}")
+    for problem in problems:
+        yield f"the intrinsics of the {name} look wrong: {problem}; give the right ones with --camera"
 
 
-def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | None) -> list[str]:
-    out = []
-    if len(times) > 1:
-        step = float(np.median(np.diff(times)))
-        if not FAST <= step <= SLOW:
-            out.append(f"the times look wrong: {step:.3g} s from frame to frame; expected seconds, of one camera")
+def _time_warnings(times: NDArray[np.float64], colors: NDArray[np.float64] | None) -> Iterator[str]:
+    step = float(np.median(np.diff(times))) if len(times) > 1 else None
+    if step is not None and not FAST <= step <= SLOW:
+        yield f"the times look wrong: {step:.3g} s from frame to frame; expected seconds, of one camera"
     if colors is None:
-        return out
+        return
     late = float(np.median(np.abs(colors - times)))
     if late > LATE:
-        out.append(f"colour and depth are {1000 * late:.0f} ms apart in most frames: the lists may be paired wrongly")
+        yield f"colour and depth are {1000 * late:.0f} ms apart in most frames: the lists may be paired wrongly"
     if np.any(np.diff(colors) < 0):
-        out.append("the colour images are not in the order of the depth images: the times of the lists are mixed up")
-    return out
+        yield "the colour images are not in the order of the depth images: the times of the lists are mixed up"
 
 
-def _focal_warnings(sequence: "Sequence") -> list[str]:
-    error = focal_error(sequence)
-    if error is None or abs(error - 1) < WRONG:
-        return []
-    fx = sequence.camera.fx
-    return [
-        f"the focal length {fx:g} is that of {getattr(sequence, 'sources', {})['intrinsics']}, but pairs of frames are "
-        f"consistent with about {fx / error:.0f}; give the right intrinsics with --camera"
-    ]
+def _focal_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[str]:
+    intrinsics = sources.get("intrinsics", "")
+    if not intrinsics.endswith(BY_NAME) or sequence.calibration is not None:
+        return
+    error, fx = focal_error(sequence), sequence.camera.fx
+    if error is not None and abs(error - 1) >= WRONG:
+        yield (
+            f"the focal length {fx:g} is that of {intrinsics}, but pairs of frames are consistent with about "
+            f"{fx / error:.0f}; give the right intrinsics with --camera"
+        )
 
 
-def _pairing_warnings(sequence: "Sequence") -> list[str]:
+def _pairing_warnings(sequence: "Sequence", sources: dict[str, str]) -> Iterator[str]:
     counts = getattr(sequence, "image_counts", None)
-    if counts is None or len(sequence) >= (1 - LEFT_OVER) * max(counts):
-        return []
-    how = getattr(sequence, "sources", {})["frames"]
-    return [f"only {len(sequence)} frames come of {how}; the other images are not used"]
+    if counts is not None and len(sequence) < (1 - LEFT_OVER) * max(counts):
+        yield f"only {len(sequence)} frames come of {sources['frames']}; the other images are not used"
 
 
-def _truth_warnings(times: NDArray[np.float64], truth: "Trajectory | None") -> list[str]:
-    if truth is None or (truth.timestamps[0] <= times[-1] and times[0] <= truth.timestamps[-1]):
-        return []
-    return [
-        f"the ground truth ({truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s) is of another time than the "
-        f"images ({times[0]:.3f} to {times[-1]:.3f} s)"
-    ]
+def _truth_warnings(times: NDArray[np.float64], truth: "Trajectory | None") -> Iterator[str]:
+    if truth is not None and not (truth.timestamps[0] <= times[-1] and times[0] <= truth.timestamps[-1]):
+        yield (
+            f"the ground truth ({truth.timestamps[0]:.3f} to {truth.timestamps[-1]:.3f} s) is of another time than the "
+            f"images ({times[0]:.3f} to {times[-1]:.3f} s)"
+        )

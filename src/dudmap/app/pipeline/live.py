@@ -7,10 +7,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dudmap.app.pipeline.frame_source import FrameRead, SourceFrame, prepared
+from dudmap.app.pipeline.frame_source import SourceFrame, prepared
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.replay import Arrival, arrivals
+from dudmap.app.pipeline.replay import arrivals
 from dudmap.app.pipeline.run import process_source
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
 from dudmap.config import Config
@@ -113,7 +113,7 @@ def _arriving_frames(
     """Frames of the camera, prepared by the thread that takes them; all that arrive are recorded, those for which there
     is no time are dropped. For ``idle`` see ``replay.arrivals``."""
 
-    def deliver(put: Callable[[Arrival[FrameRead]], None], wait: Callable[[float], bool]) -> None:
+    def deliver(put: Callable[[SourceFrame], None], wait: Callable[[float], bool]) -> None:
         start, latest = None, -np.inf
         while not wait(0) and (arrived := camera.read()) is not None:
             start = arrived.number if start is None else start
@@ -123,13 +123,9 @@ def _arriving_frames(
                 latest = arrived.frame.timestamp
                 if recorder is not None:
                     recorder.put(arrived.frame)
-            put(Arrival(arrived.number - start, prepared(arrived.frame, slam), arrived.time))
+            put(SourceFrame(arrived.number - start, prepared(arrived.frame, slam), arrival=arrived.time))
 
-    last = -1
-    with closing(arrivals(deliver, camera.close, idle)) as delivered:
-        for arrival in delivered:
-            yield SourceFrame(arrival.number, arrival.item, arrival.number - last - 1, arrival.time)
-            last = arrival.number
+    return arrivals(deliver, camera.close, idle)
 
 
 def _finish(recorder: Recorder | None, display: RunProgress) -> None:

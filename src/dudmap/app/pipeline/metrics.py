@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
     from dudmap.errors import FrameError
 
+COUNTED = ("fused", "skipped_similar", "relocalized", "corrected", "blind", "uncertain")
+"""What ``FrameResult`` says of a frame, of which the number of frames is counted."""
+
 
 @dataclass
 class RunRecord:
@@ -38,8 +41,8 @@ class RunRecord:
         movers: Per frame with moving objects, the line of movers.jsonl: a third of the memory of the object.
         residuals: (BINS,) histogram of the normalised residuals of all frames (see ``dynamics.mixture``), or 0.
         postponed: Rows and results of the frames of a live run whose moving objects are still to be found.
-        fused, skipped_similar, relocalized, corrected, blind, uncertain: Numbers of frames, as in ``FrameResult``.
-        degenerate: Number of tracked frames with unobservable directions of motion.
+        counts: Numbers of frames by what ``FrameResult`` says of them, and of ``degenerate`` ones, in which not all
+            directions of motion are observable.
         warnings: Sentences on what looked wrong in the recording before the run.
         masked: Number of frames with an external mask, None without external masks.
         dropped: Number of frames dropped by a live run, None otherwise.
@@ -55,13 +58,7 @@ class RunRecord:
     movers: list[str] = field(default_factory=list)
     residuals: NDArray[np.int64] = field(default_factory=lambda: np.zeros((), dtype=np.int64))
     postponed: "list[tuple[dict[str, Any], FrameResult]]" = field(default_factory=list)
-    fused: int = 0
-    skipped_similar: int = 0
-    relocalized: int = 0
-    corrected: int = 0
-    blind: int = 0
-    uncertain: int = 0
-    degenerate: int = 0
+    counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys((*COUNTED, "degenerate"), 0))
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
@@ -94,33 +91,24 @@ class RunRecord:
             delays: In a live run, the number of frames ``dropped`` before this one, and the ``latency`` from its
                 arrival to the result, ms.
         """
-        row: dict[str, Any] = (
-            {
-                "timestamp": f"{result.timestamp:.6f}",
-                "state": result.state,
-                "fused": int(result.fused),
-                "dynamic_share": round(result.dynamic_share, 4),
-                "reading": round(reading_ms, 3),
-                "total": round(total_ms, 3),
-            }
-            | {key: round(value, 3) for key, value in delays.items()}
-            | {stage: round(ms, 3) for stage, ms in result.timings.items()}
-        )
+        frame = {"timestamp": f"{result.timestamp:.6f}", "state": result.state}
+        times = {"reading": reading_ms, "total": total_ms} | delays | result.timings
+        row: dict[str, Any] = frame | {
+            "fused": int(result.fused),
+            "dynamic_share": round(result.dynamic_share, 4),
+            **{name: round(value, 3) for name, value in times.items()},
+        }
         self.rows.append(row)
-        self.fused += result.fused
-        self.skipped_similar += result.skipped_similar
-        self.relocalized += result.relocalized
-        self.corrected += result.corrected
-        self.blind += result.blind
-        self.uncertain += bool(result.uncertain)
-        self.degenerate += len(result.unobservable) > 0
+        for name in COUNTED:
+            self.counts[name] += bool(getattr(result, name))
+        self.counts["degenerate"] += len(result.unobservable) > 0
         if result.rejected:
             self._reject(result.rejected)
         if result.repeats:
             self.repeated[result.repeats] = self.repeated.get(result.repeats, 0) + 1
         if result.checks:
             known = {name: float(f"{figure:.4g}") for name, figure in result.checks.items() if np.isfinite(figure)}
-            self.checks.append({"timestamp": f"{result.timestamp:.6f}", "state": result.state} | known)
+            self.checks.append(frame | known)
         if result.state == "lost":
             self.lost.append({"timestamp": result.timestamp, "reason": result.lost_reason})
         self.postponed.append((row, result))
@@ -185,50 +173,42 @@ class RunRecord:
 
     def metrics(self) -> dict[str, Any]:
         """Counts and times of all frames, under the keys of metrics.json."""
-        totals = np.array([row["total"] for row in self.rows] or [np.nan])
-        readings = np.array([row["reading"] for row in self.rows] or [np.nan])
-        return {
+        totals, readings, shares = (self._column(name) for name in ("total", "reading", "dynamic_share"))
+        out: dict[str, Any] = {
             "frames": len(self.rows) + len(self.unreadable),
             "tracked": sum(row["state"] == "tracked" for row in self.rows),
             "repeated": sum(row["state"] == "repeated" for row in self.rows),
-            "fused": self.fused,
-            "skipped_similar": self.skipped_similar,
+            **self.counts,
             "lost": len(self.lost),
-            "relocalized": self.relocalized,
-            "corrected": self.corrected,
-            "blind": self.blind,
-            "uncertain": self.uncertain,
-            "degenerate": self.degenerate,
             "unreadable": len(self.unreadable),
             "frames_rejected": dict(sorted(self.rejected.items())),
             "images_repeated": dict(sorted(self.repeated.items())),
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),
             "ms_reading_median": _number(np.median(readings)),
-            "wall_s": round(time.perf_counter() - self._wall_start, 3),
-            "cpu_s": round(time.process_time() - self._cpu_start, 3),
+            **{name: round(seconds, 3) for name, seconds in zip(("wall_s", "cpu_s"), self.elapsed(), strict=True)},
             "peak_rss_mb": peak_rss_mb(),
-            "dynamic_share_mean": _number(np.mean([row["dynamic_share"] for row in self.rows] or [np.nan]), 4),
+            "dynamic_share_mean": _number(np.mean(shares), 4),
             "warnings": self.warnings,
             "lost_frames": self.lost,
             "unreadable_frames": self.unreadable,
-        } | self._occasional()
-
-    def _occasional(self) -> dict[str, Any]:
-        """Metrics of runs with masks and of live runs."""
-        out: dict[str, Any] = {}
+        }
         if self.masked is not None:
             out |= {"frames_with_mask": self.masked, "frames_without_mask": len(self.rows) - self.masked}
         if self.mask_ious:
             out |= {"mask_iou_mean": _number(np.mean(self.mask_ious), 4), "mask_iou_frames": len(self.mask_ious)}
         if self.dropped is not None:
-            latencies = np.array([row["latency"] for row in self.rows] or [np.nan])
+            latencies = self._column("latency")
             out |= {
                 "dropped": self.dropped,
                 "latency_ms_median": _number(np.median(latencies)),
                 "latency_ms_p95": _number(np.percentile(latencies, 95)),
             }
         return out
+
+    def _column(self, name: str) -> NDArray[np.float64]:
+        """Numbers of a column of all frames; NaN without any."""
+        return np.array([row[name] for row in self.rows] or [np.nan])
 
 
 def _write_table(path: Path, rows: list[dict[str, Any]], missing: str) -> None:

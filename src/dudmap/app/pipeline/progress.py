@@ -14,6 +14,22 @@ from dudmap.app.terminal import plain_console
 if TYPE_CHECKING:
     from dudmap.core.result import FrameResult
 
+FIGURES = (
+    ("  dropped", "dropped", "{}", 1),
+    ("latency, median", "latency_ms_median", "{:.1f} ms", 1),
+    ("latency, 95th percentile", "latency_ms_p95", "{:.1f} ms", 1),
+    ("time per frame, median", "ms_per_frame_median", "{:.1f} ms", 1),
+    ("time per frame, 95th percentile", "ms_per_frame_p95", "{:.1f} ms", 1),
+    ("peak memory", "peak_rss_mb", "{:.0f} MB", 1),
+    ("map", "map_bytes", "{:.1f} MB", 1e-6),
+    ("mesh", "mesh_triangles", "{} triangles", 1),
+    ("ATE RMSE", "ate_rmse_m", "{:.2f} cm", 100),
+    ("RPE RMSE, translation", "rpe_trans_rmse_m_per_s", "{:.2f} cm/s", 100),
+    ("RPE RMSE, rotation", "rpe_rot_rmse_deg_per_s", "{:.2f} deg/s", 1),
+    ("mask IoU", "mask_iou_mean", "{:.3f}", 1),
+)
+"""Label, key of metrics.json, format and factor of the figures of a run, printed where the run has them."""
+
 
 class RunProgress:
     """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
@@ -94,32 +110,16 @@ def summary(metrics: dict[str, Any]) -> Table:
     table = Table(title=str(metrics["sequence"]), show_header=False, title_justify="left")
     table.add_column(style="bold")
     table.add_column(justify="right")
-    counts = "tracked", "repeated", "fused", "skipped_similar", "lost", "unreadable"
     table.add_row("frames", str(metrics["frames"]))
-    for key in counts:
+    for key in ("tracked", "repeated", "fused", "skipped_similar", "lost", "unreadable"):
         value = metrics[key]
         bad = key in ("lost", "unreadable") and value
         table.add_row(f"  {key.replace('_', ' ')}", Text(str(value), "red" if bad else ""))
-    if "dropped" in metrics:
-        table.add_row("  dropped", str(metrics["dropped"]))
-        table.add_row("latency, median", _text(metrics["latency_ms_median"], "{:.1f} ms"))
-        table.add_row("latency, 95th percentile", _text(metrics["latency_ms_p95"], "{:.1f} ms"))
-    table.add_row("time per frame, median", _text(metrics["ms_per_frame_median"], "{:.1f} ms"))
-    table.add_row("time per frame, 95th percentile", _text(metrics["ms_per_frame_p95"], "{:.1f} ms"))
-    table.add_row("peak memory", _text(metrics["peak_rss_mb"], "{:.0f} MB"))
-    table.add_row("map", _text(metrics["map_bytes"], "{:.1f} MB", 1e-6))
-    table.add_row("mesh", f"{metrics['mesh_triangles']} triangles")
-    if "bodies" in metrics:
-        rigid = sum(body["rigid"] for body in metrics["bodies"])
-        table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
-    if "ate_rmse_m" in metrics:
-        table.add_row("ATE RMSE", _text(metrics["ate_rmse_m"], "{:.2f} cm", 100))
-        table.add_row("RPE RMSE, translation", _text(metrics["rpe_trans_rmse_m_per_s"], "{:.2f} cm/s", 100))
-        table.add_row("RPE RMSE, rotation", _text(metrics["rpe_rot_rmse_deg_per_s"], "{:.2f} deg/s"))
-    if "mask_iou_mean" in metrics:
-        table.add_row("mask IoU", _text(metrics["mask_iou_mean"], "{:.3f}"))
+    for label, key, form, factor in FIGURES:
+        if key in metrics:
+            value = metrics[key]
+            table.add_row(label, "unknown" if value is None else form.format(value * factor))
+        if key == "mesh_triangles" and "bodies" in metrics:
+            rigid = sum(body["rigid"] for body in metrics["bodies"])
+            table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
     return table
-
-
-def _text(value: float | None, form: str, factor: float = 1.0) -> str:
-    return "unknown" if value is None else form.format(value * factor)

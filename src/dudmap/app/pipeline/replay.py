@@ -4,39 +4,23 @@ import threading
 import time
 from collections.abc import Callable, Generator
 from concurrent.futures import ThreadPoolExecutor
-from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-T = TypeVar("T")
-
-
-class Arrival(NamedTuple, Generic[T]):
-    """Item of a live stream.
-
-    Attributes:
-        number: Number of the frame in the stream.
-        item: Result of reading the frame.
-        time: Time of arrival, seconds of ``time.perf_counter``.
-    """
-
-    number: int
-    item: T
-    time: float
-
+from dudmap.app.pipeline.frame_source import FrameRead, SourceFrame
 
 PATIENCE = 0.1
 """Time for which a frame may wait for its processing, seconds: at 30 Hz one that takes three times as long as usual
 delays the next ones and drops none, and nothing is processed that is much older."""
 
 
-class WaitingRoom(Generic[T]):
+class WaitingRoom:
     """Thread-safe queue between a sensor and its consumer: of the newest item and those at most ``PATIENCE`` older."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
-        self._held: list[Arrival[T]] = []
+        self._held: list[SourceFrame] = []
         self._closed = False
 
     @property
@@ -44,13 +28,13 @@ class WaitingRoom(Generic[T]):
         """Whether no item waits."""
         return not self._held
 
-    def put(self, item: Arrival[T]) -> None:
+    def put(self, item: SourceFrame) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
-            self._held = [held for held in self._held if item.time - held.time <= PATIENCE] + [item]
+            self._held = [held for held in self._held if item.arrival - held.arrival <= PATIENCE] + [item]
             self._changed.notify()
 
-    def take(self) -> Arrival[T] | None:
+    def take(self) -> SourceFrame | None:
         """Oldest item; waits for one that was not taken yet. None once the queue is closed and empty."""
         with self._changed:
             self._changed.wait_for(lambda: self._held or self._closed)
@@ -65,8 +49,8 @@ class WaitingRoom(Generic[T]):
 
 def replay(
     timestamps: NDArray[np.float64],
-    read: Callable[[int], T],
-    put: Callable[[Arrival[T]], None],
+    read: Callable[[int], FrameRead],
+    put: Callable[[SourceFrame], None],
     wait: Callable[[float], bool],
     now: Callable[[], float] = time.perf_counter,
 ) -> None:
@@ -91,26 +75,26 @@ def replay(
         elapsed = now() - start
         latest = int(np.searchsorted(timestamps, elapsed, side="right")) - 1
         index = max(index, min(latest, int(np.searchsorted(timestamps, elapsed - PATIENCE))))
-        put(Arrival(index, read(index), start + timestamps[index]))
+        put(SourceFrame(index, read(index), arrival=start + timestamps[index]))
         index += 1
 
 
-def live(
-    timestamps: NDArray[np.float64], read: Callable[[int], T], idle: Callable[[], bool] = lambda: False
-) -> Generator[Arrival[T]]:
+def in_real_time(
+    timestamps: NDArray[np.float64], read: Callable[[int], FrameRead], idle: Callable[[], bool] = lambda: False
+) -> Generator[SourceFrame]:
     """Replay a recording in real time; each step yields the next frame that has arrived.
 
-    Frames for which the consumer leaves no room are dropped, which leaves a gap in ``Arrival.number``. The last frame
-    is always yielded. For ``idle`` see ``arrivals``.
+    Frames for which the consumer leaves no room are dropped and counted in ``SourceFrame.dropped``. The last frame is
+    always yielded. For ``idle`` see ``arrivals``.
     """
     return arrivals(lambda put, wait: replay(timestamps, read, put, wait), idle=idle)
 
 
 def arrivals(
-    deliver: Callable[[Callable[[Arrival[T]], None], Callable[[float], bool]], None],
+    deliver: Callable[[Callable[[SourceFrame], None], Callable[[float], bool]], None],
     stop: Callable[[], None] | None = None,
     idle: Callable[[], bool] = lambda: False,
-) -> Generator[Arrival[T]]:
+) -> Generator[SourceFrame]:
     """Items that a sensor delivers; those for which the consumer leaves no room (``WaitingRoom``) are dropped.
 
     Args:
@@ -119,8 +103,8 @@ def arrivals(
         stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
         idle: Called while no item waits; does a few milliseconds of other work and returns True, or has none.
     """
-    waiting: WaitingRoom[T] = WaitingRoom()
-    stopping = threading.Event()
+    waiting: WaitingRoom = WaitingRoom()
+    stopping, last = threading.Event(), -1
 
     def sensor() -> None:
         try:
@@ -134,9 +118,10 @@ def arrivals(
             while True:
                 while waiting.is_empty and idle():
                     pass
-                if (arrival := waiting.take()) is None:
+                if (frame := waiting.take()) is None:
                     break
-                yield arrival
+                yield frame._replace(dropped=frame.number - last - 1)
+                last = frame.number
             future.result()
         finally:
             stopping.set()

@@ -3,22 +3,19 @@
 import sqlite3
 from contextlib import closing
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from dudmap.app.pipeline.progress import RunProgress
-from dudmap.app.pipeline.run import Job, run
+from dudmap.app.pipeline.run import Job, open_masks, run
 from dudmap.app.pipeline.run_folder import RunReport, locked
-from dudmap.app.pipeline.storing import RunStore, Storing, check_recording, restored, stored_options
+from dudmap.app.pipeline.storing import RunStore, check_recording, stored_options
 from dudmap.app.state.system import on_device
-from dudmap.config import Config
 from dudmap.errors import StateError
 from dudmap.input_files import damaged
-from dudmap.io.sequences import is_timed
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.io.sequences import Sequence
-    from dudmap.io.sequences.masks import MaskFolder
 
 
 def resume(
@@ -47,55 +44,38 @@ def resume(
             dudmap wrote it, or it is damaged.
         DudmapError: As for ``run``; or the run is still alive, or another one writes into the folder.
     """
-    from dudmap.core.map.memory_limit import MemoryLimit
     from dudmap.core.places.saved_map import SavedMap
-    from dudmap.core.slam import Slam
+    from dudmap.io.sequences import open_sequence
 
     out = Path(out)
     if not out.is_dir():
         raise StateError(f"there is no run folder {out}")
     with locked(out):
-        reader, meta = stored_options(out)
+        reader, stored = stored_options(out)
         with closing(reader):
-            options = meta["options"]
+            options, storing = stored.options, stored.options.storing
             with damaged(StateError, reader.path):
-                sequence = open_recording(options["recording"]) if sequence is None else sequence
-                config = on_device(Config.model_validate_json(options["config"]), device)
-            check_recording(sequence, meta, out)
-            limit = None if options["max_memory"] is None else MemoryLimit(options["max_memory"])
-            if "pass" in meta:
-                display = RunProgress(options["count"] * options["passes"], bar=progress)
+                if storing is None:
+                    raise ValueError("it does not say of which recording it is")
+                sequence = open_sequence(**storing.recording) if sequence is None else sequence
+                options = options.model_copy(update={"config": on_device(options.config, device)})
+            check_recording(sequence, stored, out)
+            if stored.number is not None:
+                display = RunProgress(options.max_frames * options.passes, bar=progress)
+                masks = open_masks(options.masks, sequence)
+                job = Job(sequence, out, options, display, masks, observers=observers)
                 try:
-                    store = RunStore(out, options["every"], display.note)
-                    systems = (
-                        Slam(sequence.camera, config, max_blocks=limit, timed=is_timed(sequence)) for _ in range(2)
-                    )
-                    state = restored(reader, store, *systems)
+                    store = RunStore(out, storing.every, display.note)
+                    state = job.restored(reader, store)
                 except sqlite3.Error as error:
                     raise StateError(f"the state of the run in {out} cannot be read: {error}") from error
-                job = Job(
-                    sequence, config, out, options["count"], display, _masks(options["masks"], sequence),
-                    options["save_masks"], options["save_map"], options["ahead"], False, options["passes"], None,
-                    observers,
-                )  # fmt: skip
                 return job.carry_out(state, store)
-    saved = options["saved_map"]
+    config, folder = options.config, options.saved_map
+    saved_map = None if folder is None else SavedMap.load(folder, config.volume.voxel_size)
+    others = {name: value for name, value in options if name not in ("config", "saved_map")}
     return run(
-        sequence, config, out,
-        max_frames=options["count"], save_masks=options["save_masks"], save_map=options["save_map"],
-        masks=options["masks"], progress=progress, ahead=options["ahead"], passes=options["passes"],
-        depth_model=options["depth_model"], calibrate=True, localize=options["localize"],
-        saved_map=None if saved is None else SavedMap.load(saved, config.volume.voxel_size),
-        max_memory=options["max_memory"], observers=observers,
-        storing=Storing(options["recording"], options["every"], options["report"]),
-    )  # fmt: skip
-
-
-def open_recording(arguments: dict[str, Any]) -> "Sequence":
-    """The recording that a stored run is of."""
-    from dudmap.io.sequences import open_sequence
-
-    return open_sequence(**arguments)
+        sequence, config, out, saved_map=saved_map, calibrate=True, progress=progress, observers=observers, **others
+    )
 
 
 def wants_report(out: Path) -> bool:
@@ -104,12 +84,6 @@ def wants_report(out: Path) -> bool:
     Raises:
         StateError: The folder holds no run that can be continued.
     """
-    reader, meta = stored_options(out)
+    reader, stored = stored_options(out)
     reader.close()
-    return bool(meta["options"]["report"])
-
-
-def _masks(folder: str | None, sequence: "Sequence") -> "MaskFolder | None":
-    from dudmap.io.sequences.masks import MaskFolder
-
-    return None if folder is None else MaskFolder(folder, sequence.timestamps, sequence.camera)
+    return stored.options.storing is not None and stored.options.storing.report

@@ -1,17 +1,18 @@
 """Processing of a recording: reads frames, runs the SLAM system, records metrics and writes the run folder."""
 
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Generator, Iterable, Iterator
 from contextlib import ExitStack, closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from dudmap.app.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, in_real_time, load_kernels
+from dudmap.app.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, load_kernels, read_frame
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.replay import in_real_time
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
-from dudmap.app.pipeline.storing import RunState, RunStore, Storing, restored
+from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
 from dudmap.app.state.database import StateReader
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, FrameError
@@ -102,8 +103,6 @@ def run(
     """
     from dudmap.app.pipeline.calibration import calibrate_start
     from dudmap.core.calibration.depth_model import DepthModel
-    from dudmap.core.map.memory_limit import MemoryLimit
-    from dudmap.core.slam import Slam
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -123,39 +122,29 @@ def run(
         raise ConfigError("found passes = 2 with a saved map, which is kept; expected 1 pass")
     if storing is not None and live:
         raise ConfigError("a live replay cannot be stored: it does not stop for what is missed; drop live or storing")
+    map_folder = None if saved_map is None else saved_map.folder
+    options = RunOptions(
+        config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
+        live=live, passes=passes, depth_model=_resolved(depth_model), saved_map=_resolved(map_folder),
+        localize=localize, max_memory=max_memory, storing=storing,
+    )  # fmt: skip
     with locked(out):
-        given_masks = None if masks is None else _open_masks(masks, sequence)
+        display = RunProgress(count * passes, bar=progress)
+        job = Job(sequence, out, options, display, open_masks(masks, sequence), observe, observers)
         model = None if depth_model is None else DepthModel.load(Path(depth_model))
         prepare_run_folder(out, masks, save_masks=save_masks)
-        display = RunProgress(count * passes, bar=progress)
         store = None
         if storing is not None:
             store = RunStore(out, storing.every, display.note)
-            options = {
-                "recording": storing.recording, "report": storing.report, "every": storing.every, "count": count,
-                "masks": None if masks is None else str(Path(masks).resolve()), "save_masks": save_masks,
-                "save_map": save_map, "ahead": ahead, "passes": passes, "config": config.model_dump_json(),
-                "max_memory": max_memory, "localize": localize,
-                "saved_map": None if saved_map is None else str(saved_map.folder.resolve()),
-                "depth_model": None if depth_model is None else str(Path(depth_model).resolve()),
-            }  # fmt: skip
             store.order(sequence, options)
         if calibrate:
             calibration = calibrate_start(sequence, config, count, display.note if progress else None)
         calibration = calibration or sequence.calibration
-        slam = Slam(
-            sequence.camera, config, depth_model=model, calibration=calibration, live=live, saved_map=saved_map,
-            localize=localize, max_blocks=None if max_memory is None else MemoryLimit(max_memory),
-            timed=is_timed(sequence),
-        )  # fmt: skip
+        slam = job.system(depth_model=model, calibration=calibration, live=live, saved_map=saved_map, localize=localize)
         record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
         state = RunState(slam, record, calibration, model)
         if store is not None:
             store.begin(state)
-        job = Job(
-            sequence, config, out, count, display, given_masks, save_masks, save_map, ahead, live, passes, observe,
-            observers,
-        )  # fmt: skip
         return job.carry_out(state, store)
 
 
@@ -164,27 +153,34 @@ class Job:
     """A run as it was ordered; for the attributes see ``run``."""
 
     sequence: "Sequence"
-    config: Config
     out: Path
-    count: int
+    options: RunOptions
     display: RunProgress
     masks: "MaskFolder | None" = None
-    save_masks: bool = False
-    save_map: bool = True
-    ahead: int = AHEAD
-    live: bool = False
-    passes: int = 1
     observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None
     observers: "tuple[RunObserver, ...]" = ()
+
+    def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
+        """A new system for this recording."""
+        from dudmap.core.map.memory_limit import MemoryLimit
+        from dudmap.core.slam import Slam
+
+        limit = None if self.options.max_memory is None else MemoryLimit(self.options.max_memory)
+        timed = is_timed(self.sequence)
+        return Slam(self.sequence.camera, self.options.config, max_blocks=limit, timed=timed, **given)
+
+    def restored(self, reader: StateReader, store: RunStore) -> RunState:
+        """Where the run stood at the checkpoint in its database, where ``store`` goes on."""
+        return restored(reader, store, self.system(), self.system())
 
     def carry_out(self, state: RunState, store: RunStore | None = None) -> RunReport:
         """Process the frames from where the run stands, and write the run folder, which is locked; see ``run``."""
         out, display, stopped, defect = self.out, self.display, "", False
         with ExitStack() as files, display:
             try:
-                if self.live:
+                if self.options.live:
                     display.working("loading kernels")
-                    load_kernels(self._system(state, None), self.sequence, self.count)
+                    load_kernels(self._next_system(state), self.sequence, self.options.max_frames)
                 try:
                     self._process(state, store)
                 except DeviceError as error:
@@ -197,10 +193,10 @@ class Job:
                     display.note(_unmerged_submaps(state.slam))
                 if state.record.repeated:
                     display.note(_repeats(state.record))
-                if state.record.degenerate:
-                    display.note(f"{state.record.degenerate} frames do not show all directions of motion: not fused")
+                if degenerate := state.record.counts["degenerate"]:
+                    display.note(f"{degenerate} frames do not show all directions of motion: not fused")
                 if state.record.dropped:
-                    display.note(f"live: {state.record.dropped} of {self.count} frames were dropped")
+                    display.note(f"live: {state.record.dropped} of {self.options.max_frames} frames were dropped")
             except KeyboardInterrupt:
                 stopped = f"interrupted after {len(state.record.rows)} frames{_of_second(state.finished)}"
                 raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
@@ -212,73 +208,63 @@ class Job:
                 raise
             finally:
                 report = self._finish(state, store, stopped, defect=defect)
-        record = state.record
+        record, count = state.record, self.options.max_frames
         if record.rows and not len(report.trajectory):
-            raise DudmapError(
-                f"none of the {self.count} frames could be tracked; the first: {record.lost[0]['reason']}"
-            )
+            raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
         if not record.rows:
-            raise DatasetError(f"none of the {self.count} frames could be read; the first: {record.unreadable[0]}")
+            raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
         return report
 
     def _process(self, state: RunState, store: RunStore | None) -> None:
         """Process the frames of all passes that are left."""
-        for number in range(state.number, self.passes):
+        options = self.options
+        for number in range(state.number, options.passes):
             if number > state.number:
                 state.finished = state.slam, state.record
                 masked = state.record.masked and 0
-                state.slam = self._system(state, state.slam)
+                state.slam = self._next_system(state, first_pass=state.slam)
                 state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
                 state.number, state.next = number, 0
-            last = number == self.passes - 1
+            last = number == options.passes - 1
             for observer in self.observers:
                 if state.next:
-                    observer.resume(state.slam, self.out, self.count, state.next)
+                    observer.resume(state.slam, self.out, options.max_frames, state.next)
                 else:
-                    observer.start(state.slam, self.out, self.count)
-            with closing(
-                in_real_time(self.sequence, self.count, self.masks, state.slam, state.record.catch_up)
-                if self.live
-                else in_order(self.sequence, self.count, self.ahead, self.masks, state.slam, state.next)
-            ) as frames:
+                    observer.start(state.slam, self.out, options.max_frames)
+            mask_folder = self.out if options.save_masks and last else None
+            with closing(self._frames(state)) as frames:
                 for frame in frames:
                     process_source(
-                        frame,
-                        state.slam,
-                        state.record,
-                        self.display,
-                        self.out if self.save_masks and last else None,
-                        self.observe if last else None,
+                        frame, state.slam, state.record, self.display, mask_folder, self.observe if last else None,
                         self.observers,
-                    )
+                    )  # fmt: skip
                     state.next = frame.number + 1
                     if store is not None:
                         store.frame(state, frame.read.frame)
         if store is not None:
             store.end(state)
 
+    def _frames(self, state: RunState) -> Generator[SourceFrame]:
+        """The frames of a pass that are left."""
+        count, sequence, slam = self.options.max_frames, self.sequence, state.slam
+        if self.options.live:
+            times, idle = sequence.timestamps[:count], state.record.catch_up
+            return in_real_time(times, lambda index: read_frame(sequence, index, self.masks, slam), idle)
+        return in_order(sequence, count, self.options.ahead, self.masks, slam, state.next)
+
+    def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
+        """A new system with what is known of the camera; for a second pass with the first."""
+        return self.system(first_pass=first_pass, depth_model=state.model, calibration=state.calibration)
+
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
         """Where the run stood at its last checkpoint, from which it goes on on the CPU."""
-        from dudmap.core.slam import Slam
-
         store.close(finished=False)
         with closing(StateReader(store.database.path)) as reader:
             store = store.reopened()
-            limit, timed = state.slam.max_blocks, state.slam.motion.timed
-            systems = (Slam(self.sequence.camera, self.config, max_blocks=limit, timed=timed) for _ in range(2))
-            old, state = state, restored(reader, store, *systems)
+            old, state = state, self.restored(reader, store)
             self.display.note(f"frames {state.next} to {old.next - 1} are processed again, from the last checkpoint on")
             yield state, store
-
-    def _system(self, state: RunState, first_pass: "Slam | None") -> "Slam":
-        """A new system for this recording."""
-        from dudmap.core.slam import Slam
-
-        return Slam(
-            self.sequence.camera, self.config, first_pass=first_pass, depth_model=state.model,
-            calibration=state.calibration, timed=is_timed(self.sequence),
-        )  # fmt: skip
 
     def _finish(self, state: RunState, store: RunStore | None, stopped: str, *, defect: bool) -> RunReport:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
@@ -288,8 +274,9 @@ class Job:
             slam, record = state.finished
         complete = False
         try:
+            config, save_map = self.options.config, self.options.save_map
             report = write_run_folder(
-                self.out, slam, record, self.sequence, self.config, stopped, save_map=self.save_map, defect=defect
+                self.out, slam, record, self.sequence, config, stopped, save_map=save_map, defect=defect
             )
             for observer in self.observers:
                 observer.finish(self.out)
@@ -327,10 +314,15 @@ def _saved(finished: object) -> str:
     return whole if finished else "the trajectory and the map up to there are"
 
 
-def _open_masks(folder: str | Path, sequence: "Sequence") -> "MaskFolder":
+def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":
+    """The external masks of a run, if there are any."""
     from dudmap.io.sequences.masks import MaskFolder
 
-    return MaskFolder(folder, sequence.timestamps, sequence.camera)
+    return None if folder is None else MaskFolder(folder, sequence.timestamps, sequence.camera)
+
+
+def _resolved(path: str | Path | None) -> Path | None:
+    return None if path is None else Path(path).resolve()
 
 
 def process_source(
@@ -371,7 +363,7 @@ def process_source(
     end = time.perf_counter()
     if record.masked is not None:
         record.masked += given_mask is not None
-    delays = {} if source.arrival is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
+    delays = {} if record.dropped is None else {"dropped": source.dropped, "latency": 1000 * (end - source.arrival)}
     record.add(result, 1000 * (end - start), read.ms, true_mask, **delays)
     if mask_folder is not None and not result.rejected:
         try:

@@ -155,8 +155,6 @@ def write_run_folder(
     sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
     metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
     metrics["maps"] = len(others) + 1
-    noise = slam.depth_noise.fitted()
-    metrics["depth_noise"] = {"base": round(noise.base, 6), "scale": round(noise.scale, 6)}
     calibration = slam.calibration
     metrics["calibration"] = calibration.tree()
 

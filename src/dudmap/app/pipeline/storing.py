@@ -7,13 +7,17 @@ from datetime import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
 from dudmap.app.pipeline.environment import versions
+from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.state import schema
 from dudmap.app.state.checkpoints import Checkpoints
 from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
 from dudmap.app.state.system import check_code, restore
+from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
 from dudmap.input_files import DAMAGE, damaged, read_json
 from dudmap.own_folder import remove_files
@@ -28,14 +32,6 @@ if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 DATABASE = "state.db"
-OPTIONS = {
-    "recording": dict[str, Any], "report": bool, "every": float | None, "count": int, "masks": str | None,
-    "save_masks": bool, "save_map": bool, "ahead": int, "passes": int, "config": str, "max_memory": int | None,
-    "localize": bool, "saved_map": str | None, "depth_model": str | None,
-}  # fmt: skip
-"""What describes a run, and the types of its values."""
-PLACE = {"pass": int, "next": int, "frame": str}
-"""What says where a run stands, once it has begun."""
 FILES = DATABASE, f"{DATABASE}-wal", f"{DATABASE}-shm"
 
 
@@ -52,6 +48,43 @@ class Storing:
     recording: dict[str, Any]
     every: float | None = None
     report: bool = False
+
+
+class RunOptions(BaseModel):
+    """What a run was ordered with, under the names of the arguments of ``run``, as it is stored."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    config: Config
+    max_frames: int
+    save_masks: bool = False
+    save_map: bool = True
+    masks: Path | None = None
+    ahead: int = AHEAD
+    live: bool = False
+    passes: int = 1
+    depth_model: Path | None = None
+    saved_map: Path | None = None
+    localize: bool = False
+    max_memory: int | None = None
+    storing: Storing | None = None
+
+
+class StoredRun(BaseModel):
+    """What the database of a run says of it.
+
+    Attributes:
+        options: What it was ordered with.
+        recording: Fingerprint of the recording.
+        number: Number of the pass that goes on, None before the first frame.
+        next, frame: Number of the frame that comes next, and fingerprint of the one before.
+    """
+
+    options: RunOptions
+    recording: str
+    number: int | None = Field(default=None, alias="pass")
+    next: int = 0
+    frame: str = ""
 
 
 @dataclass(eq=False)
@@ -114,20 +147,16 @@ class RunStore:
         self.checkpoints = Checkpoints(self.database, every, notice)
         self._out, self._every, self._notice = out, every, notice
 
-    def order(self, sequence: "Sequence", options: dict[str, Any]) -> None:
+    def order(self, sequence: "Sequence", options: RunOptions) -> None:
         """Store what the run is, before anything that takes time.
-
-        Args:
-            sequence: The recording.
-            options: Everything else that a continued run needs, as plain values.
 
         Raises:
             DudmapError: It cannot be written.
         """
-        about = {"options": options, "recording": recording_fingerprint(sequence), "code": code_fingerprint()}
-        times = {"versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
+        about = {"options": options.model_dump(mode="json"), "recording": recording_fingerprint(sequence)}
+        about |= {"code": code_fingerprint(), "versions": versions(), "begun": datetime.now().isoformat(" ", "seconds")}
         try:
-            self.database.write_meta(about | times)
+            self.database.write_meta(about)
         except sqlite3.Error as error:
             raise DudmapError(f"the state of the run cannot be stored in {self.database.path}: {error}") from error
 
@@ -158,8 +187,8 @@ class RunStore:
             remove_files(self._out, {"": "|".join(map(re.escape, FILES))})
 
 
-def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
-    """The database of an unfinished run, and what describes the run.
+def stored_options(out: Path) -> tuple[StateReader, StoredRun]:
+    """The database of an unfinished run, and what it says of the run.
 
     Raises:
         StateError: There is none, the run is finished, or another version wrote it.
@@ -171,23 +200,22 @@ def stored_options(out: Path) -> tuple[StateReader, dict[str, Any]]:
     if not meta:
         raise StateError(f"the run in {out} ended before its first frame; begin it again with dudmap run")
     check_code(meta, out / DATABASE)
-    options, begun = meta.get("options"), any(key in meta for key in PLACE)
-    options = options if isinstance(options, dict) and isinstance(meta.get("recording"), str) else {}
-    known = all(schema.fits(options.get(key), kind) for key, kind in OPTIONS.items())
-    if not known or (begun and not all(schema.fits(meta.get(key), kind) for key, kind in PLACE.items())):
-        raise StateError(f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run")
-    return reader, meta
+    try:
+        return reader, StoredRun.model_validate(meta)
+    except ValidationError as error:
+        raise StateError(
+            f"{out / DATABASE} is damaged or not the state of a run; begin anew with dudmap run"
+        ) from error
 
 
-def check_recording(sequence: "Sequence", meta: dict[str, Any], out: Path) -> None:
+def check_recording(sequence: "Sequence", stored: StoredRun, out: Path) -> None:
     """Check that a recording is the one that a stored run is of.
 
     Raises:
         StateError: It is not.
     """
-    last = meta.get("frame")
-    same = recording_fingerprint(sequence) == meta["recording"]
-    if not same or (last and frame_fingerprint(sequence, meta["next"] - 1) != last):
+    same = recording_fingerprint(sequence) == stored.recording
+    if not same or (stored.frame and frame_fingerprint(sequence, stored.next - 1) != stored.frame):
         raise StateError(
             f"the recording {sequence.name} is not as it was when the run in {out} began; bring the old one back, or "
             "begin anew with dudmap run"

@@ -1,13 +1,12 @@
 """Blocks of the maps on their way into the database and back: only those that changed are copied and written."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.block_keys import MAP_SHIFT, MAX_MAPS, block_keys
 from dudmap.core.backends.cpu import hashing
 from dudmap.core.map.block_pager import Region
 from dudmap.core.map.block_window import BlockWindow
@@ -29,9 +28,9 @@ class MapSnapshot:
     Attributes:
         number: Number of the map in the database.
         map_id, frame: The map in this process, and its number of fused frames.
-        slots: (n,) int32 slots that were written.
-        keys: (n,) int64 keys of their blocks; -1 for a slot that was released.
-        voxels: (n, VOXELS) int32.
+        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) int32 of the blocks that were written.
+        released: Slots that hold no block any more.
+        num_slots: Number of slots in use; there are none behind them.
         away: Number of the content of each region that has left the memory.
         regions: Those of them that the database lacks.
     """
@@ -40,37 +39,20 @@ class MapSnapshot:
     map_id: int
     frame: int
     slots: NDArray[np.int32]
-    keys: NDArray[np.int64]
+    coords: NDArray[np.int32]
     voxels: NDArray[np.int32]
-    away: dict[Region, int] = field(default_factory=dict)
-    regions: list[tuple[Region, BlockRecords]] = field(default_factory=list)
+    released: NDArray[np.int32]
+    num_slots: int
+    away: dict[Region, int]
+    regions: list[tuple[Region, BlockRecords]]
 
 
-@dataclass(eq=False)
-class StoredMap:
-    """What is known of a map in the database: its number, the frame that it was stored after, the keys by slot, and the
-    numbers of the contents of its regions."""
+class StoredMap(NamedTuple):
+    """A map in the database: its number, the frame that it was stored after, the numbers of its regions' contents."""
 
     number: int
     frame: int
-    keys: NDArray[np.int64]
-    regions: dict[Region, int] = field(default_factory=dict)
-
-    def replaced(self, changed: MapSnapshot) -> NDArray[np.int64]:
-        """Keys (n,) that are no longer those of a slot that changed."""
-        known = changed.slots < len(self.keys)
-        old, new = self.keys[changed.slots[known]], changed.keys[known]
-        return old[(old >= 0) & (old != new)]
-
-    def update(self, changed: MapSnapshot) -> None:
-        """Take over what was written."""
-        needed = int(changed.slots.max(initial=-1)) + 1
-        if needed > len(self.keys):
-            grown = np.full(2 * needed, -1, np.int64)
-            grown[: len(self.keys)] = self.keys
-            self.keys = grown
-        self.keys[changed.slots] = changed.keys
-        self.frame, self.regions = changed.frame, changed.away
+    regions: dict[Region, int]
 
 
 class StoredMaps:
@@ -85,61 +67,40 @@ class StoredMaps:
         self._promised: dict[int, int] = {}  # numbers of maps that are not in the database yet
 
     def snapshot(self, volume: TsdfVolume) -> tuple[dict[str, Any], MapSnapshot]:
-        """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state.
-
-        Raises:
-            StateError: There are too many maps.
-        """
-        stored = self.by_id.get(volume.map_id)
-        if stored is None:
-            number = self._free_number(volume.map_id)
-            slots = volume.active_slots
-        else:
-            number, (slots, _) = stored.number, volume.written_since(stored.frame)
-        blocks = volume.blocks
-        keys = np.where(blocks.entry_of[slots] >= 0, block_keys(number, blocks.slot_coords[slots]), -1)
-        if stored is not None:  # slots that are no longer there since all blocks have left the memory
-            vacated = blocks.num_slots + np.flatnonzero(stored.keys[blocks.num_slots :] >= 0).astype(np.int32)
-            slots, keys = np.append(slots, vacated), np.append(keys, np.full(len(vacated), -1))
-        voxels = np.zeros((len(slots), VOXELS), np.int32)
-        kept = slots[slots < blocks.num_slots]
-        voxels[: len(kept), : VOXELS // 2] = blocks.geometry[kept]
-        voxels[: len(kept), VOXELS // 2 :] = blocks.colors[kept]
-        away, known = {}, {} if stored is None else stored.regions
-        regions = []
+        """Index of a map, and a copy of the blocks that the database lacks or has in an earlier state."""
+        stored, blocks = self.by_id.get(volume.map_id), volume.blocks
+        number = self._free_number(volume.map_id) if stored is None else stored.number
+        slots = volume.active_slots if stored is None else volume.written_since(stored.frame)[0]
+        used = blocks.entry_of[slots] >= 0
+        slots, released = slots[used], slots[~used]
+        voxels = np.concatenate([blocks.geometry[slots], blocks.colors[slots]], axis=1)
+        away = {} if volume.pager is None else volume.pager.away()
+        serials, regions = {region: serial for region, (serial, *_) in away.items()}, []
         if volume.pager is not None:
-            away = volume.pager.away()
-            unknown = [region for region, (serial, *_) in away.items() if known.get(region) != serial]
+            known = {} if stored is None else stored.regions
+            unknown = [region for region, serial in serials.items() if known.get(region) != serial]
             regions = [(region, volume.pager.records(region)) for region in unknown]
-        serials = {region: serial for region, (serial, *_) in away.items()}
-        frame = volume.num_integrated
-        changed = MapSnapshot(number, volume.map_id, frame, slots, keys, voxels, serials, regions)
+        changed = MapSnapshot(
+            number, volume.map_id, volume.num_integrated, slots, blocks.slot_coords[slots], voxels, released,
+            blocks.num_slots, serials, regions,
+        )  # fmt: skip
         return _index(volume) | {"away": _away_rows(away)}, changed
 
     def commit(self, maps: list[MapSnapshot]) -> None:
         """The blocks of these maps are in the database, and no other maps."""
-        for changed in maps:
-            self.by_id.setdefault(changed.map_id, StoredMap(changed.number, 0, np.empty(0, np.int64))).update(changed)
-        kept = {changed.map_id for changed in maps}
-        self.by_id = {map_id: stored for map_id, stored in self.by_id.items() if map_id in kept}
+        self.by_id = {changed.map_id: StoredMap(changed.number, changed.frame, changed.away) for changed in maps}
         self._promised = {}
 
     def add(self, volume: TsdfVolume, number: int) -> None:
         """A map has been read from the database."""
-        blocks = volume.blocks
-        coords = blocks.slot_coords[: blocks.num_slots]
-        keys = np.where(blocks.entry_of[: blocks.num_slots] >= 0, block_keys(number, coords), -1)
         regions = {} if volume.pager is None else {r: serial for r, (serial, *_) in volume.pager.away().items()}
-        self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, keys, regions)
+        self.by_id[volume.map_id] = StoredMap(number, volume.num_integrated, regions)
 
     def _free_number(self, map_id: int) -> int:
         """Number for a map that is not in the database; the same until the next ``commit``."""
         if map_id not in self._promised:
             used = {stored.number for stored in self.by_id.values()} | set(self._promised.values())
-            free = next(number for number in range(len(used) + 1) if number not in used)
-            if free >= MAX_MAPS:
-                raise StateError(f"there are more than {MAX_MAPS} maps, which the database cannot hold")
-            self._promised[map_id] = free
+            self._promised[map_id] = next(number for number in range(len(used) + 1) if number not in used)
         return self._promised[map_id]
 
 
@@ -174,9 +135,9 @@ def _away_rows(away: dict[Region, tuple[int, int, int, int]]) -> NDArray[np.int6
 def restore_map(
     volume: TsdfVolume,
     index: dict[str, Any],
-    keys: NDArray[np.int64],
     slots: NDArray[np.int64],
-    voxels: NDArray,
+    coords: NDArray[np.int64],
+    voxels: NDArray[np.int32],
     read_region: Callable[[Region], BlockRecords],
 ) -> None:
     """Fill a map, whose other attributes are set.
@@ -184,7 +145,7 @@ def restore_map(
     Args:
         volume: The map.
         index: Its part of the tree.
-        keys, slots, voxels: (n,), (n,), (n, VOXELS) of all its rows in the database.
+        slots, coords, voxels: (n,), (n, 3), (n, VOXELS) of all its rows in the database, by slot.
         read_region: Reads a region from there that has left the memory.
 
     Raises:
@@ -194,11 +155,7 @@ def restore_map(
     volume.clear()
     volume._frame_number, volume._left = frame_number, left
     owned = _check_index(index)
-    order = np.argsort(slots)
-    number = int(keys[0] >> MAP_SHIFT) if len(keys) else 0
-    if not np.array_equal(slots[order], owned) or not np.array_equal(
-        keys[order], block_keys(number, index["slot_coords"][owned])
-    ):
+    if not (np.array_equal(slots, owned) and np.array_equal(coords, index["slot_coords"][owned])):
         raise StateError(f"the stored map is damaged: {len(slots)} of {len(owned)} blocks fit its index")
     blocks = volume.blocks
     _restore_blocks(blocks, index, paged=volume.pager is not None)

@@ -1,6 +1,6 @@
 """The database of a run: one SQLite file, one transaction per checkpoint.
 
-Tables: ``blocks`` (voxels by map and Morton code), ``regions`` (blocks that have left the memory), ``frames`` (stored
+Tables: ``blocks`` (voxels by map and slot), ``regions`` (blocks that have left the memory), ``frames`` (stored
 frames), ``chunks`` (parts of arrays by their content), ``state`` (the tree), ``meta`` (what the run is). The
 write-ahead log makes a checkpoint whole or absent after a crash, and lets others read while it is written.
 """
@@ -20,10 +20,9 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.state.block_keys import MAP_SHIFT
 from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.app.state.frames import FrameSnapshot, StoredFrames
-from dudmap.app.state.tree import Snapshot, lines
+from dudmap.app.state.tree import Snapshot
 from dudmap.core.map.block_pager import Region
 from dudmap.core.map.region_store import COLUMNS, blobs_of, records_of
 from dudmap.core.map.voxel_blocks import BlockRecords
@@ -38,12 +37,12 @@ from dudmap.input_files import (
     SAFE_KINDS,
     inflated,
     parse_json,
-)
+)  # fmt: skip
 from dudmap.own_folder import OwnFolder
 
 APPLICATION = 0x44554453
 """Number in the header of the file that tells it from other SQLite databases: the letters DUDS."""
-SCHEMA = 2
+SCHEMA = 3
 CHUNK = 1 << 16
 """Bytes of an array that are stored together; a part that did not change is not written again."""
 STEPS, LIMIT = 10_000, 100_000
@@ -55,7 +54,8 @@ TABLES = """
 CREATE TABLE meta (key TEXT PRIMARY KEY, value TEXT NOT NULL);
 CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), crc INTEGER NOT NULL, tree BLOB NOT NULL);
 CREATE TABLE chunks (key BLOB PRIMARY KEY, content BLOB NOT NULL);
-CREATE TABLE blocks (key INTEGER PRIMARY KEY, slot INTEGER NOT NULL, crc INTEGER NOT NULL, voxels BLOB NOT NULL);
+CREATE TABLE blocks (map INTEGER, slot INTEGER, x INTEGER NOT NULL, y INTEGER NOT NULL, z INTEGER NOT NULL,
+                     crc INTEGER NOT NULL, voxels BLOB NOT NULL, PRIMARY KEY (map, slot));
 CREATE TABLE regions (map INTEGER, x INTEGER, y INTEGER, z INTEGER, level INTEGER, crc INTEGER NOT NULL, coords BLOB,
                       free_count BLOB, owners BLOB, geometry BLOB, colors BLOB, fused BLOB,
                       PRIMARY KEY (map, x, y, z, level));
@@ -111,14 +111,14 @@ class StateDatabase:
         Raises:
             sqlite3.Error: It cannot be written; the database holds the checkpoint before.
         """
+        texts = ("".join(json.dumps(record) + "\n" for record in records).encode() for records in snapshot.records)
         arrays = [self._described(array, n in snapshot.constant) for n, array in enumerate(snapshot.arrays)]
-        described = {"tree": snapshot.tree, "arrays": [one for one, _ in arrays], "records": []}
-        parts = {key: part for _, found in arrays for key, part in found.items()}
-        for records in snapshot.records:
-            one, found = self._described(np.frombuffer(lines(records).encode(), np.uint8), constant=False)
-            described["records"].append(one)
-            parts |= found
-        used = {key for one in described["arrays"] + described["records"] for key in one["chunks"]}
+        records = [self._described(np.frombuffer(text, np.uint8), constant=False) for text in texts]
+        described = {
+            "tree": snapshot.tree, "arrays": [one for one, _ in arrays], "records": [one for one, _ in records],
+        }  # fmt: skip
+        parts = {key: part for _, found in arrays + records for key, part in found.items()}
+        used = {key for one, _ in arrays + records for key in one["chunks"]}
         tree = zlib.compress(json.dumps(described).encode(), 1)
         self._execute("BEGIN IMMEDIATE")
         try:
@@ -151,22 +151,23 @@ class StateDatabase:
 
     def _write_maps(self, maps: list[MapSnapshot]) -> None:
         run, known = self._connection.executemany, {stored.number: stored for stored in self.maps.by_id.values()}
-        current = {changed.map_id for changed in maps}
-        gone = {stored.number for map_id, stored in self.maps.by_id.items() if map_id not in current}
-        for number in gone:
-            self._execute("DELETE FROM blocks WHERE key >= ? AND key < ?", *_key_range(number))
+        for number in known.keys() - {changed.number for changed in maps}:
+            self._execute("DELETE FROM blocks WHERE map = ?", number)
             self._execute("DELETE FROM regions WHERE map = ?", number)
         for changed in maps:
             number, stored = changed.number, known.get(changed.number)
             if stored is not None:
-                run("DELETE FROM blocks WHERE key = ?", ((int(key),) for key in stored.replaced(changed)))
+                run("DELETE FROM blocks WHERE map = ? AND slot = ?", ((number, n) for n in changed.released.tolist()))
+                self._execute("DELETE FROM blocks WHERE map = ? AND slot >= ?", number, changed.num_slots)
                 back = ((number, *region) for region in stored.regions.keys() - changed.away.keys())
                 run("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", back)
             for region, records in changed.regions:
                 self._execute("DELETE FROM regions WHERE map = ? AND x = ? AND y = ? AND z = ?", number, *region)
-                rows = ((number, *region, *row) for row in _region_rows(records))
-                run(f"INSERT INTO regions VALUES ({', '.join('?' * 12)})", rows)
-            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?)", _block_rows(changed))
+                levels = ((n, _checksum(blobs), *blobs) for n, blobs in enumerate(blobs_of(records)))
+                run(f"INSERT INTO regions VALUES ({', '.join('?' * 12)})", ((number, *region, *row) for row in levels))
+            blocks = zip(changed.slots.tolist(), changed.coords.tolist(), changed.voxels, strict=True)
+            rows = ((number, slot, *coords, zlib.crc32(voxels), voxels.tobytes()) for slot, coords, voxels in blocks)
+            run("INSERT OR REPLACE INTO blocks VALUES (?, ?, ?, ?, ?, ?, ?)", rows)
 
     def _write_frames(self, frames: list[FrameSnapshot]) -> None:
         for changed in frames:
@@ -234,7 +235,10 @@ class StateReader:
         Raises:
             StateError: The database is damaged.
         """
-        return {key: _parsed(value, self.path) for key, value in self._rows("SELECT key, value FROM meta")}
+        try:
+            return {key: parse_json(value, exact=True) for key, value in self._rows("SELECT key, value FROM meta")}
+        except (ValueError, TypeError, AttributeError) as error:
+            raise self._damaged(error) from error
 
     def state(self) -> tuple[Any, list[NDArray], list[list[Any]]] | None:
         """Tree, arrays and records of the checkpoint; None if there is none yet.
@@ -260,30 +264,26 @@ class StateReader:
             records = [[parse_json(line, exact=True) for line in text.splitlines()] for text in texts]
             return described["tree"], arrays, records
         except (*DAMAGE, MemoryError) as error:
-            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+            raise self._damaged(error) from error
 
-    def blocks(
-        self, map_number: int, first: int = 0, last: int = (1 << MAP_SHIFT) - 1
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-        """Keys (n,), slots (n,) and voxels (n, VOXELS) of the blocks of a map with Morton codes in a range.
+    def blocks(self, map_number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
+        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of the blocks of a map, by slot.
 
         Raises:
             StateError: The database is damaged.
         """
-        start = map_number << MAP_SHIFT
-        select = "SELECT key, slot, crc, voxels FROM blocks WHERE key BETWEEN ? AND ? ORDER BY key"
-        rows = list(self._rows(select, start | first, start | last))
-        for key, slot, crc, content in rows:
-            whole = isinstance(slot, int) and isinstance(content, bytes) and len(content) == 4 * VOXELS
+        select = "SELECT slot, x, y, z, crc, voxels FROM blocks WHERE map = ? ORDER BY slot"
+        rows = list(self._rows(select, map_number))
+        for *place, crc, content in rows:
+            whole = all(isinstance(n, int) for n in place) and isinstance(content, bytes) and len(content) == 4 * VOXELS
             if not whole or zlib.crc32(content) != crc:
-                raise StateError(
-                    f"the state of the run in {self.path} is damaged: block {key} is not as it was written"
-                )
+                raise self._damaged(f"block {place[0]} is not as it was written")
         voxels = np.empty((len(rows), VOXELS), np.int32)
         for n in range(0, len(rows), ROWS):
-            part = b"".join(row[3] for row in rows[n : n + ROWS])
+            part = b"".join(row[5] for row in rows[n : n + ROWS])
             voxels[n : n + ROWS] = np.frombuffer(part, np.int32).reshape(-1, VOXELS)
-        return np.array([row[0] for row in rows], np.int64), np.array([row[1] for row in rows], np.int64), voxels
+        places = np.array([row[:4] for row in rows], np.int64).reshape(-1, 4)
+        return places[:, 0], places[:, 1:], voxels
 
     def region(self, map_number: int, region: Region) -> BlockRecords:
         """Blocks of a region of a map that had left the memory.
@@ -295,12 +295,11 @@ class StateReader:
         select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
         rows = list(self._rows(select, map_number, *region))
         try:
-            whole = all(row[0] == n and _checksum(row[2:]) == row[1] for n, row in enumerate(rows))
-            if not rows or not whole:
+            if not rows or any(row[0] != n or _checksum(row[2:]) != row[1] for n, row in enumerate(rows)):
                 raise ValueError("it is missing or not as it was written")
             return records_of([row[2:] for row in rows])
         except (ValueError, TypeError) as error:
-            raise StateError(f"the state of the run in {self.path} is damaged: region {region}: {error}") from error
+            raise self._damaged(f"region {region}: {error}") from error
 
     def frame(self, store: int, serial: int) -> EncodedFrame:
         """A stored frame by its serial: depth, colour and mask as files.
@@ -311,7 +310,7 @@ class StateReader:
         select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
         rows = list(self._rows(select, store, serial))
         if not rows or not all(isinstance(content, bytes) for content in rows[0]):
-            raise StateError(f"the state of the run in {self.path} is damaged: stored frame {serial} is missing")
+            raise self._damaged(f"stored frame {serial} is missing")
         depth, color, mask = rows[0]
         return depth, color, mask
 
@@ -334,7 +333,10 @@ class StateReader:
         except (sqlite3.Error, UnicodeDecodeError) as error:
             if "interrupted" in str(error) and self._left > 0:  # what ctrl-C raises in the handler ends here
                 raise KeyboardInterrupt from None
-            raise StateError(f"the state of the run in {self.path} is damaged: {error}") from error
+            raise self._damaged(error) from error
+
+    def _damaged(self, what: object) -> StateError:
+        return StateError(f"the state of the run in {self.path} is damaged: {what}")
 
     def _is_too_long(self) -> bool:
         """Whether a statement must end; called by SQLite, so that ctrl-C is heard."""
@@ -365,28 +367,11 @@ def _check_size(path: Path) -> None:
         raise StateError(f"{path} is damaged or not of this program: {stored} of its {status.st_size} bytes are there")
 
 
-def _region_rows(records: BlockRecords) -> Iterable[list[Any]]:
-    """Level, checksum and arrays of the blocks of a region, level by level."""
-    for level, blobs in enumerate(blobs_of(records)):
-        yield [level, _checksum(blobs), *blobs]
-
-
 def _checksum(blobs: Sequence[bytes | memoryview]) -> int:
     crc = 0
     for blob in blobs:
         crc = zlib.crc32(blob, crc)
     return crc
-
-
-def _key_range(number: int) -> tuple[int, int]:
-    return number << MAP_SHIFT, (number + 1) << MAP_SHIFT
-
-
-def _block_rows(changed: MapSnapshot) -> Iterable[tuple[int, int, int, bytes]]:
-    for slot, key, voxels in zip(changed.slots.tolist(), changed.keys.tolist(), changed.voxels, strict=True):
-        if key >= 0:
-            content = voxels.tobytes()
-            yield key, slot, zlib.crc32(content), content
 
 
 def _array(about: dict[str, Any], chunks: dict[str, bytes]) -> NDArray:
@@ -407,10 +392,3 @@ def _checked(key: str, content: bytes) -> bytes:
     if hashlib.blake2b(content, digest_size=16).hexdigest() != key:
         raise ValueError("an array is not as it was written")
     return content
-
-
-def _parsed(text: str, path: Path) -> Any:  # noqa: ANN401
-    try:
-        return parse_json(text, exact=True)
-    except (ValueError, TypeError, AttributeError) as error:
-        raise StateError(f"the state of the run in {path} is damaged: {error}") from error

@@ -8,14 +8,12 @@ import sys
 from collections import ChainMap, deque
 from collections.abc import Mapping
 from dataclasses import is_dataclass
-from functools import cache
+from functools import cache, cached_property
 from importlib import import_module
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
-
-from dudmap.app.state import wiring
 
 CLASSES = """
 app.pipeline.metrics:RunRecord
@@ -25,11 +23,12 @@ core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,Rea
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
-core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:_State,_PairSystems,_System,Adjustment
+core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.collector:KeyframeCollector core.calibration.depth_estimator:DepthView
 core.calibration.depth_model:DepthModel core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
-core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair core.calibration.self_calibration:SelfCalibration
-core.color_calibration:ColorCalibration core.dynamics.background_model:BackgroundModel
+core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
+core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
+core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
 core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
@@ -56,7 +55,7 @@ core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabas
 core.places.prior_map:PriorMap core.places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews
 core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap core.result:FrameResult
 core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
-core.tracking.depth_noise:DepthNoise core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
+core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
 core.tracking.front_end:FrontEnd core.tracking.gradient_agreement:GradientAgreement
 core.tracking.image_consistency:ImageComparison,ImageConsistency core.tracking.motion_model:MotionModel
 core.tracking.observability:Observability,GradientNoise core.tracking.pose_prediction:PosePrediction,PosePredictor
@@ -64,6 +63,31 @@ core.tracking.quality_monitor:RegistrationHistory,Verdict,QualityMonitor
 core.tracking.tracker:TrackingResult,Minimum,Tracker
 """
 """All classes whose objects may be stored, and made from what is stored: modules of this package and names in them."""
+NOT_STORED = {
+    "Atlas": ("make_volume",),
+    "BlockPager": (
+        "_store", "_executor", "_away", "_writing", "_reading", "_unchanged_since", "_serial", "_archived", "_archive",
+    ),
+    "FrameStore": ("registered", "_places", "_glimpses", "_file", "_encoder", "_pending", "archived"),
+    "KeyframeDatabase": ("_sift",),
+    "LoopCloser": ("_executor",),
+    "Observation": ("_halvings", "_recorded_halvings"),
+    "SimilarityTest": ("_sift",),
+    "Slam": ("device",),
+    "TsdfVolume": ("blocks", "window", "levels", "map_id"),
+}  # fmt: skip
+"""Attributes by class that a new object makes itself: connections, threads, files, what has a table of its own, what
+follows from other attributes, and what is of one process or device alone."""
+BACKENDS = frozenset({"CpuBackend", "WarpBackend"})
+"""Classes of back ends, which hold nothing that is part of the state: a new one may be of another device."""
+EVALUATED = {"FrameView": ("segmentation",), "KeyframeDatabase": ("_unsettled",)}
+"""Attributes that are functions without arguments, of which the result is stored."""
+CONSTANT = frozenset({"PlacedFeatures", "Preprocessor"})
+"""Classes whose arrays never change once they are made: they need not be copied for a snapshot."""
+RECORDS = {"RunRecord": ("rows", "lost", "movers", "unreadable", "checks")}
+"""Attributes that are lists of plain values which only grow; they are stored as lines of JSON."""
+COLUMNS = frozenset({"TimedPose"})
+"""Classes of which many objects stand in one list and nowhere else; they are stored attribute by attribute."""
 NUMBERS = (bool, int, float, np.generic)
 LARGEST_COUNT = 2**23
 """Largest number of equal things that are stored as one array."""
@@ -98,6 +122,29 @@ def class_of(name: object) -> type:
     return getattr(import_module(module), str(name).partition(":")[2])
 
 
+def not_stored(cls: type) -> set[str]:
+    """Attributes that objects of a class make themselves."""
+    return {name for base in cls.__mro__ for name in NOT_STORED.get(base.__name__, ())}
+
+
+def attributes(value: Any) -> dict[str, Any]:  # noqa: ANN401
+    """The attributes of an object that are its state, in the order in which they were set.
+
+    Values that ``functools.cached_property`` keeps are left out: they follow from the others.
+    """
+    left_out = not_stored(type(value))
+    return {
+        name: content
+        for name, content in vars(value).items()
+        if name not in left_out and not is_computed(type(value), name)
+    }
+
+
+def is_computed(cls: type, name: str) -> bool:
+    """Whether an attribute is one that ``functools.cached_property`` keeps."""
+    return isinstance(getattr(cls, name, None), cached_property)
+
+
 @cache
 def _names(cls: type) -> frozenset[str]:
     """Names that the attributes of an object may have."""
@@ -129,7 +176,7 @@ def check_attributes(cls: type, content: object, like: Mapping[str, Any]) -> Non
         ValueError: There is one too many, or one is missing.
     """
     needed = _names(cls) if is_dataclass(cls) else like.keys()
-    needed = {name for name in needed - wiring.rebuilt(cls) if not wiring.is_computed(cls, name)}
+    needed = {name for name in needed - not_stored(cls) if not is_computed(cls, name)}
     if not isinstance(content, dict) or not needed <= content.keys() <= _names(cls) | needed:
         found = sorted(content) if isinstance(content, dict) else content
         raise ValueError(f"found the attributes {found} of {cls.__name__}; expected {sorted(needed)}")
@@ -160,7 +207,7 @@ def is_alike(value: object, like: object) -> bool:
         return isinstance(value, NUMBERS)
     if isinstance(like, np.ndarray):
         return isinstance(value, np.ndarray) and value.dtype.kind == like.dtype.kind
-    backends = {type(value).__name__, type(like).__name__} <= wiring.BACKENDS
+    backends = {type(value).__name__, type(like).__name__} <= BACKENDS
     return type(value) is type(like) or backends
 
 

@@ -2,24 +2,23 @@
 
 The tree is found by walking through all attributes of all objects, so that no class needs to list what it remembers,
 and an attribute that is added later is stored without further work. What cannot be stored (a thread, an open file, a
-function) is an error unless ``wiring.py`` says how it is made again. Nothing is executed when a tree is read: objects
+function) is an error unless ``schema.py`` says how it is made again. Nothing is executed when a tree is read: objects
 are made of the classes of a table only, without calling them, and receive the attributes that ``schema.py`` allows.
 
 A node is a number, a text, None, or an object with one key that names its kind.
 """
 
-import json
 from collections import deque
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel
 
-from dudmap.app.state import schema, wiring
+from dudmap.app.state import schema
 from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
@@ -95,7 +94,7 @@ class TreeWriter:
             return {"same": self._seen[id(value)][0]}
         number = len(self._seen)
         self._seen[id(value)] = number, value
-        if type(value).__name__ in wiring.BACKENDS:
+        if type(value).__name__ in schema.BACKENDS:
             return {"backend": number}
         if isinstance(value, np.ndarray):
             return {"array": self._array(value, place, constant=constant), "id": number}
@@ -105,11 +104,6 @@ class TreeWriter:
             return {"random": value.bit_generator.state, "id": number}
         if isinstance(value, Future):
             return {"result": self._node(self._result(value), place), "id": number}
-        if isinstance(value, tuple | list | deque | dict | set | frozenset):
-            return self._container(value, place, number, constant=constant)
-        return self._object(value, place, number)
-
-    def _container(self, value: Any, place: str, number: int, *, constant: bool) -> Node:  # noqa: ANN401
         if isinstance(value, tuple):
             items = [self._node(item, f"{place}[{n}]", constant=constant) for n, item in enumerate(value)]
             node = {"tuple": items, "id": number}
@@ -121,7 +115,10 @@ class TreeWriter:
         if isinstance(value, dict):
             keys, content = list(value), list(value.values())
             return {"dict": self._items(keys, f"{place}.keys"), "values": self._items(content, place), "id": number}
-        return {"frozenset" if isinstance(value, frozenset) else "set": self._items(sorted(value), place), "id": number}
+        if isinstance(value, set | frozenset):
+            kind = "frozenset" if isinstance(value, frozenset) else "set"
+            return {kind: self._items(sorted(value), place), "id": number}
+        return self._object(value, place, number)
 
     def _items(self, items: list[Any], place: str) -> Node:
         """Items of a list: one by one, or as an array where they are many of one kind."""
@@ -132,8 +129,8 @@ class TreeWriter:
                 return {"numbers": self._add(np.array(items, np.int64 if kind is int else np.float64))}
             if kind is np.ndarray and items[0].size <= 64 and len({(a.shape, a.dtype) for a in items}) == 1:
                 return {"stack": self._add(np.stack(items))}
-            if kind.__name__ in wiring.COLUMNS and schema.is_state_class(kind):
-                names = list(wiring.attributes(items[0]))
+            if kind.__name__ in schema.COLUMNS and schema.is_state_class(kind):
+                names = list(schema.attributes(items[0]))
                 columns = [self._items([getattr(item, name) for item in items], f"{place}.{name}") for name in names]
                 return {"columns": schema.name_of(kind), "names": names, "values": columns, "count": len(items)}
         return [self._node(item, f"{place}[{n}]") for n, item in enumerate(items)]
@@ -142,7 +139,7 @@ class TreeWriter:
         cls = type(value)
         if not schema.is_state_class(cls) or not hasattr(value, "__dict__"):
             raise StateError(f"{place} is a {cls.__module__}.{cls.__qualname__}, which cannot be stored")
-        evaluated, records = wiring.EVALUATED.get(cls.__name__, ()), wiring.RECORDS.get(cls.__name__, ())
+        evaluated, records = schema.EVALUATED.get(cls.__name__, ()), schema.RECORDS.get(cls.__name__, ())
         node: dict[str, Node] = {"object": schema.name_of(cls), "id": number}
         if isinstance(value, TsdfVolume):
             state, changed = self._maps.snapshot(value)
@@ -153,7 +150,7 @@ class TreeWriter:
             self.snapshot.frames.append(changed)
             node |= {"store": changed.number}
         content = {}
-        for name, attribute in wiring.attributes(value).items():
+        for name, attribute in schema.attributes(value).items():
             where = f"{place}.{name}"
             if name in records:
                 self.snapshot.records.append(list(attribute))
@@ -161,16 +158,15 @@ class TreeWriter:
             elif name in evaluated:
                 content[name] = {"call": self._node(attribute(), where)}
             else:
-                content[name] = self._node(attribute, where, constant=cls.__name__ in wiring.CONSTANT)
+                content[name] = self._node(attribute, where, constant=cls.__name__ in schema.CONSTANT)
         return node | {"attributes": content}
 
     def _array(self, array: NDArray, place: str, *, constant: bool) -> int:
         if array.dtype.hasobject:
             raise StateError(f"{place} is an array of objects, which cannot be stored")
-        number = self._add(array if constant else array.copy(order="K"))
         if constant:
-            self.snapshot.constant.add(number)
-        return number
+            self.snapshot.constant.add(len(self.snapshot.arrays))
+        return self._add(array if constant else array.copy(order="K"))
 
     def _add(self, array: NDArray) -> int:
         self.snapshot.arrays.append(array)
@@ -204,7 +200,7 @@ class TreeReader:
         self._arrays, self._records = arrays, records
         self._load_map, self._load_frames, self._make_backend = load_map, load_frames, make_backend
         self._made: dict[int, Any] = {}
-        self._at: list[str] = []  # where the tree is being read
+        self._at: list[str] = []  # where the tree is being read, which an error names
         self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
         self._taken: set[int] = set()  # identities of the objects of the given system that are in use
 
@@ -228,31 +224,62 @@ class TreeReader:
             what = str(error) if type(error) is ValueError else f"{type(error).__name__} {error}"
             raise StateError(f"the stored state is damaged or not of this program, at {place}: {what}") from error
 
-    def _within(self, place: str, node: Node, current: Any = None) -> Any:  # noqa: ANN401
-        """Value of a part of the tree, whose place an error names."""
-        self._at.append(place)
-        value = self._value(node, current)
-        self._at.pop()
-        return value
-
     def _value(self, node: Node, current: Any = None) -> Any:  # noqa: ANN401
         if not isinstance(node, dict):
             return node
-        if "same" in node:
-            return self._made[node["same"]]
-        if "backend" in node:
-            usable = type(current).__name__ in wiring.BACKENDS and id(current) not in self._taken
-            return self._use(node["backend"], current if usable else self._make_backend())
-        if "scalar" in node:
-            kind = np.dtype(node["scalar"])
-            if kind.kind not in "biuf" or not isinstance(node["value"], bool | int | float):
-                raise ValueError(f"found a {kind} of {type(node['value']).__name__}; expected a number")
-            return kind.type(node["value"])
-        if "object" in node:
-            return self._object(node, current)
-        value = self._leaf(node) if "list" not in node and "dict" not in node and "deque" not in node else None
-        if value is None:
-            return self._mutable(node, current)
+        match node:
+            case {"same": number}:
+                return self._made[number]
+            case {"backend": number}:
+                usable = type(current).__name__ in schema.BACKENDS and id(current) not in self._taken
+                return self._use(number, current if usable else self._make_backend())
+            case {"scalar": name, "value": value}:
+                kind = np.dtype(name)
+                if kind.kind not in "biuf" or not isinstance(value, bool | int | float):
+                    raise ValueError(f"found a {kind} of {type(value).__name__}; expected a number")
+                return kind.type(value)
+            case {"records": number}:
+                return self._records[number]
+            case {"call": result}:
+                made = self._value(result)
+                return lambda: made
+            case {"object": _}:
+                return self._object(node, current)
+            case {"array": number}:
+                value = self._arrays[number]
+            case {"model": name, "json": text}:
+                cls = schema.class_of(name)
+                if not issubclass(cls, BaseModel):
+                    raise ValueError(f"{cls.__name__} is no configuration")
+                value = cls.model_validate_json(text)
+            case {"random": state}:
+                value = np.random.default_rng(0)
+                value.bit_generator.state = state
+            case {"result": result}:
+                value = Future()
+                value.set_result(self._value(result))
+            case {"tuple": items}:
+                value = self._tuple(self._items(items), node.get("class"))
+            case {"set": items}:
+                value = set(self._items(items))
+            case {"frozenset": items}:
+                value = frozenset(self._items(items))
+            case {"list": items, "id": number}:  # this and the next may be part of their own content
+                value = self._made[number] = []
+                value += self._items(items, current)
+            case {"deque": items, "limit": limit, "id": number}:
+                value = self._made[number] = deque(maxlen=limit)
+                value.extend(self._items(items))
+            case {"dict": names, "values": items, "id": number}:
+                value = self._made[number] = {}
+                keys = self._items(names)
+                known = [current.get(key) for key in keys] if isinstance(current, dict) else []
+                content = self._items(items, known)
+                if not all(map(schema.is_alike, content, known or content)):
+                    raise ValueError(f"found values of other types than those of {keys}")
+                value.update(zip(keys, content, strict=True))
+            case _:
+                raise ValueError(f"found a value of the kind {sorted(node)}")
         self._made[node["id"]] = value
         return value
 
@@ -262,59 +289,23 @@ class TreeReader:
         self._taken.add(id(value))
         return value
 
-    def _leaf(self, node: dict[str, Node]) -> Any:  # noqa: ANN401
-        """A value that holds no reference to itself."""
-        if "array" in node:
-            return self._arrays[node["array"]]
-        if "model" in node:
-            cls = schema.class_of(node["model"])
-            if not issubclass(cls, BaseModel):
-                raise ValueError(f"{cls.__name__} is no configuration")
-            return cls.model_validate_json(node["json"])
-        if "random" in node:
-            generator = np.random.default_rng(0)
-            generator.bit_generator.state = node["random"]
-            return generator
-        if "result" in node:
-            future: Future[Any] = Future()
-            future.set_result(self._value(node["result"]))
-            return future
-        if "tuple" in node:
-            items = self._items(node["tuple"])
-            if "class" not in node:
-                return tuple(items)
-            cls: Any = schema.class_of(node["class"])
-            if not issubclass(cls, tuple) or len(items) != len(getattr(cls, "_fields", ())):
-                raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
-            return tuple.__new__(cls, items)
-        items = self._items(node["frozenset"] if "frozenset" in node else node["set"])
-        return frozenset(items) if "frozenset" in node else set(items)
-
-    def _mutable(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
-        """A list, deque or dictionary, which may be part of its own content."""
-        if "list" in node:
-            value: Any = []
-            self._made[node["id"]] = value
-            value += self._items(node["list"], current)
-        elif "deque" in node:
-            value = deque(maxlen=node["limit"])
-            self._made[node["id"]] = value
-            value.extend(self._items(node["deque"]))
-        else:
-            value = {}
-            self._made[node["id"]] = value
-            keys = self._items(node["dict"])
-            known = [current.get(key) for key in keys] if isinstance(current, dict) else []
-            content = self._items(node["values"], known)
-            if not all(map(schema.is_alike, content, known or content)):
-                raise ValueError(f"found values of other types than those of {keys}")
-            value.update(zip(keys, content, strict=True))
-        return value
+    def _tuple(self, items: list[Any], name: str | None) -> tuple[Any, ...]:
+        if name is None:
+            return tuple(items)
+        cls: Any = schema.class_of(name)
+        if not issubclass(cls, tuple) or len(items) != len(getattr(cls, "_fields", ())):
+            raise ValueError(f"{cls.__name__} is no tuple of {len(items)} values")
+        return tuple.__new__(cls, items)
 
     def _items(self, node: Node, current: Any = None) -> list[Any]:  # noqa: ANN401
         if isinstance(node, list):
             known = current if isinstance(current, list) and len(current) == len(node) else [None] * len(node)
-            return [self._within(f"[{n}]", item, one) for n, (item, one) in enumerate(zip(node, known, strict=True))]
+            out = []
+            for n, (item, one) in enumerate(zip(node, known, strict=True)):
+                self._at.append(f"[{n}]")
+                out.append(self._value(item, one))
+                self._at.pop()
+            return out
         if "numbers" in node:
             return self._arrays[node["numbers"]].tolist()
         if "stack" in node:
@@ -327,31 +318,30 @@ class TreeReader:
         schema.check_attributes(cls, dict.fromkeys(node["names"]), {})
         out = []
         for values in zip(*columns, strict=True):
-            one = object.__new__(cls)
+            out.append(object.__new__(cls))
             for name, value in zip(node["names"], values, strict=True):
                 schema.check_value(cls, name, value, None)
-                object.__setattr__(one, name, value)
-            out.append(one)
+                object.__setattr__(out[-1], name, value)
         return out
 
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
         cls = schema.class_of(node["object"])
-        usable = type(current) is cls and id(current) not in self._taken and not _is_frozen(cls)
+        frozen = is_dataclass(cls) and cls.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+        usable = type(current) is cls and id(current) not in self._taken and not frozen
         if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
             raise ValueError(f"{cls.__name__} is no class of plain objects")
         value: Any = self._use(node["id"], current if usable else object.__new__(cls))
         content = node["attributes"]
-        like = self._new.setdefault(cls, wiring.attributes(current)) if usable else self._new.get(cls, {})
+        like = self._new.setdefault(cls, schema.attributes(current)) if usable else self._new.get(cls, {})
         schema.check_attributes(cls, content, like)
-        if not usable:
-            for name, default in _defaults(cls).items():
-                object.__setattr__(value, name, default)
+        for name, default in {} if usable else _defaults(cls).items():
+            object.__setattr__(value, name, default)
         for name, attribute in content.items():
             self._at.append(f".{name}")
-            made = self._attribute(attribute, getattr(current, name, None))
+            made = self._value(attribute, getattr(current, name, None))
             schema.check_value(cls, name, made, like.get(name))
-            object.__setattr__(value, name, made)
             self._at.pop()
+            object.__setattr__(value, name, made)
         if cls is Camera:
             value.__post_init__()  # its size decides how much memory is taken
         if "map" in node:
@@ -359,14 +349,6 @@ class TreeReader:
         if "store" in node:
             self._load_frames(value, node["store"])
         return value
-
-    def _attribute(self, node: Node, current: Any) -> Any:  # noqa: ANN401
-        if isinstance(node, dict) and "records" in node:
-            return self._records[node["records"]]
-        if isinstance(node, dict) and "call" in node:
-            result = self._value(node["call"])
-            return lambda: result
-        return self._value(node, current)
 
 
 def _defaults(cls: type) -> dict[str, Any]:
@@ -380,17 +362,7 @@ def _defaults(cls: type) -> dict[str, Any]:
     return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}
 
 
-def _is_frozen(cls: type) -> bool:
-    parameters = getattr(cls, "__dataclass_params__", None)
-    return parameters is not None and parameters.frozen
-
-
 def _class_name(value: object, place: str) -> str:
     if not schema.is_state_class(type(value)):
         raise StateError(f"{place} is a {schema.name_of(type(value))}, which cannot be stored")
     return schema.name_of(type(value))
-
-
-def lines(records: list[Any]) -> str:
-    """Plain values as lines of JSON."""
-    return "".join(json.dumps(record) + "\n" for record in records)

@@ -4,6 +4,7 @@ import ipaddress
 import re
 import secrets
 import socket
+import sys
 from collections.abc import Mapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -99,3 +100,15 @@ def is_loopback(host: str) -> bool:
         return ipaddress.ip_address(host).is_loopback
     except ValueError:
         return False
+
+
+def port_problem(host: str, port: int) -> str:
+    """Why no page can be served at a port; empty if one can."""
+    with socket.socket() as probe:
+        if sys.platform != "win32":  # where it would let two programs take one port
+            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        try:
+            probe.bind((host, port))
+        except OSError as error:
+            return error.strerror or str(error)
+    return ""

@@ -15,7 +15,7 @@ WIDTH = 320
 DEPTH_RANGE = 5.0
 """Depth at the end of the colour scale, metres: about the range of structured-light sensors."""
 RESIDUAL_RANGE = 0.05
-"""Residual at the ends of the colour scale, metres, as in the contact sheet."""
+"""Residual at the ends of the colour scale, metres."""
 KINDS = ("color", "depth", "mask", "residuals")
 """The images of a frame."""
 _NO_READING = np.array([40, 40, 40], dtype=np.uint8)
@@ -101,11 +101,11 @@ class FrameImages:
         }
 
 
-def depth_colors(depth: NDArray[np.floating]) -> NDArray[np.uint8]:
-    """Depth (h, w) in the colours of the turbo scale (h, w, 3), dark where there is no reading."""
+def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArray[np.uint8]:
+    """Depth (h, w) in the colours of the turbo scale (h, w, 3) up to ``far``, dark where there is no reading."""
     import cv2
 
-    scaled = np.clip(255 * depth / DEPTH_RANGE, 0, 255).astype(np.uint8)
+    scaled = np.clip(255 * depth / far, 0, 255).astype(np.uint8)
     colors = np.array(cv2.applyColorMap(scaled, cv2.COLORMAP_TURBO)[..., ::-1], dtype=np.uint8)
     colors[depth <= 0] = _NO_READING
     return colors

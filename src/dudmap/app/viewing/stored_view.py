@@ -46,6 +46,9 @@ def show_run(window: Window, run: RunFiles) -> None:
 
 def frames_of(run: RunFiles) -> list[FrameFigures]:
     """Pose, moving objects and figures of every processed frame; the residual of single frames is not stored."""
+    if not run.frames:  # maps of several runs that were merged have trajectories and no frames
+        pairs = zip(run.trajectory.timestamps.tolist(), run.trajectory.Ts_world_camera, strict=True)
+        return [FrameFigures(stamp, T, "", (), 0.0, np.nan, 0.0) for stamp, T in pairs]
     poses = {f"{t:.6f}": T for t, T in zip(run.trajectory.timestamps, run.trajectory.Ts_world_camera, strict=True)}
     with damaged(DudmapError, run.folder / "metrics.json"):
         reasons = {f"{row['timestamp']:.6f}": str(row["reason"]) for row in run.metrics.get("lost_frames", [])}

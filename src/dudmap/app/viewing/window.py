@@ -1,8 +1,6 @@
 """A page in the browser with the map, the camera, what moves, images and plots, served by viser."""
 
 import io
-import socket
-import sys
 import threading
 from contextlib import redirect_stdout
 from dataclasses import replace
@@ -11,9 +9,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.viewing.glb import glb
 from dudmap.app.viewing.mesh_feed import MeshChanges
-from dudmap.app.viewing.page_access import PageAccess
+from dudmap.app.viewing.page_access import PageAccess, port_problem
 from dudmap.app.viewing.picking import first_hit
 from dudmap.app.viewing.snapshot import KINDS, FrameFigures, jpeg
 from dudmap.core.geometry import se3
@@ -21,6 +18,7 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
 from dudmap.errors import DudmapError
 from dudmap.extras import extra
+from dudmap.io.exporting.gltf import encoded
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
@@ -30,6 +28,8 @@ MAX_IMAGES = 300
 PLOT_POINTS = 500
 """Points of a plot over time."""
 MOVER_COLORS = ((255, 77, 109), (77, 171, 247), (255, 212, 59), (105, 219, 124), (218, 119, 242), (59, 201, 219))
+LAYERS = {"map": "map", "path": "trajectory", "camera": "camera", "movers": "what moves"}
+"""Parts of the scene that can be hidden, by the first part of the names of their nodes, and their labels."""
 PATH_COLOR, CAMERA_COLOR, MARK_COLOR = (0, 150, 220), (255, 120, 40), (255, 200, 0)
 
 
@@ -54,7 +54,9 @@ class Window:
         with extra("view", "the page in the browser"):
             import viser  # pyright: ignore[reportMissingImports]
         self.access = PageAccess(host, port, token)
-        _check_port(host, port)
+        problem = port_problem(host, port)
+        if problem:  # viser would take another port without a word
+            raise DudmapError(f"cannot show a page at {host}:{port} ({problem}); name another --port or --host")
         self._lock = threading.RLock()
         with redirect_stdout(io.StringIO()):  # viser prints a banner, also where JSON is expected
             self._server = viser.ViserServer(host=host, port=port, verbose=False)
@@ -105,9 +107,8 @@ class Window:
                     self._remove(_mesh_name(key))
                 else:
                     self._chunks[key] = mesh
-                    visible = self._show_map.value
-                    name = _mesh_name(key)
-                    self._handles[name] = self._server.scene.add_glb(name, glb(mesh), visible=visible)
+                    file = encoded(mesh, double_sided=False)  # rooms are looked into from outside
+                    self._add(_mesh_name(key), "add_glb", file)
 
     def add_frames(self, frames: list[FrameFigures], poses: dict[float, NDArray] | None = None) -> None:
         """Append frames; ``poses`` (4, 4) by time replace those of earlier frames after a correction."""
@@ -187,11 +188,8 @@ class Window:
         self._follow = gui.add_checkbox("follow the run", initial_value=True)
         self._slider.on_update(lambda event: self._slide(event))
         self._follow.on_update(lambda _: self.show_frame(len(self._frames) - 1) if self._follow.value else None)
-        self._show_map = gui.add_checkbox("map", initial_value=True)
-        self._show_path = gui.add_checkbox("trajectory", initial_value=True)
-        self._show_camera = gui.add_checkbox("camera", initial_value=True)
-        self._show_movers = gui.add_checkbox("what moves", initial_value=True)
-        for control in (self._show_map, self._show_path, self._show_camera, self._show_movers):
+        self._layers = {layer: gui.add_checkbox(label, initial_value=True) for layer, label in LAYERS.items()}
+        for control in self._layers.values():
             control.on_update(lambda _: self._apply_visibility())
         self._point = gui.add_markdown("click on the map for a point, again for a distance")
         empty = np.zeros((48, 64, 3), dtype=np.uint8)
@@ -210,15 +208,13 @@ class Window:
             self.show_frame(int(self._slider.value))
 
     def _apply_visibility(self) -> None:
-        wanted = {
-            "/map/": self._show_map.value, "/path": self._show_path.value, "/camera": self._show_camera.value,
-            "/movers/": self._show_movers.value,
-        }  # fmt: skip
         with self._lock:
             for name, handle in self._handles.items():
-                for prefix, visible in wanted.items():
-                    if name.startswith(prefix):
-                        handle.visible = visible
+                handle.visible = self._is_visible(name)
+
+    def _is_visible(self, name: str) -> bool:
+        control = self._layers.get(name.split("/")[1])
+        return control is None or control.value
 
     # -- scene --------------------------------------------------------------------------------------------------------
 
@@ -228,10 +224,7 @@ class Window:
             return
         points = points[np.unique(np.linspace(0, len(points) - 1, 2000).astype(int))]
         segments = np.stack([points[:-1], points[1:]], axis=1).astype(np.float32)
-        self._add(
-            "/path", "add_line_segments", points=segments, colors=PATH_COLOR, thickness=0.008,
-            visible=self._show_path.value,
-        )  # fmt: skip
+        self._add("/path", "add_line_segments", points=segments, colors=PATH_COLOR, thickness=0.008)
 
     def _draw_camera(self, frame: FrameFigures) -> None:
         if frame.T_world_camera is None or self._camera is None:
@@ -243,24 +236,19 @@ class Window:
             return
         height, width = self._camera.shape
         fov = 2 * np.arctan(height / 2 / self._camera.fy)
-        self._add(
-            "/camera", "add_camera_frustum", fov=float(fov), aspect=width / height, scale=0.15, color=CAMERA_COLOR,
-            visible=self._show_camera.value, **place,
-        )  # fmt: skip
+        look = {"fov": float(fov), "aspect": width / height, "scale": 0.15, "color": CAMERA_COLOR}
+        self._add("/camera", "add_camera_frustum", **look, **place)
 
     def _draw_movers(self, frame: FrameFigures) -> None:
         for name in [name for name in self._handles if name.startswith("/movers/")]:
             self._remove(name)
-        visible = self._show_movers.value
         for mover in frame.movers:
             color, center = MOVER_COLORS[mover.id % len(MOVER_COLORS)], mover.box.mean(axis=0)
-            self._add(
-                f"/movers/{mover.id}/box", "add_box", color=color, dimensions=mover.box[1] - mover.box[0],
-                position=center, wireframe=True, visible=visible,
-            )  # fmt: skip
+            box = {"color": color, "dimensions": mover.box[1] - mover.box[0], "position": center, "wireframe": True}
+            self._add(f"/movers/{mover.id}/box", "add_box", **box)
             above = np.array([center[0], mover.box[0, 1], center[2]])
             text = f"{mover.id}: {mover.speed:.2f} m/s"
-            self._add(f"/movers/{mover.id}/label", "add_label", text=text, position=above, visible=visible)
+            self._add(f"/movers/{mover.id}/label", "add_label", text=text, position=above)
 
     def _draw_images(self, timestamp: float) -> None:
         import cv2
@@ -278,8 +266,9 @@ class Window:
         self._residual_plot.visible = bool(np.isfinite(residuals).any())  # a run folder does not hold them
         self._residual_plot.data = (t, np.nan_to_num(residuals))
 
-    def _add(self, name: str, method: str, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
-        self._handles[name] = getattr(self._server.scene, method)(name, **values)
+    def _add(self, name: str, method: str, *content: Any, **values: Any) -> None:  # noqa: ANN401 - arguments of viser
+        visible = self._is_visible(name)
+        self._handles[name] = getattr(self._server.scene, method)(name, *content, visible=visible, **values)
 
     def _remove(self, name: str) -> None:
         handle = self._handles.pop(name, None)
@@ -298,17 +287,3 @@ def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known wh
 def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
     """The frame with the corrected pose of its time, if there is one."""
     return replace(frame, T_world_camera=poses.get(frame.timestamp, frame.T_world_camera))
-
-
-def _check_port(host: str, port: int) -> None:
-    """Check that the page can be served there; viser would take another port without a word."""
-    with socket.socket() as probe:
-        if sys.platform != "win32":  # where it would let two programs take one port
-            probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-        try:
-            probe.bind((host, port))
-        except OSError as error:
-            reason = error.strerror or error
-            raise DudmapError(
-                f"cannot show a page at {host}:{port} ({reason}); name another --port or --host"
-            ) from None

@@ -1,7 +1,6 @@
 """What stands behind the things that move: depth from the map, colour from other frames of the recording."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,22 +42,8 @@ class Source:
     gain: NDArray[np.float64]
 
 
-class Background(NamedTuple):
-    """The static scene as a frame would have shown it.
-
-    Attributes:
-        color: (h, w, 3) uint8; where it is not known, a smooth continuation of what is.
-        depth: (H, W) float32, metres, 0 where it is not known.
-        known: (h, w) bool, whether the colour is known.
-    """
-
-    color: NDArray[np.uint8]
-    depth: NDArray[np.float32]
-    known: NDArray[np.bool_]
-
-
 class BackgroundRenderer:
-    """Renders the background of frames of one recording.
+    """Renders the static scene behind what moves in the frames of one recording.
 
     Args:
         volume: The map.
@@ -123,29 +108,6 @@ class BackgroundRenderer:
         color[rows, columns] = np.clip(np.rint(values), 0, 255).astype(np.uint8)
         known[rows, columns] = True
         return color, known
-
-    def render(
-        self,
-        frame: Frame,
-        replaced: NDArray[np.bool_],
-        moving: NDArray[np.bool_],
-        T_world_camera: NDArray[np.float64],
-        colors: tuple[NDArray[np.uint8], NDArray[np.bool_]],
-    ) -> Background:
-        """Background of a frame where something moves; elsewhere its images are as recorded.
-
-        Args:
-            frame: The frame.
-            replaced: Pixels (H, W) of the depth image to replace.
-            moving: Pixels (h, w) of the colour image to replace.
-            T_world_camera: (4, 4) pose of the depth image.
-            colors: What ``colors`` gives for these pixels, or for more.
-        """
-        depth = np.where(replaced, self.map_depth(T_world_camera), frame.depth).astype(np.float32)
-        found, seen = colors
-        color = np.where((moving & seen)[..., None], found, frame.color)
-        known = seen | ~moving
-        return Background(continued(color, known), depth, known)
 
     def map_depth(self, T_world_camera: NDArray[np.float64]) -> NDArray[np.float32]:
         """Depth (H, W) of the map as the depth camera sees it, metres, 0 where nothing is known."""

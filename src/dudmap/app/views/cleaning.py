@@ -8,10 +8,9 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.views.background import Background, BackgroundRenderer
-from dudmap.atomic_file import write_bytes, write_text
+from dudmap.app.views.background import BackgroundRenderer, continued
+from dudmap.app.views.tum_folder import TumFolder, camera_lines, depth_units
 from dudmap.core.frames.frame import Frame
-from dudmap.core.geometry.camera import Camera
 from dudmap.errors import DatasetError, FrameError
 from dudmap.io.exporting.run_content import RunContent
 from dudmap.io.exporting.view_synthesis import index_at
@@ -46,13 +45,17 @@ class Cleaned(NamedTuple):
         frame: As recorded.
         moving: (h, w) bool, replaced pixels of the colour image.
         replaced: (H, W) bool, replaced pixels of the depth image: the same, and shadows without readings.
-        background: What the pixels were replaced by.
+        color: (h, w, 3) uint8; where it is not known, a smooth continuation of what is.
+        depth: (H, W) float32, metres, 0 where it is not known.
+        known: (h, w) bool, whether the colour is known.
     """
 
     frame: Frame
     moving: NDArray[np.bool_]
     replaced: NDArray[np.bool_]
-    background: Background
+    color: NDArray[np.uint8]
+    depth: NDArray[np.float32]
+    known: NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
@@ -110,22 +113,17 @@ class Cleaner:
             raise DatasetError(f"{run.folder} lacks calibration.toml, which a camera for colour needs; repeat the run")
         color_camera = sequence.camera if run.calibration is None else run.calibration.camera
         self._renderer = BackgroundRenderer(run.volume, sequence.camera, color_camera, registered=self.registered)
-        self._is_prepared = False
-
-    def prepare(self) -> None:
-        """Read the frames that lend their colours."""
-        step = max(1, -(-len(self.indices) // SOURCES))
-        for index in self.indices[::step]:
+        for index in self.indices[:: max(1, -(-len(self.indices) // SOURCES))]:
             try:
-                frame = self.sequence[index]
+                frame = sequence[index]
             except FrameError:
                 continue
             T_world_camera, T_world_color = self._poses[index], self._color_pose(frame)
-            moving = self._renderer.in_color(self.moving(index, frame), frame, T_world_camera, T_world_color)
+            moving = self._moving(index, frame, self._renderer.map_depth(T_world_camera))
+            moving = self._renderer.in_color(moving, frame, T_world_camera, T_world_color)
             self._renderer.add(frame, moving, T_world_camera, T_world_color)
-        self._is_prepared = True
 
-    def moving(self, index: int, frame: Frame) -> NDArray[np.bool_]:
+    def _moving(self, index: int, frame: Frame, behind: NDArray[np.float32]) -> NDArray[np.bool_]:
         """Pixels (H, W) of a frame that are replaced: its mask, what lies in front of the map beside it, and a margin.
 
         Raises:
@@ -134,31 +132,29 @@ class Cleaner:
         mask, width = read_mask(self._masks[index]), self.sequence.camera.width
         if mask.shape != frame.depth.shape:
             raise DatasetError(f"the masks of {self.run.folder} do not have the size of the frames")
-        behind = self._renderer.map_depth(self._poses[index])
         in_front = (frame.depth > 0) & (frame.depth < (1 - IN_FRONT) * behind)
         return grown(mask | (in_front & grown(mask, REACH * width)), MARGIN * width)
 
     def clean(self, index: int) -> Cleaned:
         """Frame number ``index`` without what moves."""
-        if not self._is_prepared:
-            self.prepare()
         frame, T_world_camera = self.sequence[index], self._poses[index]
         T_world_color = self._color_pose(frame)
-        replaced = self.moving(index, frame)
-        moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
         behind = self._renderer.map_depth(T_world_camera)
+        replaced = self._moving(index, frame, behind)
+        moving = self._renderer.in_color(replaced, frame, T_world_camera, T_world_color)
         asked, surely = grown(moving, REACH * moving.shape[1]), None
         if self.registered:  # what is too near for the sensor has no readings, and its colours tell it
             asked |= connected(replaced, (frame.depth == 0) & (behind > 0))
             surely = (frame.depth > 0) & (np.abs(frame.depth - behind) < IN_FRONT * behind)
-        color, known = self._renderer.colors(frame, asked, T_world_color)
-        left = unlike(frame.color, color, asked & ~moving & known, surely)
+        found, seen = self._renderer.colors(frame, asked, T_world_color)
+        left = unlike(frame.color, found, asked & ~moving & seen, surely)
         if self.registered:
             replaced = replaced | left
         replaced = with_shadow(replaced, frame.depth, behind)
         moving = moving | left
-        background = self._renderer.render(frame, replaced, moving, T_world_camera, (color, known))
-        return Cleaned(frame, moving, replaced, background)
+        known = seen | ~moving
+        color = continued(np.where((moving & seen)[..., None], found, frame.color), known)
+        return Cleaned(frame, moving, replaced, color, np.where(replaced, behind, frame.depth), known)
 
     def _color_pose(self, frame: Frame) -> NDArray[np.float64]:
         return self.run.color_pose(frame.timestamp if frame.color_timestamp is None else frame.color_timestamp)
@@ -246,82 +242,39 @@ def clean_recording(
     """
     if out.exists() and (not out.is_dir() or any(path.name != "run" for path in out.iterdir())):
         raise DatasetError(f"{out} exists and is not an empty folder; name another one")
-    cleaner = Cleaner(run, sequence)
+    cleaner, camera = Cleaner(run, sequence), sequence.camera
     masks = ("replaced", "unknown") + (() if cleaner.registered else ("replaced_color", "unknown_color"))
-    for name in ("rgb", "depth", *masks):
-        (out / name).mkdir(parents=True, exist_ok=True)
-    lines: list[tuple[str, str]] = []
+    folder = TumFolder(out, f"{sequence.name} without what moves, by dudmap clean", ("rgb", "depth", *masks))
     wanted = range(len(sequence))[:max_frames]
     indices = [index for index in cleaner.indices if index in wanted]
-    shares, left_out = [], sorted(set(wanted) - set(indices))
+    pairs, shares, left_out = [], [], sorted(set(wanted) - set(indices))
     for done, index in enumerate(indices, start=1):
         try:
             cleaned = cleaner.clean(index)
         except FrameError:
             left_out.append(index)
             continue
-        lines.append(_write_frame(out, cleaned, sequence.camera.depth_scale))
-        shares.append((float(cleaned.moving.mean()), float(_unknown_color(cleaned).mean())))
+        frame = cleaned.frame
+        unknown_color, unknown = cleaned.moving & ~cleaned.known, cleaned.replaced & (cleaned.depth == 0)
+        images = {"replaced": cleaned.replaced, "unknown": unknown | unknown_color if cleaner.registered else unknown}
+        if not cleaner.registered:
+            images |= {"replaced_color": cleaned.moving, "unknown_color": unknown_color}
+        for kind, image in images.items():
+            folder.add(kind, frame.timestamp, image)
+        color_time = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
+        color = folder.add("rgb", color_time, cleaned.color)
+        pairs.append(f"{color} {folder.add('depth', frame.timestamp, depth_units(cleaned.depth, camera))}")
+        shares.append((float(cleaned.moving.mean()), float(unknown_color.mean())))
         if progress is not None:
             progress(done, len(indices))
-    _write_lists(out, run, sequence, lines, masks)
-    replaced, unknown = np.mean(shares, axis=0) if shares else (0.0, 0.0)
-    return CleanReport(len(lines), tuple(sorted(left_out)), float(replaced), float(unknown))
-
-
-def _unknown_color(cleaned: Cleaned) -> NDArray[np.bool_]:
-    return cleaned.moving & ~cleaned.background.known
-
-
-def _write_frame(out: Path, cleaned: Cleaned, depth_scale: float) -> tuple[str, str]:
-    """Write the images of a frame; returns the times of colour and depth as text."""
-    import cv2
-
-    frame, background = cleaned.frame, cleaned.background
-    stamp = f"{frame.timestamp:.6f}"
-    color_stamp = stamp if frame.color_timestamp is None else f"{frame.color_timestamp:.6f}"
-    units = np.rint(background.depth * depth_scale)
-    unknown, masks = cleaned.replaced & (background.depth == 0), {}
-    if (out / "replaced_color").is_dir():
-        masks = {"replaced_color": cleaned.moving, "unknown_color": _unknown_color(cleaned)}
-    else:
-        unknown |= _unknown_color(cleaned)
-    masks |= {"replaced": cleaned.replaced, "unknown": unknown}
-    images = {
-        f"rgb/{color_stamp}.png": background.color[..., ::-1],
-        f"depth/{stamp}.png": np.where(units > 65535, 0, units).astype(np.uint16),
-        **{f"{name}/{stamp}.png": mask.astype(np.uint8) * 255 for name, mask in masks.items()},
-    }
-    for name, image in images.items():
-        write_bytes(out / name, cv2.imencode(".png", image)[1].tobytes(), sync=False)
-    return color_stamp, stamp
-
-
-def _write_lists(
-    out: Path, run: RunContent, sequence: "Sequence", lines: list[tuple[str, str]], masks: tuple[str, ...]
-) -> None:
-    camera = sequence.camera
-    lists = {
-        "rgb.txt": [f"{color} rgb/{color}.png" for color, _ in lines],
-        "associations.txt": [f"{color} rgb/{color}.png {depth} depth/{depth}.png" for color, depth in lines],
-        **{f"{name}.txt": [f"{t} {name}/{t}.png" for _, t in lines] for name in ("depth", *masks)},
-    }
-    for name, rows in lists.items():
-        text = "\n".join([f"# {sequence.name} without what moves, by dudmap clean", *rows])
-        write_text(out / name, text + "\n")
-    numbers = [*_numbers(camera), f"depth_scale {camera.depth_scale}"]
+    lines = []
     if sequence.calibration is not None and run.calibration is not None:
-        numbers += [f"color_{line}" for line in _numbers(run.calibration.camera)]
         T = np.linalg.inv(run.calibration.T_color_depth)
-        numbers.append("T_depth_color " + " ".join(f"{value:.9g}" for value in T.reshape(-1)))
-    write_text(out / "intrinsics.txt", "\n".join(numbers) + "\n")
+        lines = [f"color_{line}" for line in camera_lines(run.calibration.camera)]
+        lines.append("T_depth_color " + " ".join(f"{value:.9g}" for value in T.reshape(-1)))
+    folder.finish(camera, pairs, lines)
     run.trajectory.save(out / "trajectory.txt")
     if sequence.ground_truth is not None:
         sequence.ground_truth.save(out / "groundtruth.txt")
-
-
-def _numbers(camera: Camera) -> list[str]:
-    """Lines of intrinsics.txt."""
-    lines = [f"{key} {getattr(camera, key)}" for key in ("fx", "fy", "cx", "cy", "width", "height")]
-    lens = zip(("k1", "k2", "p1", "p2", "k3"), camera.distortion, strict=False)
-    return [*lines, *(f"{key} {value}" for key, value in lens)]
+    replaced, unknown = np.mean(shares, axis=0) if shares else (0.0, 0.0)
+    return CleanReport(len(pairs), tuple(sorted(left_out)), float(replaced), float(unknown))

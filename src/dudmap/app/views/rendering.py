@@ -6,8 +6,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.app.views.tum_folder import TumFolder, depth_units
 from dudmap.app.views.video import CODECS, VideoWriter
-from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
@@ -100,8 +100,18 @@ def render_run(
                     progress(number, len(trajectory))
         return len(trajectory)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
-        raise DatasetError(f"{out} exists and is not an empty folder; name another one, or a video ({_endings()})")
-    _write_folder(run, trajectory, out, camera, progress)
+        raise DatasetError(
+            f"{out} exists and is not an empty folder; name another one, or a video ({', '.join(CODECS)})"
+        )
+    folder = TumFolder(out, f"views of {run.folder.name}", ("rgb", "depth"))
+    for number, (stamp, T) in enumerate(zip(trajectory.timestamps, trajectory.Ts_world_camera, strict=True), start=1):
+        color, depth = _view(run, T, camera)
+        folder.add("rgb", stamp, color)
+        folder.add("depth", stamp, depth_units(depth, camera))
+        if progress is not None:
+            progress(number, len(trajectory))
+    folder.finish(camera)
+    trajectory.save(out / "groundtruth.txt")
     return len(trajectory)
 
 
@@ -111,35 +121,6 @@ def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDAr
     return np.where(seen.depth[..., None] > 0, seen.color, np.uint8(EMPTY)), seen.depth
 
 
-def _write_folder(
-    run: RunContent, trajectory: Trajectory, out: Path, camera: Camera, progress: Callable[[int, int], None] | None
-) -> None:
-    import cv2
-
-    for name in ("rgb", "depth"):
-        (out / name).mkdir(parents=True, exist_ok=True)
-    lists: dict[str, list[str]] = {"rgb": [], "depth": []}
-    for number, (stamp, T) in enumerate(zip(trajectory.timestamps, trajectory.Ts_world_camera, strict=True), start=1):
-        color, depth = _view(run, T, camera)
-        units = np.rint(depth * camera.depth_scale)
-        images = {"rgb": color[..., ::-1], "depth": np.where(units > 65535, 0, units).astype(np.uint16)}
-        for name, image in images.items():
-            path = f"{name}/{stamp:.6f}.png"
-            write_bytes(out / path, cv2.imencode(".png", image)[1].tobytes(), sync=False)
-            lists[name].append(f"{stamp:.6f} {path}")
-        if progress is not None:
-            progress(number, len(trajectory))
-    for name, lines in lists.items():
-        write_text(out / f"{name}.txt", "\n".join([f"# views of {run.folder.name}", *lines]) + "\n")
-    keys = ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")
-    write_text(out / "intrinsics.txt", "".join(f"{key} {getattr(camera, key)}\n" for key in keys))
-    trajectory.save(out / "groundtruth.txt")
-
-
 def up_for_orbit(run: RunContent, up: tuple[float, float, float] | None) -> NDArray[np.float64]:
     """Unit vector (3,) against gravity, given or found in the map."""
     return up_of(run, ExportOptions(up=up))
-
-
-def _endings() -> str:
-    return ", ".join(CODECS)

@@ -113,19 +113,6 @@ class Backend(Protocol):
         """
         ...
 
-    def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
-    ) -> NDArray[np.uint8]:
-        """Mean colour (H, W, 3) uint8 of the surface within a voxel of each reading.
-
-        Args:
-            color: (H, W, 3) uint8.
-            depth: (H, W) float32, metres, 0 = none; pixels without a reading keep their colour.
-            focal: Focal length, pixels.
-            voxel_size: Metres.
-        """
-        ...
-
     def fuse(
         self,
         grid: VoxelGrid,

@@ -3,7 +3,7 @@
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.core.backends.median import median
+from dudmap.core.backends.threads import kernel
 from dudmap.core.frames.observation import Level
 
 LARGE_GAIN, MORE_ROUNDS, MAX_GAIN = 1.25, 3, 4.0
@@ -64,19 +64,28 @@ def fit_exposure(
     return exposure
 
 
+@kernel
 def _fit(x: NDArray[np.float64], y: NDArray[np.float64]) -> tuple[float, float]:
     """One robust fit of ``gain * x + offset`` to y (n,), with a prior of the gain at 1."""
-    gain, offset = 1.0, float(median(y - x))
+    middle, count = len(x) // 2, len(x)
+    errors = y - x
+    gain, offset = 1.0, np.partition(errors, middle)[middle]
     for _ in range(3):  # iteratively reweighted least squares, Cauchy weights
-        error = y - gain * x - offset
-        scale = max(1.5 * float(median(np.abs(error))), 0.01)
-        w = 1 / (1 + (error / scale) ** 2)
-        total = w.sum()
+        for n in range(count):
+            errors[n] = abs(y[n] - gain * x[n] - offset)
+        scale = max(1.5 * np.partition(errors, middle)[middle], 0.01)
+        total = x_sum = y_sum = 0.0
+        for n in range(count):
+            errors[n] = 1 / (1 + (errors[n] / scale) ** 2)  # the weight from here on
+            total += errors[n]
+            x_sum += errors[n] * x[n]
+            y_sum += errors[n] * y[n]
+        x_mean, y_mean = x_sum / total, y_sum / total
         # prior of the gain at 1: worth a tenth of the pixels at a contrast of 0.2
-        prior = 0.1 * total * 0.04
-        x_mean, y_mean = (w * x).sum() / total, (w * y).sum() / total
-        variance = (w * (x - x_mean) ** 2).sum() + prior
-        covariance = (w * (x - x_mean) * (y - y_mean)).sum() + prior
-        gain = float(np.clip(covariance / variance, 0.5, 2.0))
-        offset = float(y_mean - gain * x_mean)
+        variance = covariance = 0.1 * total * 0.04
+        for n in range(count):
+            variance += errors[n] * (x[n] - x_mean) ** 2
+            covariance += errors[n] * (x[n] - x_mean) * (y[n] - y_mean)
+        gain = min(max(covariance / variance, 0.5), 2.0)
+        offset = y_mean - gain * x_mean
     return gain, offset

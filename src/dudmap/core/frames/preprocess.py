@@ -39,8 +39,6 @@ class Preprocessor:
         calibration: Of the colour camera; None for colour that is registered to depth. Colours that were not taken
             together with the depth are left as they were recorded, scaled to the size of the depth image, to those who
             know the motion.
-        voxel_size: Of the map, if its voxels hold mean colours (``volume.antialias``): the intensities are then
-            averaged in the same way, since an image with more detail than the map does not fit it. 0 leaves them.
     """
 
     def __init__(
@@ -49,9 +47,7 @@ class Preprocessor:
         config: PreprocessConfig | None = None,
         backend: Backend | None = None,
         calibration: Calibration | None = None,
-        voxel_size: float = 0.0,
     ) -> None:
-        self.voxel_size = voxel_size
         self.config = config or PreprocessConfig()
         self.calibration = calibration
         self.camera = replace(camera, distortion=())
@@ -87,10 +83,7 @@ class Preprocessor:
         recorded = None
         if self.calibration is not None:
             recorded, rgb = rgb, self._colors(self.calibration, rgb, depth, offset)
-        smooth = rgb
-        if self.voxel_size > 0:
-            smooth = self._backend.footprint_colors(rgb, depth, self.camera.fx, self.voxel_size)
-        intensity = self._backend.intensity(smooth)
+        intensity = self._backend.intensity(rgb)
         return Observation(frame.timestamp, self.camera, depth, intensity, rgb, self._backend, recorded, offset)
 
     def _colors(

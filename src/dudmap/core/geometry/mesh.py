@@ -34,6 +34,10 @@ class Mesh:
     colors: NDArray[np.uint8]
     normals: NDArray[np.float32]
 
+    def __repr__(self) -> str:
+        """The sizes without the arrays."""
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} triangles)"
+
     def area(self) -> float:
         """Surface in square metres."""
         a, b, c = (self.vertices[self.faces[:, k]].astype(np.float64) for k in range(3))

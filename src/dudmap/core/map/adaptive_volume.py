@@ -177,8 +177,6 @@ class AdaptiveVolume(TsdfVolume):
             return candidates
         level, integrator, number = self.levels[n], self._integrators[n], self._frame_number
         blocks = level.blocks
-        if self.config.antialias:
-            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), level.voxel_size)
         grid = level.grid(self.window.local_origin * 2 ** (n + 1), self.sdf_unit)
         turn = number if self.config.take_turns else -1
         slots, occupied = self.backend.fuse(

@@ -166,8 +166,6 @@ class Integrator:
         if len(window.near) == 0:
             return window.near
         turn = frame_number if self.config.take_turns else -1
-        if self.config.antialias:
-            color = self.backend.footprint_colors(color, view.depth, float(view.intrinsics[0]), self.scale.voxel_size)
         grid = self._local_grid(blocks, window)
         slots, occupied = self.backend.fuse(
             grid, view, color, weights, window.near, blocks.fused, turn, count, self.parameters

@@ -10,6 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.config import Config
 from dudmap.core.frames.exposure import exposed_color
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.stream_check import Repeats
@@ -21,6 +22,7 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, SHOWN, MapRebuilding, nearest_views
 from dudmap.core.places.place_recognition import KeyframeDatabase
+from dudmap.core.places.prior_map import PriorMap
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.tracking.motion_model import VELOCITY_LIFETIME
 
@@ -72,6 +74,30 @@ class Atlas:
         self.current = number
         self.poses: list[TimedPose] = []
         self.saved: int | None = None
+
+    @classmethod
+    def of(
+        cls,
+        config: Config,
+        camera: Camera,
+        make_volume: Callable[[], TsdfVolume],
+        prior: PriorMap | None,
+        *,
+        keep_frames: bool,
+    ) -> "Atlas":
+        """An atlas with one empty map.
+
+        Args:
+            config: All parameters.
+            camera: Of the frames, without lens distortion.
+            make_volume: Makes an empty map.
+            prior: Of the first pass over the same recording, whose keyframes are used; frames are not kept then.
+            keep_frames: Whether frames are kept for corrections, where the configuration needs them.
+        """
+        if prior is not None:
+            return cls(make_volume, prior.keyframes, None, prior.submap)
+        keyframes = KeyframeDatabase(config.relocalization, camera, config.sensor)
+        return cls(make_volume, keyframes, FrameStore.of(config, camera) if keep_frames else None)
 
     def go_on_in(self, saved: SavedMap, camera: Camera, max_blocks: int | MemoryLimit | None = None) -> None:
         """Make a saved map, whose volume and keyframes are taken over, the current submap of frames of a camera.
@@ -145,6 +171,7 @@ class Atlas:
     def as_saved_map(self) -> SavedMap:
         """The main map and its keyframes; how well frames fit it is left to the caller."""
         self.complete()
+        self.keyframes.settle()
         main = self.by_size()[0]
         return SavedMap(self.volumes[main], [one for one in self.keyframes.keyframes if one.submap == main])
 

@@ -140,6 +140,7 @@ class LoopCloser:
         newest = keyframes[-1] if keyframes else None
         # a keyframe of a saved map may have the same time, but not the same pose
         if newest and newest.timestamp == query.observation.timestamp and np.array_equal(newest.T_world_camera, T):
+            self.atlas.keyframes.settle()
             return newest.features
         return self.atlas.keyframes.extract(query.observation, query.static_mask)
 

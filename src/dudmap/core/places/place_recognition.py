@@ -4,13 +4,14 @@ SIFT features of a reduced image (Lowe 2004), compared as RootSIFT (Arandjelovic
 RANSAC over three pairs of points (Fischler and Bolles 1981; see ``rigid_ransac``).
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import RelocalizationConfig, SensorConfig
+from dudmap.core.backends.threads import submit
 from dudmap.core.frames.observation import Observation
 from dudmap.core.geometry.alignment import agree, rigid_ransac
 from dudmap.core.geometry.camera import Camera
@@ -43,6 +44,10 @@ class PlacedFeatures:
 
     def __len__(self) -> int:
         return len(self.points)
+
+
+NO_FEATURES = PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+"""Those of an image without texture."""
 
 
 @dataclass(eq=False)
@@ -82,7 +87,8 @@ class PlaceMatch:
 class KeyframeDatabase:
     """Keyframes along the trajectory, and the recognition of the places they show.
 
-    ``extract`` and ``match`` do not change the database. Not for concurrent calls of ``extract``.
+    The features of a new keyframe are extracted in another thread, and are there after ``settle``. Not for concurrent
+    calls of ``extract``.
 
     Args:
         config: Distances, limits and thresholds.
@@ -97,6 +103,7 @@ class KeyframeDatabase:
         self.keyframes: list[Keyframe] = []
         self._sift = SiftExtractor(config.max_features)
         self._frames_since_last = config.keyframe_gap
+        self._unsettled: Callable[[], PlacedFeatures | None] = _nothing  # features of the newest keyframe
 
     def extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None = None) -> PlacedFeatures:
         """SIFT features of a frame that lie on one static surface.
@@ -105,9 +112,13 @@ class KeyframeDatabase:
             observation: The frame.
             static_mask: (H, W) bool, pixels that are not dynamic; None = all.
         """
+        self.settle()
+        return self._extract(observation, static_mask)
+
+    def _extract(self, observation: Observation, static_mask: NDArray[np.bool_] | None) -> PlacedFeatures:
         features = self._sift.extract(reduced_grey(observation.rgb, self.config.image_width))
         if len(features) == 0:
-            return PlacedFeatures(np.empty((0, 128), np.float32), np.empty((0, 3)))
+            return NO_FEATURES
         height, width = observation.depth.shape
         reduced_height, reduced_width = features.image_shape
         # pixel centres lie at whole numbers in both images
@@ -132,8 +143,8 @@ class KeyframeDatabase:
     ) -> bool:
         """Make a tracked frame a keyframe if none of its submap is near; call with every tracked frame.
 
-        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt and
-        ``relocalization.min_inliers`` features.
+        A keyframe also needs ``relocalization.keyframe_gap`` tracked frames since the last attempt. One that turns out
+        to have fewer than ``relocalization.min_inliers`` features is removed when it is settled.
 
         Args:
             observation: The frame.
@@ -144,20 +155,29 @@ class KeyframeDatabase:
         Returns:
             Whether the frame was added.
         """
+        self.settle()
         self._frames_since_last += 1
         if self._frames_since_last <= self.config.keyframe_gap:
             return False
         if self.near(T_world_camera, submap, self.config.keyframe_distance, self.config.keyframe_angle_deg):
             return False
         self._frames_since_last = 0
-        features = self.extract(observation, static_mask)
-        if len(features) < self.config.min_inliers:
-            return False
         timestamp = observation.timestamp
-        self.keyframes.append(Keyframe(timestamp, T_world_camera.copy(), features, submap, timestamp))
+        self.keyframes.append(Keyframe(timestamp, T_world_camera.copy(), NO_FEATURES, submap, timestamp))
+        self._unsettled = submit(lambda: self._extract(observation, static_mask))
+        return True
+
+    def settle(self) -> None:
+        """Wait for the features of the newest keyframe, and keep it if they are enough."""
+        features, self._unsettled = self._unsettled(), _nothing
+        if features is None:
+            return
+        if len(features) < self.config.min_inliers:
+            self.keyframes.pop()
+            return
+        self.keyframes[-1].features = features
         if len(self.keyframes) > self.config.max_keyframes:
             self._remove_most_redundant()
-        return True
 
     def match(self, features: PlacedFeatures, among: Sequence[Keyframe] | None = None) -> list[PlaceMatch]:
         """Keyframes that a frame with these features may show, with the frame's pose.
@@ -225,6 +245,10 @@ class KeyframeDatabase:
         """Largest believable error (n,) of the position of a feature, metres."""
         z = points[:, 2]
         return POSITION_ERROR * z + 2 * self.sensor.sigma(z)
+
+
+def _nothing() -> None:
+    """No keyframe waits for its features."""
 
 
 def _most_similar(features: PlacedFeatures, among: Sequence[Keyframe]) -> Iterable[Keyframe]:

@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
 from dudmap.errors import CameraError
-from dudmap.extras import extra
+from dudmap.io.exporting import ros_messages as ros
+from dudmap.io.exporting.mcap import McapWriter
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -77,7 +78,7 @@ class Recorder:
         try:
             self._writer.close()
             if self._error is None and self.written:
-                (self._folder / f"{self._folder.name}.mcap").replace(self.path)
+                self._writer.file.replace(self.path)
             if self._error is None:
                 shutil.rmtree(self._folder)
         except OSError as error:
@@ -102,31 +103,27 @@ class _Messages:
     """Frames as messages of ROS 2."""
 
     def __init__(self, camera: "Camera", calibration: "Calibration | None") -> None:
-        from rosbags.typesys import Stores, get_typestore
-
-        self._store = get_typestore(Stores.ROS2_HUMBLE)
         self._camera, self._calibration = camera, calibration
-        self._connections: dict[str, Any] = {}
         self._last = -1
 
-    def write(self, writer: Any, frame: "Frame") -> None:  # noqa: ANN401
+    def write(self, writer: McapWriter, frame: "Frame") -> None:
         """Write images and camera_info of a frame; with the first one the place of the colour camera."""
+        types, calibration = writer.types, self._calibration
         recorded = max(round(frame.timestamp * 1e9), self._last + 1)
-        registered = self._calibration is None
-        depth_frame, depth_space = (COLOR_FRAME, ALIGNED) if registered else (DEPTH_FRAME, DEPTH)
-        if self._last < 0 and self._calibration is not None:
-            self._put(writer, "/tf_static", self._transform(frame.timestamp, self._calibration), recorded)
+        depth_frame, depth_space = (COLOR_FRAME, ALIGNED) if calibration is None else (DEPTH_FRAME, DEPTH)
+        if self._last < 0 and calibration is not None:
+            T_depth_color = se3.inverse(calibration.T_color_depth)
+            place = ros.transform(types, frame.timestamp, T_depth_color, DEPTH_FRAME, COLOR_FRAME)
+            writer.write("/tf_static", recorded, ros.transforms(types, [place]))
         self._last = recorded
         color_stamp = frame.timestamp if frame.color_timestamp is None else frame.color_timestamp
-        cameras = (
+        color_camera = self._camera if calibration is None else calibration.camera
+        for space, name, camera, stamp, (pixels, encoding) in (
             (depth_space, depth_frame, self._camera, frame.timestamp, self._depth(frame.depth)),
-            (COLOR, COLOR_FRAME, self._camera if self._calibration is None else self._calibration.camera,
-             color_stamp, (frame.color, "rgb8")),
-        )  # fmt: skip
-        for space, name, camera, stamp, (pixels, encoding) in cameras:
-            header = self._header(stamp, name)
-            self._put(writer, f"{space}/camera_info", self._info(header, camera), recorded)
-            self._put(writer, f"{space}/image_raw", self._image(header, pixels, encoding), recorded)
+            (COLOR, COLOR_FRAME, color_camera, color_stamp, (frame.color, "rgb8")),
+        ):
+            writer.write(f"{space}/camera_info", recorded, ros.camera_info(types, stamp, camera, name))
+            writer.write(f"{space}/image_raw", recorded, ros.image(types, stamp, pixels, encoding, name))
 
     def _depth(self, depth: NDArray[np.float32]) -> tuple[NDArray[Any], str]:
         """16-bit millimetres where they hold the depth exactly, else metres as floats."""
@@ -138,60 +135,12 @@ class _Messages:
                     return values, "16UC1"
         return depth, "32FC1"
 
-    def _put(self, writer: Any, topic: str, message: Any, recorded: int) -> None:  # noqa: ANN401
-        kind = message.__msgtype__
-        if topic not in self._connections:
-            self._connections[topic] = writer.add_connection(topic, kind, typestore=self._store)
-        writer.write(self._connections[topic], recorded, self._store.serialize_cdr(message, kind))
 
-    def _type(self, name: str) -> Any:  # noqa: ANN401
-        return self._store.types[name]
-
-    def _header(self, stamp: float, frame: str) -> Any:  # noqa: ANN401
-        seconds, nanoseconds = divmod(round(stamp * 1e9), 10**9)
-        time = self._type("builtin_interfaces/msg/Time")(sec=seconds, nanosec=nanoseconds)
-        return self._type("std_msgs/msg/Header")(stamp=time, frame_id=frame)
-
-    def _image(self, header: Any, pixels: NDArray[Any], encoding: str) -> Any:  # noqa: ANN401
-        rows = np.ascontiguousarray(pixels).view(np.uint8).reshape(len(pixels), -1)
-        return self._type("sensor_msgs/msg/Image")(
-            header=header, height=pixels.shape[0], width=pixels.shape[1], encoding=encoding, is_bigendian=0,
-            step=rows.shape[1], data=rows.reshape(-1),
-        )  # fmt: skip
-
-    def _info(self, header: Any, camera: "Camera") -> Any:  # noqa: ANN401
-        P = np.zeros((3, 4))
-        P[:, :3] = camera.K
-        D = np.zeros(5)
-        D[: len(camera.distortion)] = camera.distortion
-        whole = self._type("sensor_msgs/msg/RegionOfInterest")(0, 0, 0, 0, False)
-        return self._type("sensor_msgs/msg/CameraInfo")(
-            header=header, height=camera.height, width=camera.width, distortion_model="plumb_bob", d=D,
-            k=camera.K.reshape(-1), r=np.eye(3).reshape(-1), p=P.reshape(-1), binning_x=0, binning_y=0, roi=whole,
-        )  # fmt: skip
-
-    def _transform(self, stamp: float, calibration: "Calibration") -> Any:  # noqa: ANN401
-        T_depth_color = se3.inverse(calibration.T_color_depth)
-        quaternion = self._type("geometry_msgs/msg/Quaternion")
-        vector = self._type("geometry_msgs/msg/Vector3")
-        motion = self._type("geometry_msgs/msg/Transform")(
-            translation=vector(*T_depth_color[:3, 3].tolist()),
-            rotation=quaternion(*se3.rotation_to_quat_xyzw(T_depth_color[:3, :3]).tolist()),
-        )
-        header = self._header(stamp, DEPTH_FRAME)
-        stamped = self._type("geometry_msgs/msg/TransformStamped")(header, COLOR_FRAME, motion)
-        return self._type("tf2_msgs/msg/TFMessage")(transforms=[stamped])
-
-
-def _open_writer(folder: Path) -> Any:  # noqa: ANN401 - a type of an optional package
-    with extra("ros-bags", "recording"):
-        from rosbags.rosbag2 import StoragePlugin, Writer
+def _open_writer(folder: Path) -> McapWriter:
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         if folder.exists():
             raise CameraError(f"{folder} is left from a recording that was cut off; remove it")
-        writer = Writer(folder, version=8, storage_plugin=StoragePlugin.MCAP)
-        writer.open()
+        return McapWriter(folder, "recording", compressed=False)
     except OSError as error:
         raise CameraError(f"cannot record to {folder.parent}: {error.strerror or error}") from error
-    return writer

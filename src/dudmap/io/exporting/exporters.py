@@ -26,7 +26,7 @@ class Exporter:
 
     @property
     def write(self) -> Callable[[RunContent, Path, ExportOptions], None]:
-        """Writes the results of a run."""
+        """Writes the results of a run; it raises what ``export_run`` names."""
         module, _, name = self.target.partition(":")
         return getattr(import_module(f"dudmap.io.exporting.{module}"), name)
 
@@ -34,9 +34,9 @@ class Exporter:
 _GRID = ("crop", "drop_pieces_below", "up", "resolution")
 _VIEWS = ("crop", "drop_pieces_below", "sequence", "camera", "every")
 EXPORTERS: dict[str, Exporter] = {
-    ".ply": Exporter("mesh", "mesh_files:write_ply", MESH_OPTIONS),
-    ".obj": Exporter("mesh", "mesh_files:write_obj", MESH_OPTIONS),
-    ".stl": Exporter("mesh without colours", "mesh_files:write_stl", MESH_OPTIONS),
+    ".ply": Exporter("mesh", "mesh_editing:write", MESH_OPTIONS),
+    ".obj": Exporter("mesh", "mesh_editing:write", MESH_OPTIONS),
+    ".stl": Exporter("mesh without colours", "mesh_editing:write", MESH_OPTIONS),
     ".glb": Exporter("mesh for browsers and Blender, y up", "gltf:write", (*MESH_OPTIONS, "up")),
     ".usdz": Exporter("mesh for USD programs, y up", "usd:write", (*MESH_OPTIONS, "up")),
     ".points.ply": Exporter("point cloud", "point_clouds:write_ply", _GRID[:2]),

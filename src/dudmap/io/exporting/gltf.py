@@ -24,7 +24,6 @@ FLOAT, UINT16, UINT32 = 5126, 5123, 5125
 VERTEX_BUFFER, INDEX_BUFFER = 34962, 34963
 MATERIAL = {
     "name": "recorded colours",
-    "doubleSided": True,
     "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
     "extensions": {"KHR_materials_unlit": {}},
 }
@@ -46,15 +45,17 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
         file.write(encoded(mesh, T))
 
 
-def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64]) -> bytes:
+def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64] | None = None, *, double_sided: bool = True) -> bytes:
     """Content of a GLB file (glTF 2.0, sections 3 and 4.4).
 
     Args:
         mesh: The mesh.
-        T_gltf_mesh: (4, 4) motion of its node.
+        T_gltf_mesh: (4, 4) motion of its node; None keeps the axes of the mesh.
+        double_sided: Whether its back can be seen.
     """
     from dudmap import __version__
 
+    T = np.eye(4) if T_gltf_mesh is None else T_gltf_mesh
     low, high = mesh.vertices.min(axis=0).tolist(), mesh.vertices.max(axis=0).tolist()
     parts: list[tuple[NDArray, int, dict[str, Any]]] = [
         (mesh.vertices.astype("<f4"), VERTEX_BUFFER, {"componentType": FLOAT, "type": "VEC3", "min": low, "max": high}),
@@ -73,9 +74,9 @@ def encoded(mesh: Mesh, T_gltf_mesh: NDArray[np.float64]) -> bytes:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "map", "mesh": 0, "matrix": T_gltf_mesh.T.reshape(-1).tolist()}],
+        "nodes": [{"name": "map", "mesh": 0, "matrix": T.T.reshape(-1).tolist()}],
         "meshes": [{"name": "map", "primitives": [{"attributes": attributes, "indices": 3, "material": 0}]}],
-        "materials": [MATERIAL],
+        "materials": [MATERIAL | {"doubleSided": double_sided}],
         "accessors": accessors,
         "bufferViews": views,
         "buffers": [{"byteLength": start}],

@@ -143,11 +143,7 @@ def _across(up: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _unit(vector: tuple[float, ...] | NDArray[np.float64]) -> NDArray[np.float64]:
-    """Vector of length 1.
-
-    Raises:
-        ConfigError: It has no direction.
-    """
+    """Vector of length 1."""
     values = np.asarray(vector, np.float64)
     length = float(np.linalg.norm(values))
     if not np.isfinite(length) or length < 1e-9:

@@ -29,11 +29,6 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     Arrays: ``format``; ``occupancy`` (X, Y, Z) int8, 100 = occupied, 0 = free, -1 = unknown; ``esdf`` (X, Y, Z)
     float32, metres; ``origin`` (3,), lower corner of the first cell; ``resolution``, metres; ``T_grid_map`` (4, 4)
     from the world of the run to the axes of the grid: z up from the floor, x along the first view.
-
-    Raises:
-        MapError: There is no map or no mesh.
-        ConfigError: An option is invalid, or no floor was found.
-        OSError: The file cannot be written.
     """
     grid, mesh = _grid(run, options)
     with atomic_file(path) as file:
@@ -49,13 +44,7 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``map.yaml`` and ``map.pgm`` beside it, as nav2's map server reads them.
-
-    Raises:
-        MapError: There is no map or no mesh.
-        ConfigError: An option is invalid, or no floor was found.
-        OSError: A file cannot be written.
-    """
+    """Write ``map.yaml`` and ``map.pgm`` beside it, as nav2's map server reads them."""
     if not options.heights[0] < options.heights[1]:
         raise ConfigError(f"found --heights {options.heights}; expected the lower one first")
     grid, _ = _grid(run, options)

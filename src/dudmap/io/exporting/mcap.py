@@ -2,6 +2,7 @@
 
 import tempfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -19,33 +20,58 @@ MESH_TRIANGLES = 50_000
 """Triangles of the mesh marker: viewers take every corner as a message of its own. The point cloud has all vertices."""
 
 
+class McapWriter:
+    """A new bag of ROS 2 with one MCAP file.
+
+    Args:
+        folder: Of the bag; it must not exist.
+        purpose: What needs the package rosbags, for the message that it is missing.
+        compressed: Whether the file is compressed by zstd.
+
+    Attributes:
+        types: Message classes.
+        file: The MCAP file, complete when the writer is closed.
+
+    Raises:
+        MissingExtraError: rosbags is not installed.
+        OSError: The folder cannot be made.
+    """
+
+    def __init__(self, folder: Path, purpose: str, *, compressed: bool) -> None:
+        with extra("ros-bags", purpose):
+            from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+            from rosbags.typesys import Stores, get_typestore
+        self._store = get_typestore(Stores.ROS2_JAZZY)
+        self.types, self.file = ros.MessageTypes(self._store.types.__getitem__), folder / f"{folder.name}.mcap"
+        self._connections: dict[str, Any] = {}
+        self._writer = Writer(folder, version=9, storage_plugin=StoragePlugin.MCAP)
+        if compressed:
+            self._writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
+        self._writer.open()
+
+    def write(self, topic: str, nanoseconds: int, message: Any) -> None:  # noqa: ANN401
+        """Write a message with its time of recording."""
+        kind = message.__msgtype__
+        if topic not in self._connections:
+            self._connections[topic] = self._writer.add_connection(topic, kind, typestore=self._store)
+        self._writer.write(self._connections[topic], nanoseconds, self._store.serialize_cdr(message, kind))
+
+    def close(self) -> None:
+        """Complete the file."""
+        self._writer.close()
+
+
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write trajectory, surface and movers of a run.
 
     Topics: /tf (map to camera), /odometry, /path, /points (vertices of the mesh), /mesh and /movers. Path, points and
     mesh come at the time of the first pose.
-
-    Raises:
-        MissingExtraError: rosbags is not installed.
-        OSError: The file cannot be written.
     """
-    with extra("ros-bags", "writing .mcap"):
-        from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
-        from rosbags.typesys import Stores, get_typestore
-    store = get_typestore(Stores.ROS2_JAZZY)
-    types = ros.MessageTypes(store.types.__getitem__)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.stem}-") as folder:
-        bag = Path(folder) / "run"
-        writer = Writer(bag, version=9, storage_plugin=StoragePlugin.MCAP)
-        writer.set_compression(CompressionMode.STORAGE, CompressionFormat.ZSTD)
-        with writer:
-            connections: dict[str, Any] = {}
-            for topic, seconds, message in _messages(types, run):
-                kind = message.__msgtype__
-                if topic not in connections:
-                    connections[topic] = writer.add_connection(topic, kind, typestore=store)
-                writer.write(connections[topic], round(seconds * 1e9), store.serialize_cdr(message, kind))
-        put_in_place(bag / "run.mcap", path)
+        with closing(McapWriter(Path(folder) / "run", "writing .mcap", compressed=True)) as writer:
+            for topic, seconds, message in _messages(writer.types, run):
+                writer.write(topic, round(seconds * 1e9), message)
+        put_in_place(writer.file, path)
 
 
 def _messages(types: ros.MessageTypes, run: RunContent) -> Iterator[tuple[str, float, Any]]:

@@ -1,6 +1,7 @@
 """Parts of a mesh, closed holes and fewer triangles, for exports."""
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,6 +10,12 @@ from dudmap.core.geometry.mesh import Mesh
 from dudmap.errors import ConfigError, MapError
 from dudmap.extras import extra
 from dudmap.io.exporting.options import Box, ExportOptions
+from dudmap.io.exporting.run_content import RunContent
+
+
+def write(run: RunContent, path: Path, options: ExportOptions) -> None:
+    """Write the mesh in the axes of the map, in the format of the file's ending: PLY, OBJ or STL."""
+    edited(run.surface, options).save(path)
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:

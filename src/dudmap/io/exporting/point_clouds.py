@@ -24,21 +24,13 @@ def _points(run: RunContent, options: ExportOptions) -> Mesh:
 
 
 def write_ply(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write binary PLY with normals and colours.
-
-    Raises:
-        MapError: There is no mesh, or the file cannot be written.
-    """
+    """Write binary PLY with normals and colours."""
     _points(run, options).save(path)
 
 
 def write_pcd(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write binary PCD 0.7 with the fields x y z rgb normal_x normal_y normal_z; rgb is packed into a float, as PCL
     expects.
-
-    Raises:
-        MapError: There is no mesh.
-        OSError: The file cannot be written.
     """
     points = _points(run, options)
     row = np.dtype([("xyz", "<f4", 3), ("rgb", "<u4"), ("normal", "<f4", 3)])
@@ -55,13 +47,7 @@ def write_pcd(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_laz(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write LAS 1.4, point format 7 (colours of 16 bits), compressed.
-
-    Raises:
-        MapError: There is no mesh.
-        MissingExtraError: laspy or lazrs is not installed.
-        OSError: The file cannot be written.
-    """
+    """Write LAS 1.4, point format 7 (colours of 16 bits), compressed."""
     with extra("export", "writing .laz"):
         import laspy
         import lazrs  # noqa: F401 - laspy compresses with it
@@ -78,13 +64,7 @@ def write_laz(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def write_e57(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write E57 with one scan.
-
-    Raises:
-        MapError: There is no mesh.
-        MissingExtraError: pye57 is not installed.
-        OSError: The file cannot be written.
-    """
+    """Write E57 with one scan."""
     with extra("export", "writing .e57"):
         import pye57
     points = _points(run, options)

@@ -23,11 +23,6 @@ FLOAT32 = 7
 """``sensor_msgs/PointField.FLOAT32``, the type that by convention also the packed colour has."""
 TRIANGLE_LIST, CUBE, ADD, DELETE_ALL = 11, 1, 0, 3
 """Constants of ``visualization_msgs/Marker``."""
-COLOR_CHANNELS = {"rgb8": "rgb", "bgr8": "bgr", "rgba8": "rgba", "bgra8": "bgra", "mono8": "m", "8UC1": "m",
-                  "8UC3": "bgr"}  # fmt: skip
-"""Channels of the 8-bit encodings that are read."""
-DEPTH_TYPES = {"16UC1": (np.uint16, 0.001), "mono16": (np.uint16, 0.001), "32FC1": (np.float32, 1.0)}
-"""Type and metres per unit of the depth encodings (REP 118)."""
 
 
 @dataclass(frozen=True)
@@ -151,6 +146,18 @@ def image(types: MessageTypes, seconds: float, pixels: NDArray, encoding: str, f
     )  # fmt: skip
 
 
+def camera_info(types: MessageTypes, seconds: float, camera: Camera, frame: str) -> Any:  # noqa: ANN401
+    """``sensor_msgs/CameraInfo`` of a camera."""
+    P, D = np.zeros((3, 4)), np.zeros(5)
+    P[:, :3], D[: len(camera.distortion)] = camera.K, camera.distortion
+    whole = types.make("sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    return types.make(
+        "sensor_msgs/msg/CameraInfo",
+        header=header(types, seconds, frame), height=camera.height, width=camera.width, distortion_model="plumb_bob",
+        d=D, k=camera.K.reshape(-1), r=np.eye(3).reshape(-1), p=P.reshape(-1), binning_x=0, binning_y=0, roi=whole,
+    )  # fmt: skip
+
+
 def mesh_marker(types: MessageTypes, seconds: float, mesh: Mesh, frame: str) -> Any:  # noqa: ANN401
     """``visualization_msgs/Marker`` with the triangles of a mesh, coloured by vertex."""
     corners = mesh.faces.reshape(-1)
@@ -217,39 +224,6 @@ def seconds_of(message: Any) -> float:  # noqa: ANN401
     return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
-def color_of(message: Any) -> NDArray[np.uint8]:  # noqa: ANN401
-    """Colour (H, W, 3) of a ``sensor_msgs/Image``.
-
-    Raises:
-        DatasetError: The encoding is no 8-bit colour, or the message is too short.
-    """
-    channels = COLOR_CHANNELS.get(message.encoding)
-    if channels is None:
-        known = ", ".join(COLOR_CHANNELS)
-        raise DatasetError(f"colour of encoding {message.encoding!r} is not read; expected one of {known}")
-    pixels = _rows(message, np.dtype(np.uint8), len(channels))
-    if channels == "m":
-        return np.repeat(pixels, 3, axis=2)
-    return np.ascontiguousarray(pixels[..., [channels.index(name) for name in "rgb"]])
-
-
-def depth_of(message: Any) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth (H, W) in metres of a ``sensor_msgs/Image`` (REP 118), 0 = no reading.
-
-    Raises:
-        DatasetError: The encoding is no depth, or the message is too short.
-    """
-    kind = DEPTH_TYPES.get(message.encoding)
-    if kind is None:
-        raise DatasetError(
-            f"depth of encoding {message.encoding!r} is not read; expected one of {', '.join(DEPTH_TYPES)}"
-        )
-    order = ">" if message.is_bigendian else "<"
-    depth = _rows(message, np.dtype(kind[0]).newbyteorder(order), 1)[..., 0].astype(np.float32) * np.float32(kind[1])
-    depth[~np.isfinite(depth)] = 0
-    return depth
-
-
 def camera_of(message: Any) -> Camera:  # noqa: ANN401
     """Camera of a ``sensor_msgs/CameraInfo``.
 
@@ -268,17 +242,3 @@ def camera_of(message: Any) -> Camera:  # noqa: ANN401
         )
     distortion = d[:5] if any(d) else ()
     return Camera(k[0], k[4], k[2], k[5], int(message.width), int(message.height), distortion=distortion)
-
-
-def _rows(message: Any, kind: np.dtype, channels: int) -> NDArray:  # noqa: ANN401
-    """Pixels (H, W, channels) of an image message, without the padding at the ends of its rows."""
-    height, width, step = int(message.height), int(message.width), int(message.step)
-    used = width * channels * kind.itemsize
-    octets = np.frombuffer(bytes(message.data), np.uint8)
-    if step < used or len(octets) < step * height:
-        raise DatasetError(
-            f"an image of {width}x{height} in {message.encoding} needs {used * height} bytes, but the message has "
-            f"{len(octets)}"
-        )
-    rows = octets[: step * height].reshape(height, step)[:, :used]
-    return np.ascontiguousarray(rows).view(kind).reshape(height, width, channels)

@@ -146,11 +146,7 @@ class RunContent:
 
 
 def _metrics(folder: Path) -> dict[str, Any]:
-    """Content of metrics.json; empty without this file.
-
-    Raises:
-        DatasetError: It is damaged.
-    """
+    """Content of metrics.json; empty without this file."""
     path = folder / "metrics.json"
     try:
         return dict(read_json(path)) if path.is_file() else {}

@@ -13,30 +13,18 @@ EUROC_HEADER = (
 
 
 def write_tum(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write ``timestamp tx ty tz qx qy qz qw``, one pose a line.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write ``timestamp tx ty tz qx qy qz qw``, one pose a line."""
     run.trajectory.save(path)
 
 
 def write_kitti(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the upper three rows of each pose, 12 numbers a line; the format has no times.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the upper three rows of each pose, 12 numbers a line; the format has no times."""
     rows = [" ".join(f"{number:.9f}" for number in T[:3].reshape(-1)) for T in run.trajectory.Ts_world_camera]
     write_text(path, "\n".join(rows) + "\n")
 
 
 def write_euroc(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the columns of EuRoC's ``state_groundtruth_estimate0/data.csv`` up to the orientation.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """Write the columns of EuRoC's ``state_groundtruth_estimate0/data.csv`` up to the orientation."""
     lines = [EUROC_HEADER]
     for stamp, T in zip(run.trajectory.timestamps, run.trajectory.Ts_world_camera, strict=True):
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])

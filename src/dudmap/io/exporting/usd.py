@@ -19,14 +19,7 @@ MODULES = "Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt"
 
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
-    """Write the mesh of a run, y up, metres, with its colours as ``displayColor``.
-
-    Raises:
-        MapError: There is no mesh.
-        ConfigError: An option is invalid.
-        MissingExtraError: usd-core is not installed.
-        OSError: The file cannot be written.
-    """
+    """Write the mesh of a run, y up, metres, with its colours as ``displayColor``."""
     with extra("export", "writing .usdz"):
         sdf, usd, geom, utils, vt = (
             import_module(f"pxr.{name}") for name in ("Sdf", "Usd", "UsdGeom", "UsdUtils", "Vt")

@@ -54,12 +54,6 @@ class View(NamedTuple):
 def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write ``transforms.json`` and beside it images/, depth/ (16 bit, millimetres), masks/ (0 = moves, left out of
     training) and the seed points points.ply. Poses are camera to world with OpenGL's camera axes.
-
-    Raises:
-        ConfigError: The recording is not named.
-        DatasetError: The recording or the masks cannot be read, or do not belong to the run.
-        MapError: There is no mesh.
-        OSError: A file cannot be written.
     """
     sequence, seeds = _open(run, options), _seeds(run, options)
     folders = [path.parent / name for name in ("images", "depth", "masks")]
@@ -92,12 +86,6 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
 def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write ``cameras.txt``, ``images.txt`` and ``points3D.txt`` (points without tracks), and beside them images/ and
     masks/ (``NAME.png.png``, 0 = moves, as COLMAP's ``ImageReader.mask_path`` wants them).
-
-    Raises:
-        ConfigError: The recording is not named.
-        DatasetError: The recording or the masks cannot be read, or do not belong to the run.
-        MapError: There is no mesh.
-        OSError: A file cannot be written.
     """
     sequence, seeds = _open(run, options), _seeds(run, options)
     folder, camera = path.parent, _color_camera(run, sequence)
@@ -168,11 +156,7 @@ def _seeds(run: RunContent, options: ExportOptions) -> Mesh:
 
 
 def _views(run: RunContent, sequence: "Sequence", every: int) -> Iterator[View]:
-    """The frames that have a pose and a mask.
-
-    Raises:
-        DatasetError: There are none.
-    """
+    """The frames that have a pose and a mask."""
     masks, count = run.mask_files(), 0
     stamps = np.array(sorted(masks))
     other = None

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from dudmap.errors import DatasetError, printable
 from dudmap.input_files import damaged
+from dudmap.io.sequences.recording import Recording
 
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from dudmap.core.geometry.camera import Camera
     from dudmap.core.geometry.trajectory import Trajectory
 
-__all__ = ["Reader", "Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
+__all__ = ["Recording", "Sequence", "is_recording", "is_timed", "open_sequence", "reader_of", "readers"]
 
 
 @runtime_checkable
@@ -62,71 +63,27 @@ class Sequence(Protocol):
         ...
 
 
-@runtime_checkable
-class Recording(Sequence, Protocol):
-    """A sequence on disk.
-
-    Attributes:
-        format: Name of its format, for people.
-        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
-            that they are assumed.
-        timed: Whether the times were read or their rate was given; False where they are invented.
-        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
-    """
-
-    opened: dict[str, Any]
-
-    @property
-    def format(self) -> str: ...  # noqa: D102
-    @property
-    def sources(self) -> dict[str, str]: ...  # noqa: D102
-    @property
-    def timed(self) -> bool: ...  # noqa: D102
-
-
-class Reader(Protocol):
-    """Class of a recording: recognises its format and opens a folder or file of it.
-
-    Attributes:
-        format: Name of the format, for people.
-        options: Names of the options of ``open_sequence`` that the format has.
-    """
-
-    @property
-    def format(self) -> str: ...  # noqa: D102
-    @property
-    def options(self) -> tuple[str, ...]: ...  # noqa: D102
-
-    def __call__(self, path: Path, camera: "Camera | str | None" = None, **options: Any) -> Recording:  # noqa: ANN401
-        """Open a recording."""
-        ...
-
-    def recognises(self, path: Path) -> bool:
-        """Whether an existing folder or file has this format, judged by names and first bytes only."""
-        ...
-
-
 READERS = (
-    "bonn:BonnSequence",
-    "corbs:CorbsSequence",
-    "openloris:OpenLorisSequence",
-    "icl_nuim:IclNuimSequence",
-    "icl_nuim:IclNuimLoopSequence",
+    "tum:BonnSequence",
+    "tum:CorbsSequence",
+    "tum:OpenLorisSequence",
+    "numbered_folders:IclNuimSequence",
+    "numbered_folders:IclNuimLoopSequence",
     "tum:TumSequence",
     "nerfstudio:NerfstudioSequence",
-    "frame_files:VolumeDeformSequence",
-    "frame_files:SharedFrameFiles",
-    "scannet:ScanNetSequence",
-    "replica:ReplicaSequence",
+    "numbered_folders:VolumeDeformSequence",
+    "numbered_folders:SharedFrameFiles",
+    "numbered_folders:ScanNetSequence",
+    "numbered_folders:ReplicaSequence",
     "arkit:StrayScannerSequence",
     "arkit:ArkitScenesSequence",
     "arkit:PolycamSequence",
-    "redwood:RedwoodSequence",
-    "epfl:EpflSequence",
-    "bop:BopSequence",
+    "numbered_folders:RedwoodSequence",
+    "numbered_folders:EpflSequence",
+    "numbered:BopSequence",
     "numbered:NumberedSequence",
-    "sens:SensRecording",
-    "klg:KlgRecording",
+    "image_logs:SensRecording",
+    "image_logs:KlgRecording",
     "record3d:Record3DRecording",
     "azure_kinect:AzureKinectRecording",
     "realsense:RealSenseRecording",
@@ -139,13 +96,13 @@ DEPTH_OF_SEARCH = 3
 
 
 @cache
-def readers() -> tuple[Reader, ...]:
+def readers() -> tuple[type[Recording], ...]:
     """Readers of all formats, in the order in which they are tried."""
     names = (reader.split(":") for reader in READERS)
     return tuple(getattr(import_module(f"dudmap.io.sequences.{module}"), name) for module, name in names)
 
 
-def reader_of(path: Path) -> Reader | None:
+def reader_of(path: Path) -> type[Recording] | None:
     """The first reader that recognises an existing folder or file, None if there is none."""
     return next((reader for reader in readers() if reader.recognises(path)), None)
 
@@ -218,12 +175,8 @@ def _option(name: str) -> str:
     return "--" + name.replace("_", "-")
 
 
-def _find(path: Path) -> tuple[Path, Reader]:
-    """The recording at a path, in it, or in the archive at it, and its reader.
-
-    Raises:
-        DatasetError: There is none, or more than one.
-    """
+def _find(path: Path) -> tuple[Path, type[Recording]]:
+    """The recording at a path, in it, or in the archive at it, and its reader."""
     from dudmap.io.sequences.archive import split, unpack
 
     reader = reader_of(path) if path.exists() else None
@@ -247,11 +200,11 @@ def _find(path: Path) -> tuple[Path, Reader]:
     return (place, reader) if reader is not None else _find(place)
 
 
-def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, Reader | None]]":
+def _recordings_in(path: Path, levels: int) -> "list[tuple[Path, type[Recording] | None]]":
     """Recordings below a folder with their readers, and archives with None; not those inside of other recordings."""
     from dudmap.io.sequences.archive import is_archive
 
-    found: list[tuple[Path, Reader | None]] = []
+    found: list[tuple[Path, type[Recording] | None]] = []
     for place in sorted(path.iterdir()):
         reader = reader_of(place)
         if reader is not None:

@@ -149,11 +149,7 @@ def _too_large(path: Path, packed: int, limit: int) -> str:
 
 
 def _inside(path: Path, member: Member) -> PurePosixPath:
-    """Relative path of a member that is a plain file or folder.
-
-    Raises:
-        DatasetError: It is something else, or leads out of the archive.
-    """
+    """Relative path of a member that is a plain file or folder."""
     if member.kind not in ("file", "folder"):
         raise DatasetError(f"{path} holds {member.name}, a {member.kind}; an archive of a recording has files only")
     name = member.name.replace("\\", "/")

@@ -20,11 +20,10 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import read_json, read_text
 from dudmap.io.sequences import images
-from dudmap.io.sequences.camera_json import values_of
+from dudmap.io.sequences.camera_files import values_of
 from dudmap.io.sequences.image_folder import ImageFolder, numbered_files, size
-from dudmap.io.sequences.intrinsics import KEYS, Intrinsics
-from dudmap.io.sequences.nerfstudio import OPENGL_AXES, one_view
-from dudmap.io.sequences.poses import read_matrix, rigid_trajectory
+from dudmap.io.sequences.intrinsics import Intrinsics, camera_values
+from dudmap.io.sequences.poses import OPENGL_AXES, read_matrix, rigid_trajectory
 from dudmap.io.sequences.video import Video
 
 
@@ -41,12 +40,6 @@ class ArkitFolder(ImageFolder):
             depth[confidence == 0] = 0
         return depth
 
-    def _view(self, cameras: list[dict[str, float]], source: str) -> Intrinsics:
-        """Intrinsics of both images from those of colour images."""
-        color, depth = self._pairs[0]
-        shapes = self._read_color(color.path).shape[:2], self._read_depth(depth.path, self.depth_scale).shape
-        return one_view(cameras, *shapes, self.depth_scale, source)
-
 
 class StrayScannerSequence(ArkitFolder):
     """Folder of the application Stray Scanner: a video of the colour images, and depth images by frame number.
@@ -57,11 +50,7 @@ class StrayScannerSequence(ArkitFolder):
     """
 
     format = "Stray Scanner"
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a folder has this layout."""
-        return all((path / name).exists() for name in ("rgb.mp4", "depth", "odometry.csv"))
+    layout = ("rgb.mp4", "depth", "odometry.csv")
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         file = self.path / "odometry.csv"
@@ -82,7 +71,7 @@ class StrayScannerSequence(ArkitFolder):
 
     def _find_intrinsics(self) -> Intrinsics:
         K = read_matrix(self.path / "camera_matrix.csv", 3, 3)
-        return self._view([{"fx": K[0, 0], "fy": K[1, 1], "cx": K[0, 2], "cy": K[1, 2]}], "camera_matrix.csv")
+        return self._one_view([camera_values(K[0, 0], K[1, 1], K[0, 2], K[1, 2])], "camera_matrix.csv")
 
     @cached_property
     def _video(self) -> Video:
@@ -102,11 +91,7 @@ class ArkitScenesSequence(ArkitFolder):
     """
 
     format = "ARKitScenes"
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a folder has this layout."""
-        return all((path / name).is_dir() for name in ("lowres_wide", "lowres_depth", "lowres_wide_intrinsics"))
+    layout = ("lowres_wide/", "lowres_depth/", "lowres_wide_intrinsics/")
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         colors, depths = (self._timed(kind, "png") for kind in ("lowres_wide", "lowres_depth"))
@@ -123,7 +108,7 @@ class ArkitScenesSequence(ArkitFolder):
                 f"{self.path}/lowres_wide_intrinsics holds no files ID_TIME.pincam; give --camera fx,fy,cx,cy"
             )
         numbers = [read_matrix(file, 1, 6)[0, 2:].tolist() for file in files]  # after width and height
-        return self._view([dict(zip(KEYS[:4], row, strict=True)) for row in numbers], "lowres_wide_intrinsics")
+        return self._one_view([camera_values(*row) for row in numbers], "lowres_wide_intrinsics")
 
     def _find_ground_truth(self) -> Trajectory | None:
         file = self.path / "lowres_wide.traj"
@@ -155,8 +140,8 @@ class PolycamSequence(ArkitFolder):
         super().__init__(folder / "keyframes" if (folder / "keyframes").is_dir() else folder, camera)
         self.name = folder.resolve().name
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
         """Whether a folder has this layout, or is the ``keyframes`` of one that has it."""
         return any(
             (place / "depth").is_dir() and any(place.glob("*images")) and any(place.glob("*cameras/*.json"))
@@ -183,7 +168,7 @@ class PolycamSequence(ArkitFolder):
         found = [values for tree in self._cameras.values() if (values := values_of(tree)) is not None]
         if not found:
             raise DatasetError(f"{self.path / self._kind}cameras holds no camera with fx, fy, cx and cy")
-        return self._view(found, f"{self._kind}cameras")
+        return self._one_view(found, f"{self._kind}cameras")
 
     def _find_ground_truth(self) -> Trajectory | None:
         if not self._kind:

@@ -17,9 +17,9 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import LARGEST_FILE, foreign, open_plain, parse_json
 from dudmap.io.sequences import images
-from dudmap.io.sequences.file_recording import FileRecording
 from dudmap.io.sequences.lens import RATIONAL, Lens
 from dudmap.io.sequences.message_stream import MessageStream
+from dudmap.io.sequences.recording import Recording
 
 BEFORE = 1_000_000_000
 """A pass starts this long before the wanted time, nanoseconds, as a seek need not be exact."""
@@ -40,7 +40,7 @@ class _Track(NamedTuple):
     times: NDArray[np.int64]
 
 
-class AzureKinectRecording(FileRecording):
+class AzureKinectRecording(Recording):
     """Recording in a ``.mkv`` file with the tracks COLOR and DEPTH and the attachment calibration.json.
 
     Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
@@ -167,9 +167,6 @@ def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float
         size: Width and height of the images.
         whole: Those of the sensor's image at this resolution.
         cut: Column and row of it where the images begin.
-
-    Raises:
-        DatasetError: The model of the lens is another one.
     """
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":

@@ -15,12 +15,13 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
 from dudmap.input_files import GIT_LFS, foreign, open_plain
+from dudmap.io.exporting.ros_messages import seconds_of
 from dudmap.io.sequences import bag_images, bag_topics, intrinsics
 from dudmap.io.sequences.bag_file import BagFile, MessageTimes
 from dudmap.io.sequences.bag_transforms import STATIC_TOPIC, TOPIC, TransformTree
-from dudmap.io.sequences.file_recording import FileRecording
 from dudmap.io.sequences.image_folder import PROBES, size
 from dudmap.io.sequences.lens import Lens
+from dudmap.io.sequences.recording import Recording
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Connection
@@ -33,7 +34,7 @@ FIRST_TRANSFORMS = 300
 """Number of first /tf messages that tell which frames there are: some seconds of a robot that publishes at 100 Hz."""
 
 
-class RosBag(FileRecording):
+class RosBag(Recording):
     """Recording in a ROS bag, opened through its index: neither images nor poses are read before they are asked for.
 
     The time of a frame is that in the header of its depth message; colour is associated one to one, nearest first, at
@@ -100,7 +101,7 @@ class RosBag(FileRecording):
         values, image = self._depth_lens.rectify(values, depth=True), self._color_lens.rectify(image, depth=False)
         if self._exact:
             return Frame(float(self.timestamps[index]), values, image, float(self._color_stamps[index]))
-        return Frame(_stamp(depth), values, image, _stamp(color))
+        return Frame(seconds_of(depth), values, image, seconds_of(color))
 
     def _decoded(self, index: int, depth_scale: float) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
         """Depth and colour message of a frame, each with its image."""
@@ -182,11 +183,7 @@ class RosBag(FileRecording):
         self.calibration = None if together else self._between(depth_lens, color_lens, color.header.frame_id)
 
     def _probe(self) -> tuple[Any, NDArray[np.float32], Any, NDArray[np.uint8]]:
-        """The first frame that can be decoded.
-
-        Raises:
-            DatasetError: None of some frames all over the bag can be decoded.
-        """
+        """The first frame that can be decoded."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:
@@ -256,10 +253,6 @@ def starts_with(path: Path, magic: bytes) -> bool:
         return False
     with open_plain(path, pointers=True) as file:
         return file.read(max(len(magic), len(GIT_LFS))).startswith((magic, GIT_LFS))
-
-
-def _stamp(message: Any) -> float:  # noqa: ANN401
-    return message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
 
 
 def _equal(one: Lens, other: Lens) -> bool:

@@ -208,11 +208,6 @@ def _check(path: Path) -> None:
     """Check that a bag has plain files only, and that an SQLite file is nothing but tables.
 
     A view in the place of a table would be a program that runs when the bag is read.
-
-    Raises:
-        OSError: A file is none, or larger than files of its kind.
-        ValueError: An SQLite file holds something else than tables and indexes.
-        sqlite3.Error: It is damaged.
     """
     if path.is_dir():
         read_text(path / "metadata.yaml", LARGEST_METADATA)

@@ -91,11 +91,7 @@ def base(topic: str) -> str:
 def _best(
     pairs: "list[tuple[Connection, Connection]]", images: "Sequence[Connection]", bag: str
 ) -> "tuple[Connection, Connection]":
-    """The pair of one camera, registered rather than not, rectified rather than raw, raw data rather than compressed.
-
-    Raises:
-        DatasetError: Several pairs are equally good, which is so with two cameras in one bag.
-    """
+    """The pair of one camera, registered rather than not, rectified rather than raw, raw data rather than compressed."""
 
     def merit(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair

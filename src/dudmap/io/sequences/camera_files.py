@@ -1,17 +1,22 @@
-"""Where a folder's intrinsics may lie: files of the names that data sets and recorders use, in it or one folder up."""
+"""Intrinsics in files: where they may lie, and JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS and Kalibr."""
 
+import math
 import re
 from collections import Counter
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+from typing import Any, TypeGuard
 
 import numpy as np
+import yaml
+from numpy.typing import NDArray
 
+from dudmap.core.geometry import se3
 from dudmap.errors import DatasetError
-from dudmap.input_files import load_array
-from dudmap.io.sequences import camera_json
-from dudmap.io.sequences.intrinsics import Intrinsics, from_file, from_matrix
+from dudmap.input_files import LARGEST_TREE, load_array, read_json, read_text
+from dudmap.io.sequences.intrinsics import DISTORTION_KEYS, KEYS, Intrinsics, camera_values, from_file, from_matrix
 
-NAMES = (
+FILES = (
     "intrinsics.txt", "intrinsics.K.txt", "K.txt", "cam_K.txt", "camera-intrinsics.txt", "camera_intrinsics.txt",
     "intrinsic.txt", "camera-intrinsics.npy", "intrinsics.npy", "cam_K.npy", "K.npy",
 )  # fmt: skip
@@ -22,6 +27,19 @@ NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
 SHOWN = 10
 """Kinds of files that a message lists."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
+NAMES = {
+    "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
+    "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"), "height": ("height", "h", "image_height"),
+    **{key: (key,) for key in DISTORTION_KEYS},
+}  # fmt: skip
+"""Our key and the names it has in JSON and YAML files."""
+SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor")
+MATRICES = ("intrinsic_matrix", "camera_matrix", "cam_K", "K", "k")
+LENSES = ("coeffs", "disto", "distortion", "distortion_coefficients", "distortion_coeffs", "D", "d")
+"""Names of the intrinsic matrix and of the coefficients of the lens: a list, or a ``data`` list as OpenCV writes it."""
+OTHER_LENSES = ("equidistant", "fisheye", "kannala_brandt4", "equi")
+MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
+"""Names of a 4x4 matrix that takes points of the depth camera to the colour camera."""
 
 
 def find(folder: Path) -> Intrinsics | None:
@@ -31,21 +49,21 @@ def find(folder: Path) -> Intrinsics | None:
         DatasetError: The file cannot be understood.
     """
     for place in (folder, folder.resolve().parent):
-        for file in (place / name for name in NAMES):
+        for file in (place / name for name in FILES):
             if file.is_file():
                 return _from_array(file) if file.suffix == ".npy" else from_file(file)
         files = [place / name for name in TREES if (place / name).is_file()]
         if place is folder:
             files = [file for file in sorted(place.iterdir()) if re.fullmatch(NAMED, file.name.lower())]
         if files:
-            return camera_json.load(files)
+            return load(files)
     return None
 
 
 def unknown(folder: Path, why: str = "") -> DatasetError:
     """Error on a recording without intrinsics, which names what is there and how to give them."""
     return DatasetError(
-        f"the camera of {folder} is not known{why}: neither {', '.join(NAMES[:4])} nor another file of intrinsics that "
+        f"the camera of {folder} is not known{why}: neither {', '.join(FILES[:4])} nor another file of intrinsics that "
         f"is read (docs/formats.md) lies there or one folder up, only {seen(folder)}; give --camera "
         "fx,fy,cx,cy[,w,h[,depth_scale]]"
     )
@@ -53,10 +71,104 @@ def unknown(folder: Path, why: str = "") -> DatasetError:
 
 def seen(folder: Path) -> str:
     """What lies in a folder: names with their numbers replaced by N, and how many there are of each."""
-    names = (re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
-    kinds = Counter(names)
+    kinds = Counter(re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
     shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:SHOWN]]
     return ", ".join(shown) + (" ..." if len(kinds) > SHOWN else "") if shown else "nothing"
+
+
+def load(paths: Iterable[Path]) -> Intrinsics:
+    """Intrinsics of JSON and YAML files: of one camera, or of a depth and a colour camera.
+
+    Every object that holds focal lengths and a principal point is a camera; it is a depth camera where a name on the
+    way to it, the file's included, contains "depth". A depth scale below 1 is metres per unit.
+
+    Args:
+        paths: The files.
+
+    Raises:
+        DatasetError: A file cannot be read, or there is no camera or more than one of a kind.
+    """
+    cameras: list[tuple[str, dict[str, float]]] = []
+    scale, motion, files = {}, np.eye(4), list(paths)
+    for path in files:
+        tree = _read(path)
+        cameras += _cameras(tree, path.stem.lower())
+        unit = _depth_scale(tree)
+        scale = {"depth_scale": unit} if unit else scale
+        found = (_numbers(tree.get(name), 16) for name in MOTIONS) if isinstance(tree, dict) else ()
+        motion = next((numbers.reshape(4, 4) for numbers in found if numbers is not None), motion)
+    source = " and ".join(path.name for path in files)
+    depths = [values for name, values in cameras if "depth" in name]
+    colors = [values for name, values in cameras if "depth" not in name and "right" not in name]
+    if len(depths) > 1 or len(colors) > 1 or not cameras:
+        raise DatasetError(
+            f"{source} gives {len(depths)} depth and {len(colors)} other cameras; expected one of each at most: "
+            "give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+        )
+    if not depths:
+        return Intrinsics(colors[0] | scale, source)
+    color = colors[0] if colors and colors[0] != depths[0] else {}
+    return Intrinsics(depths[0] | scale, source, color, se3.inverse(motion))
+
+
+def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
+    """Numbers by our keys of one JSON object; None if it is no camera.
+
+    A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
+
+    Raises:
+        DatasetError: The lens model is another one than Brown and Conrady's with up to five coefficients.
+    """
+    values = {}
+    for key, names in NAMES.items():
+        found = next((tree[name] for name in names if _is_finite(tree.get(name))), None)
+        if found is not None:
+            values[key] = float(found)
+    K = _numbers(_first(tree, MATRICES), 9)
+    if K is not None:
+        K = K.reshape(3, 3)
+        K = K.T if K[2, 0] or K[2, 1] else K
+        values |= camera_values(K[0, 0], K[1, 1], K[0, 2], K[1, 2])
+    four = _numbers(tree.get("intrinsics"), 4)
+    if four is not None:
+        values |= camera_values(*four)
+    lens = _first(tree, LENSES)
+    if isinstance(lens, list) and lens and all(map(_is_finite, lens)):
+        model = str(tree.get("distortion_model", tree.get("model", "")))
+        if any(lens) and (any(lens[5:]) or model.lower() in OTHER_LENSES):
+            raise DatasetError(
+                f"the lens {lens} of the model {model or 'that is not named'} is not read; expected k1 k2 p1 p2 [k3]: "
+                "rectify the images, or give --camera fx,fy,cx,cy[,w,h[,depth_scale]]"
+            )
+        values |= dict(zip(DISTORTION_KEYS, map(float, lens[:5]), strict=False))
+    return values if all(key in values for key in KEYS[:4]) else None
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """Nested dictionaries and lists of a YAML file; OpenCV's header and type names are left out.
+
+    Raises:
+        DatasetError: The file cannot be read, holds no keys, or uses aliases, which could make it endless.
+    """
+    try:
+        text = re.sub(r"^%YAML.*\n|!!opencv-\w+", "", read_text(path, LARGEST_TREE))
+        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):
+            raise DatasetError(f"{path} uses aliases (*name); expected YAML of plain keys and values")
+        content = yaml.safe_load(text)
+    except (OSError, UnicodeDecodeError) as error:
+        raise DatasetError(f"cannot read {path}: {error}") from error
+    except (yaml.YAMLError, RecursionError, ValueError):
+        raise DatasetError(f"cannot read {path}; expected YAML of keys, numbers, texts and lists") from None
+    if not isinstance(content, dict):
+        raise DatasetError(f"{path} holds no keys; expected YAML of keys and values")
+    return content
+
+
+def _read(path: Path) -> Any:  # noqa: ANN401 - any JSON value
+    try:
+        return read_yaml(path) if path.suffix.lower() in (".yaml", ".yml") else read_json(path)
+    except (OSError, ValueError) as error:
+        raise DatasetError(f"cannot read {path}: {error}") from error
 
 
 def _from_array(file: Path) -> Intrinsics:
@@ -64,3 +176,44 @@ def _from_array(file: Path) -> Intrinsics:
         return from_matrix(np.asarray(load_array(file), dtype=np.float64).ravel(), file)
     except (OSError, ValueError, EOFError) as error:
         raise DatasetError(f"cannot read the array {file}: {error}") from error
+
+
+def _cameras(tree: Any, name: str) -> Iterator[tuple[str, dict[str, float]]]:  # noqa: ANN401
+    """Names and values of all cameras below a JSON value."""
+    if isinstance(tree, list):
+        for below in tree:
+            yield from _cameras(below, name)
+    elif isinstance(tree, dict) and (values := values_of(tree)) is not None:
+        yield name, values
+    elif isinstance(tree, dict):
+        for key, below in tree.items():
+            yield from _cameras(below, f"{name}/{key.lower()}")
+
+
+def _depth_scale(tree: Any) -> float | None:  # noqa: ANN401
+    """Depth units per metre anywhere in a JSON value."""
+    if not isinstance(tree, dict | list):
+        return None
+    for value in (tree.get(name) for name in SCALES) if isinstance(tree, dict) else ():
+        if _is_finite(value) and value > 0:
+            return float(value) if value >= 1 else 1.0 / value
+    parts = tree.values() if isinstance(tree, dict) else tree
+    return next((scale for below in parts if (scale := _depth_scale(below))), None)
+
+
+def _first(tree: dict[str, Any], names: tuple[str, ...]) -> Any:  # noqa: ANN401
+    """Value of the first of some names, of a matrix in OpenCV's form its data."""
+    value = next((tree[name] for name in names if name in tree), None)
+    return value.get("data") if isinstance(value, dict) else value
+
+
+def _is_finite(value: Any) -> TypeGuard[int | float]:  # noqa: ANN401 - any JSON value
+    return isinstance(value, int | float) and math.isfinite(value)
+
+
+def _numbers(value: Any, count: int) -> NDArray[np.float64] | None:  # noqa: ANN401
+    """Numbers (count,) of a list or of a list of rows; None if it is something else."""
+    if not isinstance(value, list):
+        return None
+    flat = [number for row in value for number in (row if isinstance(row, list) else [row])]
+    return np.array(flat, dtype=np.float64) if len(flat) == count and all(map(_is_finite, flat)) else None

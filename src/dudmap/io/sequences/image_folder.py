@@ -12,9 +12,9 @@ from dudmap.core.geometry.association import TimedFile, associate
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, FrameError
-from dudmap.input_files import damaged
 from dudmap.io.sequences import camera_files, images, intrinsics
-from dudmap.io.sequences.poses import read_matrix, rigid_trajectory
+from dudmap.io.sequences.poses import read_matrices, read_matrix, rigid_trajectory
+from dudmap.io.sequences.recording import Recording
 
 PROBES = 30
 """Number of evenly spread frames that are tried until one is valid and gives the image size."""
@@ -22,7 +22,7 @@ FRAME_RATE = 30.0
 """Frames per second of recordings whose frames are numbered but not timed; that of most depth cameras."""
 
 
-class ImageFolder:
+class ImageFolder(Recording):
     """Base class of recordings whose frames are a colour file and a depth file each.
 
     A format says what its files are called (``color_files`` and so on) or how they pair (``_find_pairs``), and
@@ -34,34 +34,24 @@ class ImageFolder:
         camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``;
             colour images of another size than depth keep their own camera.
 
-    Attributes:
-        name: Name of the folder.
-        camera: Intrinsics.
-        sources: Where ``intrinsics``, ``depth unit``, ``times`` and ``frames`` come from: a file, a name, an option, or
-            that they are assumed.
-        calibration: Of the colour camera, where it is another one; None for colour that is registered to depth.
-        timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
-        ground_truth: True camera poses, None if they are not known.
-        timed: Whether the times were read; False where frames are only numbered, and 1/30 s apart is assumed.
-
     Raises:
         DatasetError: A file of the layout is missing or malformed, no images can be paired, or no frame is valid.
     """
 
-    format = ""
     options: tuple[str, ...] = ("fps", "depth_unit")
-    timed = True
     depth_scale = 1000.0
     """Depth units per metre where neither the recording nor the user says otherwise."""
     color_files: tuple[str, str] = ("rgb", r"(\d+)\.png")
     depth_files: tuple[str, str] = ("depth", r"(\d+)\.png")
     pose_files: tuple[str, str] | None = None
     """Folder, and pattern of the names of its numbered files: images, and true poses, a matrix camera to world each."""
+    pose_list = ""
+    """File of true poses with a matrix camera to world per frame."""
     published: tuple[str, dict[str, float]] | None = None
     """Name of the data set and its published camera, for formats that are the layout of this data set alone."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
-        self.path = Path(path)
+        super().__init__(path)
         self.name = self.path.resolve().name
         self._pairing, self.image_counts = "a list of pairs", None
         self._pairs = self._find_pairs()
@@ -83,18 +73,8 @@ class ImageFolder:
         """(N,) timestamps of the colour images of all frames, seconds."""
         return np.array([color.timestamp for color, _ in self._pairs], dtype=np.float64)
 
-    def __len__(self) -> int:
-        return len(self._pairs)
-
-    def __getitem__(self, index: int) -> Frame:
-        """Frame number ``index``.
-
-        Raises:
-            FrameError: The frame cannot be read, or has another size than the recording.
-        """
-        index = range(len(self))[index]
-        with damaged(FrameError, f"frame {index} of {self.path}"):
-            frame = self._read(index, self.camera.depth_scale)
+    def _frame(self, index: int, name: str) -> Frame:
+        frame = self._read(index, self.camera.depth_scale)
         if frame.depth.shape != self.camera.shape:
             raise FrameError(
                 f"frame {index}: {self._pairs[index][1].path} is {size(frame.depth)} pixels, but the recording's "
@@ -119,10 +99,6 @@ class ImageFolder:
             self.ground_truth = Trajectory(factor * self.ground_truth.timestamps, self.ground_truth.Ts_world_camera)
         self.timed, self.sources["times"] = True, f"--fps {fps:g}"
 
-    def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame; this layout has none."""
-        return None
-
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of all frames, by increasing time of the depth."""
         return self._pair_numbered(self._numbered(self.color_files), self._numbered(self.depth_files))
@@ -132,11 +108,7 @@ class ImageFolder:
         return numbered_files((self.path / folder).iterdir(), pattern)
 
     def _find_intrinsics(self) -> intrinsics.Intrinsics:
-        """Intrinsics of a file that lies there, else those of the data set.
-
-        Raises:
-            DatasetError: There is neither, or the file cannot be understood.
-        """
+        """Intrinsics of a file that lies there, else those of the data set."""
         known = camera_files.find(self.path) or self._published()
         if known is None:
             raise camera_files.unknown(self.path)
@@ -144,24 +116,47 @@ class ImageFolder:
 
     def _published(self) -> intrinsics.Intrinsics | None:
         """Intrinsics of the data set, where the layout or a name tells which one it is."""
-        if self.published is None:
-            return None
-        name, values = self.published
-        return intrinsics.Intrinsics(dict(values), f"the {name} camera{intrinsics.BY_NAME}")
+        return None if self.published is None else intrinsics.by_name(*self.published)
+
+    def _one_view(self, cameras: list[dict[str, float]], source: str) -> intrinsics.Intrinsics:
+        """Intrinsics of depth images that show the view of the colour images, in the same or another size.
+
+        Args:
+            cameras: Numbers by key of each colour image; their median is taken.
+            source: Origin of the numbers.
+        """
+        color, depth = (self._read_color(self._pairs[0][0].path), self._read_depth(self._pairs[0][1].path, 1.0))
+        (height, width), unit = color.shape[:2], {"depth_scale": self.depth_scale}
+        values = {key: float(np.median([camera.get(key, 0.0) for camera in cameras])) for key in cameras[0]}
+        values |= {"width": width, "height": height}
+        if color.shape[:2] == depth.shape:
+            return intrinsics.Intrinsics(values | unit, source)
+        view = intrinsics.Intrinsics(values, source).camera(width, height).resized(depth.shape[1], depth.shape[0])
+        return intrinsics.Intrinsics(intrinsics.from_camera(view).values | unit, source, values)
 
     def _find_ground_truth(self) -> Trajectory | None:
         """True camera poses."""
+        if self.pose_list:
+            return self._listed_poses(self.path / self.pose_list)
         poses = self._numbered(self.pose_files) if self.pose_files else {}
         return rigid_trajectory((n / FRAME_RATE, read_matrix(poses[n])) for n in sorted(poses))
+
+    def _listed_poses(self, file: Path) -> Trajectory | None:
+        """Poses of a file with a matrix per frame, None if there is no such file."""
+        if not file.is_file():
+            return None
+        return rigid_trajectory((n / FRAME_RATE, T) for n, T in enumerate(read_matrices(file)))
+
+    def _stamped_poses(self) -> Trajectory | None:
+        """Poses of groundtruth.txt as they stand there, None if there is no such file."""
+        file = self.path / "groundtruth.txt"
+        return Trajectory.load(file) if file.is_file() else None
 
     def _pair_numbered(
         self, colors: dict[int, Path], depths: dict[int, Path], per_second: float | None = None
     ) -> list[tuple[TimedFile, TimedFile]]:
         """(colour, depth) files of equal numbers; the time of a frame is its number over ``per_second``, or, where the
         numbers only count the frames, over ``FRAME_RATE``.
-
-        Raises:
-            DatasetError: No number occurs in both.
         """
         numbers = sorted(colors.keys() & depths.keys())
         if not numbers:
@@ -175,11 +170,7 @@ class ImageFolder:
         return [(TimedFile(n / rate, colors[n]), TimedFile(n / rate, depths[n])) for n in numbers]
 
     def _pair_timed(self, colors: list[TimedFile], depths: list[TimedFile]) -> list[tuple[TimedFile, TimedFile]]:
-        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart.
-
-        Raises:
-            DatasetError: No colour image is so near a depth image.
-        """
+        """(colour, depth) files, one to one, nearest in time first, at most 20 ms apart."""
         pairs = associate(np.array([c.timestamp for c in colors]), np.array([d.timestamp for d in depths]))
         if not pairs:
             raise DatasetError(
@@ -234,11 +225,7 @@ class ImageFolder:
         return Frame(depth_file.timestamp, depth, color, color_file.timestamp)
 
     def _probe(self, known: intrinsics.Intrinsics) -> Camera:
-        """Camera with the size of the first valid frame.
-
-        Raises:
-            DatasetError: No frame is valid.
-        """
+        """Camera with the size of the first valid frame."""
         problem = None
         for index in np.unique(np.linspace(0, len(self) - 1, PROBES).astype(int)):
             try:

@@ -121,11 +121,7 @@ def _bytes(path: Path) -> bytes:
 
 
 def _decoded(data: bytes | NDArray[np.uint8], name: str, flags: int) -> NDArray[Any]:
-    """Image of the content of an image file.
-
-    Raises:
-        FrameError: It is truncated, damaged, too large or not an image.
-    """
+    """Image of the content of an image file."""
     import cv2
 
     with damaged(FrameError, name):

@@ -73,39 +73,22 @@ class Intrinsics:
 
 def _camera(values: dict[str, float], depth_scale: float) -> Camera:
     distortion = tuple(values.get(key, 0.0) for key in DISTORTION_KEYS)
-    return Camera(
-        fx=values["fx"],
-        fy=values["fy"],
-        cx=values["cx"],
-        cy=values["cy"],
-        width=int(values["width"]),
-        height=int(values["height"]),
-        depth_scale=depth_scale,
-        distortion=distortion if any(distortion) else (),
-    )
+    size = int(values["width"]), int(values["height"])
+    return Camera(*(values[key] for key in KEYS[:4]), *size, depth_scale, distortion if any(distortion) else ())
 
 
-def _by_key(*numbers: float) -> dict[str, float]:
-    return dict(zip(KEYS, numbers, strict=False))
+def camera_values(*numbers: float) -> dict[str, float]:
+    """Numbers of a camera by key, in the order of ``KEYS``."""
+    return dict(zip(KEYS, map(float, numbers), strict=False))
 
 
 BY_NAME = ", by name"
 """End of a source of intrinsics that are known from the name or the layout of a data set, and in no file."""
-KNOWN = (
-    (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", _by_key(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
-    (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", _by_key(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
-    (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", _by_key(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
-    (r"rgbd_bonn", "Bonn", _by_key(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)),
-)
-"""Pattern of the folder name, name and published intrinsics of the data sets."""
 
 
-def by_name(path: Path) -> Intrinsics | None:
-    """Published intrinsics of the data set that the folder name of a recording in TUM layout matches."""
-    for pattern, name, values in KNOWN:
-        if re.search(pattern, path.resolve().name, flags=re.IGNORECASE):
-            return Intrinsics(values, f"the {name} camera{BY_NAME}")
-    return None
+def by_name(name: str, values: dict[str, float]) -> Intrinsics:
+    """Published intrinsics of a data set."""
+    return Intrinsics(dict(values), f"the {name} camera{BY_NAME}")
 
 
 def given(camera: Camera | str) -> Intrinsics:
@@ -122,7 +105,7 @@ def given(camera: Camera | str) -> Intrinsics:
         numbers = []
     if len(numbers) not in (4, 6, 7) or not all(map(math.isfinite, numbers)):
         raise DatasetError(f"cannot understand the camera {camera!r}; expected fx,fy,cx,cy[,w,h[,depth_scale]]")
-    return Intrinsics(_by_key(*numbers), f"--camera {camera}")
+    return Intrinsics(camera_values(*numbers), f"--camera {camera}")
 
 
 def from_camera(camera: Camera) -> Intrinsics:
@@ -168,47 +151,43 @@ def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
     """
     source = str(path)
     if numbers.size in (4, 6, 7):
-        return Intrinsics(_by_key(*numbers.tolist()), source)
+        return Intrinsics(camera_values(*numbers.tolist()), source)
     if numbers.size not in (9, 16):
         raise DatasetError(f"{path} holds {numbers.size} numbers; expected the 9 of a 3x3 matrix K, row by row")
     K = numbers.reshape(math.isqrt(numbers.size), -1)
     if np.any(K[[1, 2, 2], [0, 0, 1]]) or K[2, 2] != 1:
         raise DatasetError(f"{path} holds {K[:3, :3].tolist()}; expected the rows fx 0 cx, 0 fy cy, 0 0 1")
-    return Intrinsics(_by_key(*(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))), source)
+    return Intrinsics(camera_values(*(float(K[at]) for at in ((0, 0), (1, 1), (0, 2), (1, 2)))), source)
 
 
 def _keyed(path: Path, rows: list[list[str]]) -> Intrinsics:
-    values, color, T_depth_color = {}, {}, None
+    """Intrinsics of lines with a key and a number, and a motion of 12 or 16 numbers."""
+    values, color, T_depth_color = {}, {}, np.eye(4)
     color_keys = [COLOR_PREFIX + key for key in (*COLOR_REQUIRED, *DISTORTION_KEYS)]
-    for row in rows:
-        if row[0] == MOTION_KEY:
-            T_depth_color = _motion(path, row[1:])
-            continue
-        if row[0] in color_keys and len(row) == 2 and _is_number(row[1]):
-            color[row[0].removeprefix(COLOR_PREFIX)] = float(row[1])
-            continue
-        if row[0] not in KEYS or len(row) != 2 or not _is_number(row[1]):
+    for key, *fields in rows:
+        if key == MOTION_KEY:
+            T_depth_color = _motion(path, fields)
+        elif key not in (*KEYS, *color_keys) or len(fields) != 1 or not _is_number(fields[0]):
             raise DatasetError(
-                f"{path}: cannot understand the line {' '.join(row)!r}; expected one of {', '.join(KEYS)} and a number"
+                f"{path}: cannot understand the line {' '.join((key, *fields))!r}; expected one of {', '.join(KEYS)} "
+                "and a number"
             )
-        values[row[0]] = float(row[1])
-    missing = [key for key in KEYS[:4] if key not in values]
-    if missing:
+        elif key in KEYS:
+            values[key] = float(fields[0])
+        else:
+            color[key.removeprefix(COLOR_PREFIX)] = float(fields[0])
+    if missing := [key for key in KEYS[:4] if key not in values]:
         raise DatasetError(f"{path} lacks {', '.join(missing)}")
     missing = [COLOR_PREFIX + key for key in COLOR_REQUIRED if key not in color]
-    if missing and (color or T_depth_color is not None):
+    if missing and (color or any(row[0] == MOTION_KEY for row in rows)):
         raise DatasetError(f"{path} lacks {', '.join(missing)}, which the second camera of the colour images needs")
-    return Intrinsics(values, str(path), color, np.eye(4) if T_depth_color is None else T_depth_color)
+    return Intrinsics(values, str(path), color, T_depth_color)
 
 
 def _motion(path: Path, fields: list[str]) -> NDArray[np.float64]:
-    """Rigid motion of 12 or 16 numbers, row by row.
-
-    Raises:
-        DatasetError: They are not a rigid motion.
-    """
+    """Rigid motion of 12 or 16 numbers, row by row."""
     T = np.eye(4)
-    if len(fields) in (12, 16) and all(_is_number(field) for field in fields):
+    if len(fields) in (12, 16) and all(map(_is_number, fields)):
         T[:3] = np.array(fields[:12], dtype=np.float64).reshape(3, 4)
         if np.allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-3) and np.linalg.det(T[:3, :3]) > 0:
             T[:3, :3] = se3.nearest_rotation(T[:3, :3])

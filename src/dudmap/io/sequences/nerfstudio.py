@@ -11,13 +11,12 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
 from dudmap.input_files import read_json
-from dudmap.io.sequences import images, intrinsics
-from dudmap.io.sequences.camera_json import values_of
+from dudmap.io.sequences import images
+from dudmap.io.sequences.camera_files import values_of
 from dudmap.io.sequences.image_folder import FRAME_RATE, ImageFolder
-from dudmap.io.sequences.poses import rigid_trajectory
+from dudmap.io.sequences.intrinsics import Intrinsics
+from dudmap.io.sequences.poses import OPENGL_AXES, rigid_trajectory
 
-OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
-"""Between the camera axes of OpenGL (y up, z backward) and ours (y down, z forward)."""
 MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "")
 
 
@@ -31,11 +30,7 @@ class NerfstudioSequence(ImageFolder):
     """
 
     format = "nerfstudio"
-
-    @staticmethod
-    def recognises(path: Path) -> bool:
-        """Whether a folder has this layout."""
-        return (path / "transforms.json").is_file()
+    layout = ("transforms.json",)
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         file = Path(path) / "transforms.json"
@@ -64,16 +59,14 @@ class NerfstudioSequence(ImageFolder):
         self.timed = False
         return [n / FRAME_RATE for n in range(len(self._frames))]
 
-    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+    def _find_intrinsics(self) -> Intrinsics:
         model = self._tree.get("camera_model", "")
         if model not in MODELS:
             raise DatasetError(f"{self.path}/transforms.json has the camera model {model}; expected OPENCV or PINHOLE")
         found = [values for frame in self._frames if (values := values_of(self._tree | frame)) is not None]
         if not found:
             raise DatasetError(f"{self.path}/transforms.json lacks fl_x, fl_y, cx or cy; give --camera fx,fy,cx,cy")
-        color, depth = self._pairs[0]
-        shapes = images.read_color(color.path).shape[:2], self._read_depth(depth.path, self.depth_scale).shape
-        return one_view(found, *shapes, self.depth_scale, "transforms.json")
+        return self._one_view(found, "transforms.json")
 
     def _read_depth(self, path: Path, depth_scale: float) -> NDArray[np.float32]:
         return images.read_depth_array(path) if path.suffix == ".npy" else images.read_depth(path, depth_scale)
@@ -93,22 +86,3 @@ class NerfstudioSequence(ImageFolder):
 def _order(frame: dict[str, Any]) -> tuple[int, str]:
     """Name of the image, shorter ones first, so that frame_2 comes before frame_10."""
     return len(frame["file_path"]), frame["file_path"]
-
-
-def one_view(
-    cameras: list[dict[str, float]], color: tuple[int, ...], depth: tuple[int, ...], depth_scale: float, source: str
-) -> intrinsics.Intrinsics:
-    """Intrinsics of depth images that show the view of the colour images, in the same or another size.
-
-    Args:
-        cameras: Numbers by key of each colour image; their median is taken.
-        color, depth: Shapes of the images.
-        depth_scale: Depth units per metre.
-        source: Origin of the numbers.
-    """
-    values = {key: float(np.median([camera.get(key, 0.0) for camera in cameras])) for key in cameras[0]}
-    values |= {"width": color[1], "height": color[0]}
-    if color == depth:
-        return intrinsics.Intrinsics(values | {"depth_scale": depth_scale}, source)
-    view = intrinsics.Intrinsics(values, source).camera(color[1], color[0]).resized(depth[1], depth[0])
-    return intrinsics.Intrinsics(intrinsics.from_camera(view).values | {"depth_scale": depth_scale}, source, values)

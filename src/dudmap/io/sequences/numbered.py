@@ -1,17 +1,20 @@
 """Numbered colour and depth images in any plain folder: exports of ZED, RealSense, Azure Kinect, your own camera."""
 
 import re
+from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError
-from dudmap.input_files import read_text
-from dudmap.io.sequences import camera_files
+from dudmap.input_files import DAMAGE, read_json, read_text
+from dudmap.io.sequences import camera_files, intrinsics
 from dudmap.io.sequences.camera_files import IMAGES
 from dudmap.io.sequences.image_folder import ImageFolder
 from dudmap.io.sequences.poses import read_matrices, rigid_trajectory
@@ -54,8 +57,8 @@ class NumberedSequence(ImageFolder):
         self._patterns = {"color": color, "depth": depth}
         super().__init__(path, camera)
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
         """Whether a folder holds depth and colour images by the words of their names."""
         return path.is_dir() and all(kinds_of_images(path).values())
 
@@ -79,8 +82,8 @@ class NumberedSequence(ImageFolder):
         self.ground_truth = self._find_ground_truth()
 
     def _find_ground_truth(self) -> Trajectory | None:
-        if (self.path / "groundtruth.txt").is_file():
-            return Trajectory.load(self.path / "groundtruth.txt")
+        if (truth := self._stamped_poses()) is not None:
+            return truth
         for name in POSES:
             place = self.path / name
             if place.is_file():
@@ -142,3 +145,58 @@ def _number(file: Path) -> float:
 
 def _seconds(number: float) -> float:
     return next(number / units for smallest, units in TIME_UNITS if number >= smallest)
+
+
+BOP_FILE = "scene_camera.json"
+LARGEST_CHANGE = 0.5
+"""Largest difference of the intrinsics of two images, pixels: below what shifts an edge by a pixel."""
+
+
+class BopSequence(NumberedSequence):
+    """Scene of BOP (Hodan et al. 2018), the benchmark for poses of objects: rgb/, depth/ and scene_camera.json.
+
+    The file holds ``cam_K`` by image number and ``depth_scale``, millimetres per unit. ``cam_R_w2c`` (row by row) and
+    ``cam_t_w2c`` (mm), if they are there, take points of the world to the camera and are the truth (bop_toolkit,
+    docs/bop_datasets_format.md).
+    """
+
+    format = "BOP"
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a folder has this layout."""
+        return (path / BOP_FILE).is_file() and super().recognises(path)
+
+    @cached_property
+    def _cameras(self) -> dict[int, dict[str, Any]]:
+        """Entries of the file by number of the image, of the frames that there are."""
+        try:
+            found = {int(number): entry for number, entry in read_json(self.path / BOP_FILE).items()}
+            return {int(depth.path.stem): found[int(depth.path.stem)] for _, depth in self._pairs}
+        except DAMAGE as error:
+            raise DatasetError(f"{self.path / BOP_FILE} does not give the camera of every image: {error!r}") from error
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        try:
+            rows = [(*entry["cam_K"], 1000.0 / entry["depth_scale"]) for entry in self._cameras.values()]
+            numbers = np.array(rows, dtype=np.float64)
+        except DAMAGE as error:
+            raise DatasetError(f"{self.path / BOP_FILE} lacks cam_K or depth_scale of an image: {error!r}") from error
+        change = float(np.ptp(numbers, axis=0).max())
+        if change > LARGEST_CHANGE:
+            raise DatasetError(
+                f"{self.path / BOP_FILE}: the camera changes by up to {change:g} from image to image; expected "
+                "one camera"
+            )
+        known = intrinsics.from_matrix(numbers[0, :9], self.path / BOP_FILE)
+        return intrinsics.Intrinsics(known.values | {"depth_scale": float(numbers[0, 9])}, known.source)
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        poses = []
+        for stamp, entry in zip(self.timestamps.tolist(), self._cameras.values(), strict=True):
+            if "cam_R_w2c" in entry and "cam_t_w2c" in entry:
+                T = np.eye(4)
+                T[:3, :3] = np.reshape(entry["cam_R_w2c"], (3, 3))
+                T[:3, 3] = np.asarray(entry["cam_t_w2c"]) / 1000
+                poses.append((stamp, se3.inverse(T)))
+        return rigid_trajectory(poses) if poses else super()._find_ground_truth()

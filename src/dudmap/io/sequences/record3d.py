@@ -15,13 +15,13 @@ from dudmap.errors import DatasetError, FrameError
 from dudmap.extras import extra
 from dudmap.input_files import DAMAGE, LARGEST_FILE, RATIO_FREE_BYTES, open_plain, parse_json
 from dudmap.io.sequences import images
-from dudmap.io.sequences.file_recording import FileRecording
+from dudmap.io.sequences.recording import Recording
 
 LARGEST_COMMAND = 315 + 2359
 """Bytes that one command of an LZFSE block can write."""
 
 
-class Record3DRecording(FileRecording):
+class Record3DRecording(Recording):
     """Recording in a ``.r3d`` file.
 
     The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same

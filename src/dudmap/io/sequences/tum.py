@@ -1,16 +1,22 @@
-"""Folders in the layout of the TUM RGB-D benchmark (Sturm et al. 2012), which several other data sets share."""
+"""Folders with lists of stamped images: the TUM RGB-D benchmark (Sturm et al. 2012) and data sets of a like layout."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.association import TimedFile, associate, read_list, read_pairs
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.errors import FrameError
+from dudmap.errors import DatasetError, FrameError
 from dudmap.io.sequences import images, intrinsics
+from dudmap.io.sequences.archive import origin, unpack
+from dudmap.io.sequences.camera_files import read_yaml
 from dudmap.io.sequences.image_folder import ImageFolder, size
+from dudmap.io.sequences.intrinsics import camera_values
 
 
 class TumSequence(ImageFolder):
@@ -19,36 +25,28 @@ class TumSequence(ImageFolder):
     associations.txt (``t_rgb rgb_file t_depth depth_file``) pairs colour and depth images; without it they are
     associated one to one, nearest first, at most 20 ms apart. The timestamp of a frame is that of its depth image.
 
-    Intrinsics come from ``camera``, else from a file, else from the folder's name (TUM freiburg1-3, Bonn).
-    The published distortion of TUM freiburg1 and 2 is deliberately left out: it describes the colour lens,
-    but the driver reprojected the depth as if that lens had no distortion, and undistorting both images would distort
-    correct depth. On 240 frames of freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in
-    intrinsics.txt (k1 k2 p1 p2 k3) are applied to both images.
-
-    Args:
-        path: The folder.
-        camera: Intrinsics that replace those of the recording, as a Camera or as ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
-
-    Attributes:
-        name: Name of the folder.
-        camera: Intrinsics.
-        calibration: Of the colour camera, where intrinsics.txt gives it; None for colour that is registered to depth.
-        timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
-        ground_truth: True camera poses, None without groundtruth.txt.
-
-    Raises:
-        DatasetError: A list is missing or malformed, no images can be paired, or no frame is valid.
+    Intrinsics come from ``camera``, else from a file, else from the folder's name (freiburg1-3). The published
+    distortion of freiburg1 and 2 is deliberately left out: it describes the colour lens, but the driver reprojected the
+    depth as if that lens had no distortion, and undistorting both images would distort correct depth. On 240 frames of
+    freiburg1_xyz the ATE was 0.96 cm without and 0.93 cm with it. Coefficients in intrinsics.txt (k1 k2 p1 p2 k3) are
+    applied to both images.
     """
 
     format = "TUM RGB-D"
     depth_scale = intrinsics.DEPTH_SCALE
+    cameras = (
+        (r"(freiburg|fr)1(?!\d)", "TUM freiburg1", camera_values(517.3, 516.5, 318.6, 255.3, 640, 480, 5000)),
+        (r"(freiburg|fr)2(?!\d)", "TUM freiburg2", camera_values(520.9, 521.0, 325.1, 249.7, 640, 480, 5000)),
+        (r"(freiburg|fr)3(?!\d)", "TUM freiburg3", camera_values(535.4, 539.2, 320.1, 247.6, 640, 480, 5000)),
+    )
+    """Pattern of the folder's name, name and published intrinsics of each camera."""
 
     def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
         super().__init__(path, camera)
         self._masks = self._find_masks()
 
-    @staticmethod
-    def recognises(path: Path) -> bool:
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
         """Whether a folder has this layout."""
         lists = (path / "rgb.txt").is_file() and (path / "depth.txt").is_file()
         return lists or (path / "associations.txt").is_file()
@@ -74,11 +72,12 @@ class TumSequence(ImageFolder):
         return self._pair_timed(read_list(self.path / "rgb.txt"), read_list(self.path / "depth.txt"))
 
     def _published(self) -> intrinsics.Intrinsics | None:
-        return super()._published() or intrinsics.by_name(self.path)
+        folder = self.path.resolve().name
+        named = (camera for pattern, *camera in self.cameras if re.search(pattern, folder, re.IGNORECASE))
+        return super()._published() or next((intrinsics.by_name(*camera) for camera in named), None)
 
     def _find_ground_truth(self) -> Trajectory | None:
-        path = self.path / "groundtruth.txt"
-        return Trajectory.load(path) if path.is_file() else None
+        return self._stamped_poses()
 
     def _find_masks(self) -> dict[int, Path]:
         """Mask files by frame number; mask.txt has the timestamps of the colour images."""
@@ -86,7 +85,145 @@ class TumSequence(ImageFolder):
         if not path.is_file():
             return {}
         masks = read_list(path)
-        colors = np.array([color.timestamp for color, _ in self._pairs])
+        colors = self.color_timestamps
         order = np.argsort(colors, kind="stable")
         pairs = associate(np.array([mask.timestamp for mask in masks]), colors[order])
         return {int(order[j]): masks[i].path for i, j in pairs}
+
+
+T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+"""Axes of Bonn's motion capture system against those of the cloud; its own inverse. From the data set's page."""
+T_MARKER_CAMERA = np.array(
+    [
+        [1.0157, 0.1828, -0.2389, 0.0113],
+        [0.0009, -0.8431, -0.6413, -0.0098],
+        [-0.3009, 0.6147, -0.8085, 0.0111],
+        [0, 0, 0, 1],
+    ]
+)
+"""T_m of the data set's page: camera to markers. Its rotation is scaled by 1.0593, which is removed for poses."""
+
+
+class BonnSequence(TumSequence):
+    """Folder ``rgbd_bonn_*`` of the Bonn RGB-D Dynamic Dataset (Palazzolo et al. 2019).
+
+    groundtruth.txt holds poses T of the markers. The true camera poses are ``T_ROS^-1 T T_ROS T_m``, in the frame of
+    the point cloud ``rgbd_bonn_groundtruth_1mm_section.ply``.
+    """
+
+    format = "Bonn RGB-D Dynamic"
+    published = "Bonn", camera_values(542.822841, 542.576870, 315.593520, 237.756098, 640, 480, 5000)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a folder has the layout and the name of this data set."""
+        return super().recognises(path) and re.search("rgbd_bonn", path.resolve().name, re.IGNORECASE) is not None
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        truth = super()._find_ground_truth()
+        if truth is None:
+            return None
+        T_marker_camera = T_MARKER_CAMERA.copy()
+        T_marker_camera[:3, :3] = se3.nearest_rotation(T_MARKER_CAMERA[:3, :3])
+        return Trajectory(truth.timestamps, T_ROS @ truth.Ts_world_camera @ T_ROS @ T_marker_camera)
+
+
+class CorbsSequence(TumSequence):
+    """Folder ``D1_pre_registereddata`` of CoRBS (Wasenmueller et al. 2016), whose lists may have backslashes.
+
+    The truth is groundtruth.txt in the folder, or in the folder or archive ``D1_Trajectory`` beside it, as downloaded.
+    """
+
+    format = "CoRBS"
+    published = "CoRBS", camera_values(468.60, 468.61, 318.27, 243.99, 640, 480, 5000)
+    folder = re.compile(r"(.+)_pre_?registered_?data", re.IGNORECASE)
+
+    @classmethod
+    def recognises(cls, path: Path) -> bool:
+        """Whether a folder has the layout and the name of this data set."""
+        return super().recognises(path) and cls.folder.fullmatch(path.resolve().name) is not None
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        pairs = super()._find_pairs()
+        return [tuple(TimedFile(t, Path(str(file).replace("\\", "/"))) for t, file in pair) for pair in pairs]
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        truth = super()._find_ground_truth()
+        match = self.folder.fullmatch(self.name)
+        if truth is not None or match is None:
+            return truth
+        archive = origin(self.path)
+        for place in (self.path.parent, *(() if archive is None else (archive.parent,))):
+            file = place / f"{match.group(1)}_Trajectory"
+            if not file.is_dir() and file.with_name(file.name + ".zip").is_file():
+                file = unpack(file.with_name(file.name + ".zip"))
+            found = sorted(file.rglob("groundtruth.txt")) if file.is_dir() else []
+            if found:
+                return Trajectory.load(found[0])
+        return None
+
+
+CAMERA_FRAME, BODY_FRAME = "d400_color_optical_frame", "base_link"
+
+
+class OpenLorisSequence(ImageFolder):
+    """Folder of OpenLORIS-Scene (Shi et al. 2020) in the "package" form: a RealSense D435i on a robot.
+
+    Intrinsics in sensors.yaml are in the order fx, cx, fy, cy. groundtruth.txt holds poses of the robot
+    (``base_link``); those of the camera follow from the tree of motions in trans_matrix.yaml.
+    """
+
+    format = "OpenLORIS-Scene"
+    layout = ("color.txt", "aligned_depth.txt", "sensors.yaml")
+
+    def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
+        return self._pair_timed(read_list(self.path / "color.txt"), read_list(self.path / "aligned_depth.txt"))
+
+    def _find_intrinsics(self) -> intrinsics.Intrinsics:
+        path = self.path / "sensors.yaml"
+        node = read_yaml(path).get(CAMERA_FRAME) or {}
+        numbers = _matrix(node, "intrinsics")
+        if numbers is None or numbers.size != 4:
+            raise DatasetError(f"{path} lacks the intrinsics (4 numbers) of {CAMERA_FRAME}")
+        fx, cx, fy, cy = numbers.ravel().tolist()
+        size = {key: float(node[key]) for key in ("width", "height") if isinstance(node.get(key), int | float)}
+        return intrinsics.Intrinsics(camera_values(fx, fy, cx, cy) | size, "sensors.yaml")
+
+    def _find_ground_truth(self) -> Trajectory | None:
+        truth, path = self._stamped_poses(), self.path / "trans_matrix.yaml"
+        if truth is None or not path.is_file():
+            return truth
+        return Trajectory(truth.timestamps, truth.Ts_world_camera @ _motion(path, BODY_FRAME, CAMERA_FRAME))
+
+
+def _matrix(node: Any, key: str) -> NDArray[np.float64] | None:  # noqa: ANN401 - a value of a YAML file
+    """Matrix under a key of a node, as OpenCV writes it; None if there is none."""
+    try:
+        rows, columns, numbers = (node[key][name] for name in ("rows", "cols", "data"))
+        return np.array(numbers, dtype=np.float64).reshape(max(int(rows), 0), max(int(columns), 0))
+    except (TypeError, KeyError, ValueError, OverflowError):
+        return None
+
+
+def _motion(path: Path, parent: str, child: str) -> NDArray[np.float64]:
+    """T_parent_child (4, 4) along the tree of the file, whose matrices take points of a child to its parent."""
+    entries = read_yaml(path).get("trans_matrix")
+    edges: dict[str, dict[str, NDArray[np.float64]]] = {}
+    for index, node in enumerate(entries if isinstance(entries, list) else []):
+        T_a_b = _matrix(node, "matrix")
+        if T_a_b is None or T_a_b.shape != (4, 4):
+            raise DatasetError(f"{path}: entry {index + 1} of trans_matrix has no 4x4 matrix")
+        a, b = str(node.get("parent_frame")), str(node.get("child_frame"))
+        edges.setdefault(a, {})[b] = T_a_b
+        edges.setdefault(b, {})[a] = se3.inverse(T_a_b)
+    reached = {parent: np.eye(4)}
+    queue = [parent]
+    while queue:
+        frame = queue.pop()
+        for neighbour, T in edges.get(frame, {}).items():
+            if neighbour not in reached:
+                reached[neighbour] = reached[frame] @ T
+                queue.append(neighbour)
+    if child not in reached:
+        raise DatasetError(f"{path} does not connect {parent} with {child}")
+    return reached[child]

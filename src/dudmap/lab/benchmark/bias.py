@@ -60,8 +60,7 @@ def measure_pulls(sequence: Sequence, config: Config, stride: int = 1) -> list[P
     truth = sequence.ground_truth
     if truth is None:
         raise DatasetError(f"{sequence.name} has no true poses; benchmark bias needs a recording with groundtruth.txt")
-    voxel_size = config.volume.voxel_size if config.volume.antialias else 0.0
-    preprocess = Preprocessor(sequence.camera, config.preprocess, voxel_size=voxel_size)
+    preprocess = Preprocessor(sequence.camera, config.preprocess)
     volume = TsdfVolume(preprocess.camera, config.volume, config.sensor, config.preprocess.depth_max)
     frames: list[tuple[Level, NDArray[np.float64]]] = []
     for index, stamp in enumerate(sequence.timestamps):

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import (
-    antialiasing,
     color_registration,
     filtering,
     integration,
@@ -168,20 +167,6 @@ class CpuBackend:
             bands(depth.shape[0], PIXEL_ROWS),
         )
         return weights
-
-    def footprint_colors(
-        self, color: NDArray[np.uint8], depth: NDArray[np.float32], focal: float, voxel_size: float
-    ) -> NDArray[np.uint8]:
-        """See ``Backend.footprint_colors``."""
-        rgb, (h, w) = np.ascontiguousarray(color), depth.shape
-        sums, out = np.empty((h + 1, w + 1), dtype=np.int64), np.empty_like(rgb)
-        antialiasing.sum_table(rgb, sums)
-        by_depth, tolerance = np.float32(focal * voxel_size), np.float32(antialiasing.SAME_SURFACE * voxel_size)
-        run_bands(
-            lambda start, stop: antialiasing.footprint_means(start, stop, depth, rgb, sums, by_depth, tolerance, out),
-            bands(h, PIXEL_ROWS),
-        )
-        return out
 
     def touched_cells(
         self,

@@ -82,7 +82,7 @@ def locate(x, y, z, last, size_y, size_z):
 
 
 @kernel
-def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
+def load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
     Those of the points, a third, whose eight voxels lie in several blocks are looked up on their own.
@@ -93,16 +93,18 @@ def load_row(window, shape, geometry, cells, voxels, crossing, outer, words):
         geometry: (slots * 512,) int32 packed voxels.
         cells: (w,) int32, cell of the window that holds the point; w is a multiple of ``LANES``.
         voxels: (w,) int32, number within the block of the voxel at its lower corner.
-        crossing: (w,) int32, 1 where the eight voxels lie in more than one block, 0 elsewhere.
+        crossing: (w,) int32, 1 where the eight voxels of a wanted point lie in more than one block, else 0.
+        wanted: (w,) uint8, 0 where nothing need be loaded; points are left out by ``LANES``.
         outer: (w + LANES,) int32, work space.
         words: (8, w) int32 out, corner 4 dx + 2 dy + dz.
     """
-    flat, num_outer = words.reshape(-1), np.uintp(0)
+    flat, groups, num_outer = words.reshape(-1), wanted.view(np.uint64), np.uintp(0)
     for u in range(len(cells)):
         outer[num_outer] = u
         num_outer += np.uintp(crossing[u])
     for start in range(0, len(cells), LANES):
-        load_voxels(window, geometry, cells, voxels, crossing, start, flat, len(cells))
+        if groups[start // LANES] != 0:
+            load_voxels(window, geometry, cells, voxels, crossing, start, flat, len(cells))
     if num_outer > 0:
         outer[num_outer : num_outer + np.uintp(LANES)] = outer[num_outer - np.uintp(1)]
     for start in range(0, num_outer, LANES):

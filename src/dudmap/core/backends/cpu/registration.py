@@ -52,7 +52,8 @@ def linearize_rows(
         geometry: (slots * 512,) int32 packed voxels.
         voxel_size, sdf_unit: Metres, and metres per step of the stored distance.
         parameters: RegistrationParameters.
-        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map.
+        residuals: (2, h, w) float32 out: signed distance (m) and intensity difference; NaN = not on the map, or without
+            a weight.
         sums: (NUM_SUMS,) float64 in and out. Twist (v, omega) about the camera's centre, world axes.
     """
     wide_vectors()
@@ -66,7 +67,7 @@ def linearize_rows(
     px = np.empty(w, np.float32)
     py = np.empty(w, np.float32)
     pz = np.empty(w, np.float32)
-    inside = np.empty(w, np.float32)
+    wanted = np.zeros(padded, np.uint8)
 
     zero, one = np.float32(0), np.float32(1)
     by_unit = sdf_unit / voxel_size
@@ -86,12 +87,12 @@ def linearize_rows(
             rx, ry, rz = rotate(t, x, y, z)
             gx, gy, gz = rx + t[3], ry + t[7], rz + t[11]
             cells[u], voxels[u], crosses, within, fx[u], fy[u], fz[u] = locate(gx, gy, gz, last, size_y, size_z)
-            ok = within & (z > zero)
+            ok = within & (z > zero) & (weights[v, u] > zero)
             crossing[u] = crosses if ok else np.int32(0)
             px[u], py[u], pz[u] = rx * voxel_size, ry * voxel_size, rz * voxel_size
-            inside[u] = one if ok else zero
+            wanted[u] = ok
 
-        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+        load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words)
 
         h00 = h01 = h02 = h11 = h12 = h22 = zero
         m00 = m01 = m02 = m10 = m11 = m12 = m20 = m21 = m22 = zero
@@ -122,7 +123,7 @@ def linearize_rows(
             scale_c = by_255 * by_voxel
             kx_, ky_, kz_ = kx_ * scale_c, ky_ * scale_c, kz_ * scale_c
 
-            known = (low > 0) & (inside[u] > zero) & (darkest > zero)  # a corner in the air is not part of a surface
+            known = (low > 0) & (wanted[u] > 0) & (darkest > zero)  # a corner in the air is not part of a surface
             valid, used, paid, forfeit, square, wg, wc = weigh(r, rc, z, weights[v, u], known, parameters)
             residuals[0, v, u] = r if known else np.float32(np.nan)
             residuals[1, v, u] = rc if valid else np.float32(np.nan)

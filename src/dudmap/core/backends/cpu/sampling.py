@@ -54,7 +54,7 @@ def sample_rows(
     cells, voxels, crossing = np.zeros(padded, np.int32), np.zeros(padded, np.int32), np.zeros(padded, np.int32)
     outer, words = np.empty(padded + LANES, np.int32), np.empty((8, padded), np.int32)
     slots = np.empty(w, np.int32)
-    fractions, inside = np.empty((3, w), np.float32), np.empty(w, np.bool_)
+    fractions, inside = np.empty((3, w), np.float32), np.zeros(padded, np.uint8)
     last, size_y, size_z = last_corner(shape), shape[1], shape[2]
     t = elements(T)
     for v in range(row_start, row_stop):
@@ -63,12 +63,13 @@ def sample_rows(
             z = depth[v, u]
             gx, gy, gz = transform(t, ray(u, intrinsics[2], intrinsics[0]) * z, row_y * z, z)
             cells[u], voxels[u], crosses, within, ax, ay, az = locate(gx, gy, gz, last, size_y, size_z)
-            crossing[u] = crosses if within else np.int32(0)
+            ok = within & (z > f32(0))
+            crossing[u] = crosses if ok else np.int32(0)
             fractions[0, u], fractions[1, u], fractions[2, u] = ax, ay, az
-            inside[u] = within & (z > f32(0))
-        load_row(window, shape, geometry, cells, voxels, crossing, outer, words)
+            inside[u] = ok
+        load_row(window, shape, geometry, cells, voxels, crossing, inside, outer, words)
         for u in range(w):
-            slots[u] = window[np.uintp(cells[u])] if inside[u] else np.int32(-1)
+            slots[u] = window[np.uintp(cells[u])] if inside[u] > 0 else np.int32(-1)
         for u in range(w):
             sdf, total, shade, shaded = zero, zero, zero, zero
             for k in range(8):

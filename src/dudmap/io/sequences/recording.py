@@ -1,7 +1,8 @@
-"""Recordings in one file: what their formats share."""
+"""What the recordings of all formats have in common."""
 
 from abc import ABC, abstractmethod
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,33 +16,41 @@ from dudmap.input_files import damaged
 from dudmap.io.sequences import intrinsics
 
 
-class FileRecording(ABC):
-    """Base class of recordings in one file.
+class Recording(ABC):
+    """A sequence on disk: recognises its format, opens a folder or file of it, and reads a frame when it is asked for.
 
-    A format sets the times and the cameras in its constructor, and reads a frame in ``_frame``.
+    A format sets the times, the cameras and their sources in its constructor, and reads a frame in ``_frame``.
 
     Args:
-        path: The file.
+        path: The folder or file.
 
     Attributes:
-        name: Name of the file without its suffix.
+        format: Name of the format, for people.
+        options: Names of the options of ``open_sequence`` that the format has.
+        name: Name of the folder, or of the file without its suffix.
         camera: Intrinsics of the depth images.
-        sources: Where the intrinsics, the depth unit and the times come from.
         calibration: Of the colour camera, None for colour that is registered to depth.
         timestamps: (N,) strictly increasing timestamps of the depth images, seconds.
         ground_truth: True camera poses, None if they are not known.
+        sources: Where ``intrinsics``, ``depth unit`` and ``times`` come from: a file, a data set's name, an option, or
+            that they are assumed.
+        timed: Whether the times were read or their rate was given; False where they are invented.
+        opened: Arguments of ``open_sequence`` that open it again, with an absolute path.
     """
 
     format = ""
-    suffix = ""
-    """By which the format is recognised."""
     options: tuple[str, ...] = ()
-    camera: Camera
+    suffix = ""
+    """Suffix of the files of the format, where it is that of files."""
+    layout: tuple[str, ...] = ()
+    """Patterns of files and folders that all lie in every folder of the format."""
     timed = True
-    sources: dict[str, str]
+    camera: Camera
     calibration: Calibration | None = None
     timestamps: NDArray[np.float64]
     ground_truth: Trajectory | None = None
+    sources: dict[str, str]
+    opened: dict[str, Any]
 
     def __init__(self, path: str | Path) -> None:
         self.path = Path(path)
@@ -49,8 +58,10 @@ class FileRecording(ABC):
 
     @classmethod
     def recognises(cls, path: Path) -> bool:
-        """Whether a file has the suffix of the format."""
-        return path.suffix.lower() == cls.suffix and path.is_file()
+        """Whether an existing folder or file has this format, judged by names and first bytes only."""
+        if cls.suffix:
+            return path.suffix.lower() == cls.suffix and path.is_file()
+        return path.is_dir() and all(any(path.glob(pattern)) for pattern in cls.layout)
 
     def __len__(self) -> int:
         return len(self.timestamps)
@@ -67,7 +78,7 @@ class FileRecording(ABC):
             return self._frame(index, name)
 
     def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """No true masks are known."""
+        """True dynamic mask (H, W) of a frame, None if it is not known."""
         return None
 
     @abstractmethod

@@ -1,0 +1,232 @@
+"""Files that hold frame after frame: ScanNet's ``.sens`` (Dai et al. 2017) and the ``.klg`` of ElasticFusion."""
+
+import struct
+import zlib
+from pathlib import Path
+from typing import IO, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.core.geometry.camera import Camera
+from dudmap.core.geometry.trajectory import Trajectory
+from dudmap.errors import DatasetError, FrameError
+from dudmap.input_files import LARGEST_FILE, open_plain
+from dudmap.io.sequences import images, intrinsics
+from dudmap.io.sequences.recording import Recording
+
+SENS_VERSION = 4
+"""The version of the format that ScanNet publishes."""
+SENS_FRAME = struct.Struct("<16f4Q")
+"""Pose camera to world row by row, colour and depth time in microseconds, bytes of the colour and depth image."""
+KLG_FRAME = struct.Struct("<qii")
+"""Time in microseconds, bytes of the depth image and bytes of the colour image."""
+PERIOD = 1 / 30
+"""Seconds between frames that have no usable times: the rate of ScanNet's Structure Sensor."""
+
+
+class FrameEntry(NamedTuple):
+    """Place of a frame in the file, bytes of its two images in the order of the file, and time in microseconds."""
+
+    offset: int
+    sizes: tuple[int, int]
+    time: int
+    color_time: int = 0
+
+
+class SensRecording(Recording):
+    """Recording in a ``.sens`` file.
+
+    Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
+    colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
+    holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
+
+    Args:
+        path: The file.
+        camera: Intrinsics of the depth images that replace those of the file.
+
+    Raises:
+        DatasetError: The file is damaged, of another version, or compressed in a way that is not supported.
+    """
+
+    format = "ScanNet .sens"
+    suffix = ".sens"
+    options: tuple[str, ...] = ("depth_unit",)
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        super().__init__(path)
+        with open_plain(self.path) as file:
+            try:
+                num_frames = self._read_header(file, camera)
+                entries = [self._read_entry(file) for _ in range(num_frames)]
+            except struct.error:
+                raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
+        self._entries = [entry for entry, _ in entries]
+        self.timestamps = 1e-6 * np.array([entry.time for entry in self._entries], dtype=np.float64)
+        self.timed = not np.any(np.diff(self.timestamps) <= 0) and bool(self.timestamps[-1] > 0)
+        if not self.timed:
+            self.timestamps = PERIOD * np.arange(num_frames, dtype=np.float64)
+            self.sources["times"] = "assumed, 30 frames a second"
+        poses = np.array([pose for _, pose in entries], dtype=np.float64).reshape(-1, 4, 4)
+        valid = np.isfinite(poses).all(axis=(1, 2))
+        truth = Trajectory(self.timestamps[valid], poses[valid] @ self._depth_extrinsic)
+        self.ground_truth = truth if valid.any() else None
+
+    def _read_header(self, file: IO[bytes], camera: Camera | str | None) -> int:
+        """Set the cameras, and give the number of frames."""
+        (version,) = _unpack(file, "<I")
+        if version != SENS_VERSION:
+            raise DatasetError(
+                f"{self.path} has version {version} of the .sens format; expected {SENS_VERSION}, which ScanNet uses"
+            )
+        (length,) = _unpack(file, "<Q")
+        file.seek(length, 1)  # name of the sensor
+        color_K, color_extrinsic, depth_K, depth_extrinsic = (
+            np.array(_unpack(file, "<16f"), dtype=np.float64).reshape(4, 4) for _ in range(4)
+        )
+        color_codec, depth_codec = _unpack(file, "<2i")
+        color_width, color_height, width, height, depth_scale, num_frames = _unpack(file, "<4IfQ")
+        if color_codec not in (1, 2) or depth_codec not in (0, 1):
+            raise DatasetError(
+                f"{self.path} stores colour as number {color_codec} and depth as number {depth_codec}; expected PNG or "
+                "JPEG (1, 2) and raw or zlib (0, 1)"
+            )
+        if num_frames == 0:
+            raise DatasetError(f"{self.path} holds no frames")
+        self._deflated, self._depth_extrinsic = depth_codec == 1, depth_extrinsic
+        own, color = (
+            Camera(K[0, 0], K[1, 1], K[0, 2], K[1, 2], *size, depth_scale=depth_scale)
+            for K, size in ((depth_K, (width, height)), (color_K, (color_width, color_height)))
+        )
+        calibration = Calibration(color, se3.inverse(color_extrinsic) @ depth_extrinsic)
+        self._set_cameras(own, calibration, "the header of the file", camera)
+        return num_frames
+
+    def _read_entry(self, file: IO[bytes]) -> tuple[FrameEntry, list[float]]:
+        """Place and pose of the next frame, without reading its images."""
+        *pose, color_time, depth_time, color_bytes, depth_bytes = _unpack(file, SENS_FRAME.format)
+        entry = FrameEntry(file.tell(), (color_bytes, depth_bytes), depth_time, color_time)
+        if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > self.path.stat().st_size:
+            raise struct.error
+        return entry, pose
+
+    def _frame(self, index: int, name: str) -> Frame:
+        entry = self._entries[index]
+        color_data, depth_data = _read(self.path, entry)
+        color = images.decode_color(color_data, f"the colour image of {name}")
+        expected = self.camera if self.calibration is None else self.calibration.camera
+        if color.shape[:2] != expected.shape:
+            raise FrameError(f"{name}: the colour image has another size than the file's header says")
+        values = decode_values(depth_data, self.camera.shape, compressed=self._deflated, name=name)
+        depth = images.metres(values, self.camera.depth_scale, name)
+        return Frame(float(self.timestamps[index]), depth, color, 1e-6 * entry.color_time if self.timed else None)
+
+
+class KlgRecording(Recording):
+    """Recording in a ``.klg`` log of ElasticFusion and Kintinuous (Whelan et al. 2015), with registered images.
+
+    Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
+    the image size: the intrinsics must be given, and the size comes from them, else from the first JPEG image, else it
+    is 640x480, which the logger always wrote.
+
+    Args:
+        path: The file.
+        camera: Intrinsics.
+
+    Raises:
+        DatasetError: No intrinsics are given, or the file is cut off or holds no frames.
+    """
+
+    format = "ElasticFusion .klg"
+    suffix = ".klg"
+    options: tuple[str, ...] = ("depth_unit",)
+
+    def __init__(self, path: str | Path, camera: Camera | str | None = None) -> None:
+        super().__init__(path)
+        if camera is None:
+            raise DatasetError(
+                f"{self.path} is a .klg file, which holds no intrinsics; give --camera "
+                "fx,fy,cx,cy[,w,h[,depth_scale]], "
+                "for the Xtion of ElasticFusion's own recordings --camera 528,528,320,240"
+            )
+        known = intrinsics.given(camera)
+        entries = self._read_index()
+        times, order = np.unique(1e-6 * np.array([entry.time for entry in entries], np.float64), return_index=True)
+        self.timestamps, self._entries = times, [entries[k] for k in order]
+        unit = known.source if "depth_scale" in known.values else "the format"
+        self.sources = {"intrinsics": known.source, "depth unit": unit, "times": "the file"}
+        self.camera = known.camera(*self._size(known), 1000.0)
+
+    def _frame(self, index: int, name: str) -> Frame:
+        depth_data, color_data = _read(self.path, self._entries[index])
+        raw = len(depth_data) == 2 * self.camera.width * self.camera.height
+        values = decode_values(depth_data, self.camera.shape, compressed=not raw, name=name)
+        if len(color_data) == 3 * self.camera.width * self.camera.height:
+            color = np.frombuffer(color_data, np.uint8).reshape(*self.camera.shape, 3).copy()
+        else:
+            color = images.decode_color(color_data, f"the colour image of {name}")
+        if color.shape[:2] != self.camera.shape:
+            raise FrameError(f"{name}: the colour image is not {self.camera.width}x{self.camera.height} pixels")
+        return Frame(float(self.timestamps[index]), images.metres(values, self.camera.depth_scale, name), color)
+
+    def _size(self, known: intrinsics.Intrinsics) -> tuple[int, int]:
+        """Width and height of the images."""
+        if "width" in known.values:
+            return int(known.values["width"]), int(known.values["height"])
+        _, color = _read(self.path, self._entries[0])
+        if color.startswith(images.JPEG):
+            height, width = images.decode_color(color, f"the first colour image of {self.path}").shape[:2]
+            return width, height
+        return 640, 480
+
+    def _read_index(self) -> list[FrameEntry]:
+        """Places of the frames, without reading the images."""
+        entries, end = [], self.path.stat().st_size
+        with open_plain(self.path) as file:
+            head = file.read(4)
+            count = struct.unpack("<i", head)[0] if len(head) == 4 else 0
+            if count < 1:
+                raise DatasetError(f"{self.path} holds no frames; expected a .klg file, which starts with their number")
+            cut_off = f"{self.path} is cut off: it says {count} frames and holds"
+            for number in range(count):
+                header = file.read(KLG_FRAME.size)
+                if len(header) < KLG_FRAME.size:
+                    raise DatasetError(f"{cut_off} {number}")
+                time, *sizes = KLG_FRAME.unpack(header)
+                entries.append(FrameEntry(file.tell(), (sizes[0], sizes[1]), time))
+                if max(sizes) > LARGEST_FILE:
+                    raise DatasetError(f"{self.path} is damaged: frame {number} says it has {sum(sizes)} bytes")
+                if min(sizes) < 0 or file.seek(sum(sizes), 1) > end:
+                    raise DatasetError(f"{cut_off} {number}")
+        return entries
+
+
+def _read(path: Path, entry: FrameEntry) -> tuple[bytes, bytes]:
+    """Data of the two images of a frame."""
+    with open_plain(path) as file:
+        file.seek(entry.offset)
+        return file.read(entry.sizes[0]), file.read(entry.sizes[1])
+
+
+def _unpack(file: IO[bytes], form: str) -> tuple:
+    return struct.unpack(form, file.read(struct.calcsize(form)))
+
+
+def decode_values(data: bytes, shape: tuple[int, int], *, compressed: bool, name: str) -> NDArray[np.uint16]:
+    """16-bit depth values (H, W) of a buffer, raw or deflated by zlib.
+
+    Raises:
+        FrameError: The data cannot be inflated, or are not of this size.
+    """
+    expected = 2 * shape[0] * shape[1]
+    if compressed:
+        try:
+            data = zlib.decompressobj().decompress(data, expected + 1)
+        except zlib.error as error:
+            raise FrameError(f"{name}: the depth image is damaged, {error}") from None
+    if len(data) != expected:
+        raise FrameError(f"{name}: the depth image has {len(data)} bytes; expected {expected} of {shape[1]}x{shape[0]}")
+    return np.frombuffer(data, dtype="<u2").reshape(shape).astype(np.uint16, copy=False)
