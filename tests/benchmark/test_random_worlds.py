@@ -52,7 +52,7 @@ def test_a_world_opens_and_its_command_writes_the_same(number, monkeypatch):
 def test_every_fault_can_be_drawn_and_used():
     for seed in range(3):
         rng = np.random.default_rng(seed)
-        faults = {name: draw(rng) for name, draw in random_worlds.FAULTS.items()}
+        faults = {name: random_worlds._drawn(name, rng) for name in random_worlds.FAULTS}
         world = {"scene": "box", "movers": (), "frames": 3, "camera": (64, 48), "faults": faults}
         recording = Entry("all", parameters=world).open()
         assert recording[len(recording) - 1].depth.max() > 0

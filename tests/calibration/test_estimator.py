@@ -5,13 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from dudmap.app.pipeline.calibration import INTERVAL, _enlarged, _Excerpt, calibrate_sequence
+from dudmap.app.pipeline.calibration import INTERVAL, _around_keyframes, _enlarged, _Excerpt, calibrate_sequence
 from dudmap.config import Config, PreprocessConfig, SensorConfig
 from dudmap.core.backends.cpu.backend import CpuBackend
-from dudmap.core.calibration.adjustment import Adjustment, _State
+from dudmap.core.calibration.adjustment import Adjustment, Fit
 from dudmap.core.calibration.collector import KeyframeCollector
 from dudmap.core.calibration.estimator import GROUPS, CalibrationEstimator, _Trial, mask_of
-from dudmap.core.calibration.pairs import Pair
+from dudmap.core.calibration.pairs import Pair, PairSet
 from dudmap.core.frames.color_registration import color_projection
 from dudmap.core.frames.frame import Frame
 from dudmap.core.frames.preprocess import Preprocessor
@@ -178,6 +178,16 @@ def test_the_images_of_the_quick_pass_are_halved_and_its_result_is_for_whole_one
     assert found.sigma.tolist() == [2.0 if name.startswith("center") else 1.0 for name in PARAMETERS]
 
 
+def test_of_a_long_recording_only_keyframes_and_their_neighbours_are_read():
+    times = np.arange(240) / 30
+    read = _around_keyframes(times, range(240))
+    assert read[:9] == [0, 1, 2, 6, 7, 8, 12, 13, 14]
+    assert len(read) == 120
+    assert _around_keyframes(times, range(120)) == list(range(120))  # four seconds
+    slow = np.arange(80) / 10
+    assert _around_keyframes(slow, range(80)) == list(range(79))
+
+
 class Explained:
     """Stands for the adjustment: a cost per set of groups that are free, in both halves of the time."""
 
@@ -188,12 +198,12 @@ class Explained:
 
     def solve(self, pairs, start, free, levels=()):
         names = frozenset(name for name, members in GROUPS.items() if free[mask_of(members)].all())
-        return replace(start, estimated=tuple(sorted(names))), np.eye(13)
+        return replace(start, calibration=replace(start.calibration, estimated=tuple(sorted(names)))), np.eye(13)
 
-    def costs(self, pairs, calibration):
-        self.asked.append(frozenset(calibration.estimated))
+    def costs(self, pairs, fit):
+        self.asked.append(frozenset(fit.calibration.estimated))
         wobble = 0.01 * np.cos(np.arange(40.0))
-        return self.table.get(frozenset(calibration.estimated), 1.0) * (1 + wobble)
+        return self.table.get(frozenset(fit.calibration.estimated), 1.0) * (1 + wobble)
 
 
 def proven(costs: dict[str, float]) -> set[str]:
@@ -201,7 +211,8 @@ def proven(costs: dict[str, float]) -> set[str]:
     estimator = CalibrationEstimator(Calibration.registered(CAMERA), SensorConfig())
     table = {frozenset(key.split()): value for key, value in costs.items()}
     estimator.adjustment = Explained(table)
-    start = _Trial(np.zeros(13, bool), [estimator.given] * 2, [estimator.adjustment.costs([], estimator.given)] * 2)
+    given = Fit(estimator.given, np.empty((0, 4, 4)), np.empty((0, 2)))
+    start = _Trial(np.zeros(13, bool), [given] * 2, [estimator.adjustment.costs([], given)] * 2)
     trial, evidence = estimator._proven([[], []], start)
     assert set(evidence) == set(GROUPS)
     return {name for name, members in GROUPS.items() if trial.free[mask_of(members)].all()}
@@ -213,8 +224,26 @@ def test_groups_that_explain_nothing_without_each_other_are_found_together():
     assert proven(both | alone) == {"geometry", "timing"}  # and not the lens, which adds nothing
     assert proven(alone | {"geometry timing lens": 0.995}) == set()  # too little to leave the given values
     assert proven({"timing": 0.8, "timing lens": 0.799, "geometry timing": 0.81}) == {"timing"}
+    # the geometry has more evidence than the lens, and too little to leave the given values
+    assert proven({"geometry": 0.96, "lens": 0.97, "geometry lens": 0.96, "timing lens": 0.97}) == {"lens"}
     everything = {"geometry timing lens": 0.3, "geometry timing": 0.5, "geometry lens": 0.6, "timing lens": 0.7}
     assert proven(alone | everything) == {"geometry", "timing", "lens"}
+
+
+def test_the_normal_equations_of_a_known_calibration_are_those_of_the_poses():
+    preprocess, collector = Preprocessor(CAMERA, PreprocessConfig(filter="none")), KeyframeCollector(CAMERA)
+    for index in range(12):
+        frame = record(Calibration.registered(CAMERA), index)
+        collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
+    given = Calibration.registered(CAMERA)
+    adjustment, pairs = Adjustment(given, SensorConfig()), PairSet([Pair(*collector.keyframes[:2])])
+    fit, level = Fit.tracked(pairs, given), adjustment.levels[-1]
+    parts = [adjustment._linearize_pairs(pairs, fit, level, (0.01, 1.0), known=known) for known in (False, True)]
+    np.testing.assert_allclose(parts[1].H[0, 13:, 13:], parts[0].H[0, 13:, 13:], rtol=1e-6)
+    np.testing.assert_allclose(parts[1].b[0, 13:], parts[0].b[0, 13:], rtol=1e-6)
+    assert not parts[1].H[0, :13].any()
+    few = PairSet([Pair(*collector.keyframes[:2])], stride=2)
+    assert len(few.points) == sum(-(-len(frame.points) // 2) for frame in collector.keyframes[:2])
 
 
 def test_relative_poses_follow_the_poses_of_both_frames():
@@ -225,13 +254,13 @@ def test_relative_poses_follow_the_poses_of_both_frames():
         collector.add(preprocess(frame), pose(frame.timestamp), np.zeros(CAMERA.shape, bool))
     given = Calibration.registered(CAMERA)
     adjustment = Adjustment(given, SensorConfig())
-    pair = Pair(collector.keyframes[0], collector.keyframes[-1])
+    pair = PairSet([Pair(collector.keyframes[0], collector.keyframes[-1])])
     rng, level, scales = np.random.default_rng(2), adjustment.levels[-1], (1e6, 1.0)  # colour counts for nothing
 
     def cost_and_gradient(steps):
-        state = _State([pair], given)
-        state.Ts_camera_world = se3.exp_all(np.array(steps)) @ state.Ts_camera_world
-        part = adjustment._linearize_pairs([pair], state, level, scales)
+        fit = Fit.tracked(pair, given)
+        fit = replace(fit, Ts_camera_world=se3.exp_all(np.array(steps)) @ fit.Ts_camera_world)
+        part = adjustment._linearize_pairs(pair, fit, level, scales)
         return part.b[0, 13:], part.H[0, 13:, 13:]
 
     start = [rng.normal(0, 2e-3, 6), rng.normal(0, 2e-3, 6)]

@@ -143,6 +143,7 @@ FAKED = {
         ["benchmark", "speed", "--out", "speed"],
         {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
+    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
         {

@@ -5,12 +5,11 @@ import pandas as pd
 import pytest
 
 from dudmap.config import Config
-from dudmap.lab.study.analysis import predict_optimum
+from dudmap.lab.study.analysis import pareto_front, predict_optimum
 from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, points_of
 from dudmap.lab.study.factors import make_factors
 from dudmap.lab.study.indices import emulated_indices, morris_indices, sobol_indices
 from dudmap.lab.study.judgement import confirm, influence
-from dudmap.lab.study.pareto import pareto_front
 from dudmap.lab.study.response_surface import fit_surface, lack_of_fit
 
 RANGES = {"tracker.huber": {"range": [0.005, 0.025]}, "volume.voxel_size": {"range": [0.01, 0.04], "scale": "log"},
@@ -106,7 +105,7 @@ def test_a_quadratic_response_is_found_believed_and_confirmed():
     factors = factors_of()
     table = runs_of(factors, DesignOptions("central-composite"), bowl, repeats=2, noise=2e-4)
     found = predict_optimum(table, factors, "ate")
-    assert found.judgement.reasons == ()
+    assert found.reasons == ()
     np.testing.assert_allclose(found.best.coded, [0.3, -0.5, 0], atol=0.1)
     assert lack_of_fit(found.surface).p > 0.05
     truth = bowl(*found.best.coded)

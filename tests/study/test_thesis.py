@@ -108,7 +108,7 @@ def test_it_says_why_the_optimum_must_not_be_believed(predicted):
     assert lack_of_fit(surface) is None  # no point was repeated
     single = influence(surface)
     assert (single.value, single.carries) == (0.365, True)
-    reasons = " ".join(predicted.judgement.reasons)
+    reasons = " ".join(predicted.reasons)
     for words in ("R2 = 0.36", "0.0292", "One value carries the model: 0.365", "below everything observed (0.08)"):
         assert words in reasons
 

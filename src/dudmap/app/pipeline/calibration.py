@@ -24,6 +24,8 @@ from dudmap.io.sequences import is_timed
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from numpy.typing import NDArray
+
     from dudmap.io.sequences import Sequence
 
 
@@ -35,6 +37,11 @@ WIDTH, INTERVAL = 320, 1 / 30
 """Width of the images (pixels) that are tracked for it, since the compared depth images are 160 and the colour images
 at most 320 wide, and their largest interval (s): the velocity of a keyframe is the mean over two of them, which less
 noise of the poses and more of the camera's shaking enter, the longer they are."""
+SPACING, SHORT = 0.2, 5.0
+"""Time between two keyframes, seconds, in recordings longer than ``SHORT``; the velocity of one needs the frames just
+before and after it, and the others are not read. From a shorter recording every frame is taken."""
+GAP = 2.5
+"""Largest time between the neighbours of a keyframe, usual intervals: frames were left out where there is more."""
 VOXEL_SIZE = 0.02
 """Edge of the voxels of the map that these frames are tracked in, metres; larger ones of the configuration stay."""
 
@@ -98,7 +105,7 @@ def calibrate_sequence(
     small = _Excerpt(sequence, given, halvings, len(sequence) if max_frames is None else min(max_frames, len(sequence)))
     slam = Slam(small.camera, _quick(config, halvings), calibration=small.calibration, timed=is_timed(sequence))
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
-    collector, submap = KeyframeCollector(small.calibration.camera), 0
+    collector, submap = KeyframeCollector(small.calibration.camera, GAP * small.interval), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
         for read in frames:
             if isinstance(read.frame, FrameError) or read.prepared is None:
@@ -133,19 +140,22 @@ def _quick(config: Config, halvings: int) -> Config:
 
 
 class _Excerpt:
-    """Frames of a recording at an ``INTERVAL``, with images halved some times by 2x2 blocks.
+    """Frames of a recording around its keyframes, at an ``INTERVAL``, with images halved some times by 2x2 blocks.
 
     Attributes:
         camera: Of its depth images.
         calibration: Of its colour images.
+        interval: Usual time between neighbours, seconds.
     """
 
     def __init__(self, sequence: "Sequence", given: Calibration, halvings: int, count: int) -> None:
         usual = float(np.median(np.diff(sequence.timestamps[:count]))) if count > 1 else INTERVAL
         self._sequence, self._halvings = sequence, halvings
         self.name, self.ground_truth = sequence.name, None
-        self._step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
-        self.timestamps = sequence.timestamps[: count : self._step]
+        step = max(1, int(1.01 * INTERVAL / max(usual, 1e-3)))
+        self.interval = step * usual
+        self._numbers = _around_keyframes(sequence.timestamps, range(0, count, step))
+        self.timestamps = np.asarray(sequence.timestamps)[self._numbers]
         self.camera = sequence.camera.scaled(halvings)
         self.calibration = replace(given, camera=given.camera.scaled(halvings))
 
@@ -153,7 +163,7 @@ class _Excerpt:
         return len(self.timestamps)
 
     def __getitem__(self, index: int) -> Frame:
-        frame, backend = self._sequence[self._step * index], CpuBackend()
+        frame, backend = self._sequence[self._numbers[index]], CpuBackend()
         depth, color = np.ascontiguousarray(frame.depth, np.float32), frame.color
         for _ in range(self._halvings):
             depth, _ = backend.halve(depth, np.zeros_like(depth), HALVING_BAND)
@@ -163,6 +173,18 @@ class _Excerpt:
 
     def mask(self, index: int) -> None:
         """No true mask: none is scored here."""
+
+
+def _around_keyframes(timestamps: "NDArray[np.float64]", numbers: range) -> list[int]:
+    """The numbers of frames that are keyframes, and those of their neighbours."""
+    if not len(numbers) or timestamps[numbers[-1]] - timestamps[numbers[0]] <= SHORT:
+        return list(numbers)
+    chosen, due = set[int](), -np.inf
+    for first, middle, last in zip(numbers, numbers[1:], numbers[2:], strict=False):
+        if timestamps[middle] >= due:
+            chosen |= {first, middle, last}
+            due = timestamps[middle] + SPACING - 1e-3
+    return sorted(chosen)
 
 
 def _enlarged(found: Calibration, camera: Camera, halvings: int) -> Calibration:

@@ -16,17 +16,18 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 CLASSES = """
-app.pipeline.metrics:RunRecord
+app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
 core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu.segmentation:SegmentSums,SegmentImage
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
-core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:_State,_PairSystems,_System,Adjustment
+core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
 core.calibration.collector:KeyframeCollector core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
-core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair core.calibration.self_calibration:SelfCalibration
-core.color_calibration:ColorCalibration core.dynamics.background_model:BackgroundModel
+core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
+core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
+core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
 core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
@@ -69,6 +70,7 @@ NOT_STORED = {
     "FrameStore": ("registered", "_places", "_file", "_encoder", "_pending", "archived"),
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
+    "RunRecord": ("_since",),
     "Observation": ("_halvings", "_recorded_halvings"),
     "SimilarityTest": ("_sift",),
     "Slam": ("device",),
@@ -190,11 +192,6 @@ def check_value(cls: type, name: str, value: object, like: object) -> None:
     if not (is_alike(value, like) if hint is Any else fits(value, hint)):
         expected = type(like).__name__ if hint is Any else getattr(hint, "__name__", hint)
         raise ValueError(f"found {type(value).__name__}; expected {expected}")
-
-
-def fits_fields(value: object) -> bool:
-    """Whether the attributes of a dataclass are what their annotations say."""
-    return all(fits(getattr(value, name), hint) for name, hint in _hints(type(value)).items())
 
 
 def is_alike(value: object, like: object) -> bool:

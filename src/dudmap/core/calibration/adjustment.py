@@ -7,10 +7,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.backends.cpu.color_pairs import SHARED, UNKNOWNS, linearize_pair
+from dudmap.core.backends.cpu.color_pairs import POSE, SHARED, UNKNOWNS, linearize_pairs
+from dudmap.core.backends.median import median
 from dudmap.core.backends.parameters import SensorNoise, single
 from dudmap.core.calibration.keyframes import SAME_SURFACE, color_levels
-from dudmap.core.calibration.pairs import Pair
+from dudmap.core.calibration.pairs import PairSet
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
 
@@ -33,50 +34,47 @@ FIRST_SCALES, LEAST_SCALE = (0.05, 1.0), 1e-3
 """The same at the start of an adjustment, which estimates them, and the least."""
 HUBER = 1.345
 """Constant of the robust weight, standard deviations: 95 % efficiency for Gaussian errors."""
-ITERATIONS = 8
-"""Largest number of Gauss-Newton steps per image size."""
+ITERATIONS, COARSE_ITERATIONS = 6, 4
+"""Largest number of Gauss-Newton steps at the largest image size, and at each of the smaller ones."""
+STEADY = 2
+"""Number of steps in a row that must be small: a single one may be before the poses have followed."""
 FIT_ITERATIONS = 3
 """Steps per image size by which poses are fitted to a known calibration."""
 SETTLED, SETTLED_COARSE = 0.01, 0.1
 """A step below this many prior standard deviations in every parameter ends the largest image size; the smaller ones
 only lead to the next."""
-POSE = 6
 
 
-class _State:
-    """What is adjusted: the calibration, the pose of every frame, gain and offset of every pair.
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """What an adjustment has come to, and where another may begin.
 
     Attributes:
         calibration: Current estimate.
-        frames: (P, 2) numbers of the two frames of every pair.
-        Ts_camera_world: (F, 4, 4) of every frame; ``tracked``: as tracked.
+        Ts_camera_world: (F, 4, 4) of every frame.
         light: (P, 2) gain and offset of the second image of every pair over the first.
-        places: (P, 25) where the unknowns of every pair stand among all: parameters, poses of both frames.
+        scales: Standard deviations of intensity (0..1) and depth differences (over sigma(z)).
     """
 
-    def __init__(self, pairs: Sequence[Pair], calibration: Calibration) -> None:
-        self.calibration = calibration
-        by_time = {frame.timestamp: frame for pair in pairs for frame in (pair.first, pair.second)}
-        number = {timestamp: n for n, timestamp in enumerate(sorted(by_time))}
-        self.frames = np.array([(number[pair.first.timestamp], number[pair.second.timestamp]) for pair in pairs])
-        self.tracked = se3.inverse(np.stack([by_time[timestamp].T_world_camera for timestamp in number]))
-        self.Ts_camera_world = self.tracked
-        self.light = np.tile([1.0, 0.0], (len(pairs), 1))
-        own = np.broadcast_to(np.arange(NUM_PARAMETERS), (len(pairs), NUM_PARAMETERS))
-        poses = NUM_PARAMETERS + POSE * self.frames[:, :, None] + np.arange(POSE)
-        self.places = np.concatenate([own, poses.reshape(len(pairs), -1)], axis=1)
+    calibration: Calibration
+    Ts_camera_world: NDArray[np.float64]
+    light: NDArray[np.float64]
+    scales: tuple[float, float] = FIRST_SCALES
 
-    @property
-    def Ts_second_first(self) -> NDArray[np.float64]:
-        """Relative poses (P, 4, 4) of the pairs."""
-        first, second = self.frames.T
-        return self.Ts_camera_world[second] @ se3.inverse(self.Ts_camera_world[first])
+    @classmethod
+    def tracked(cls, pairs: PairSet, calibration: Calibration) -> "Fit":
+        """The start: poses as tracked, equal light."""
+        return cls(calibration, pairs.Ts_camera_world, np.tile([1.0, 0.0], (len(pairs), 1)))
 
-    def move(self, step: NDArray[np.float64], parts: "_PairSystems") -> None:
-        """Apply a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
-        self.calibration = self.calibration.retract(step[:NUM_PARAMETERS])
-        self.Ts_camera_world = se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world
-        self.light = self.light - parts.light_step - _times(parts.light_slope, step[self.places])
+    def moved(self, pairs: PairSet, step: NDArray[np.float64], system: "_System") -> "Fit":
+        """After a step (13 + 6 F,) of parameters and poses, and what follows from it for gains and offsets."""
+        parts = system.parts
+        return Fit(
+            self.calibration.retract(step[:NUM_PARAMETERS]),
+            se3.exp_all(step[NUM_PARAMETERS:].reshape(-1, POSE)) @ self.Ts_camera_world,
+            self.light - parts.light_step - _times(parts.light_slope, step[pairs.places]),
+            system.scales,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,14 +85,14 @@ class _PairSystems:
         H, b: (P, 25, 25) and (P, 25) in the parameters and the poses of the first and the second frame.
         light_slope, light_step: (P, 2, 25) and (P, 2), minus the step of gain and offset is light_step + light_slope
             step.
-        residuals: P times (2, n), see ``linearize_pair``.
+        residuals: (2, n) of all pairs, see ``linearize_pair``.
     """
 
     H: NDArray[np.float64]
     b: NDArray[np.float64]
     light_slope: NDArray[np.float64]
     light_step: NDArray[np.float64]
-    residuals: list[NDArray[np.float32]]
+    residuals: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,97 +129,102 @@ class Adjustment:
 
     def __init__(self, given: Calibration, sensor: SensorConfig) -> None:
         self.given = given
-        self.sensor = sensor
+        self.noise = single(SensorNoise(sensor.sigma_base, sensor.sigma_scale))
         self.levels = color_levels(given.camera)
         sigma = PRIOR_SIGMA.copy()
         sigma[7:9] *= given.camera.width
         self.prior = CORRELATED * sigma**-2
 
     def solve(
-        self, pairs: Sequence[Pair], start: Calibration, free: NDArray[np.bool_], levels: Sequence[int] = ()
-    ) -> tuple[Calibration, NDArray[np.float64]]:
-        """Calibration from coarse to fine over the free parameters (13,) bool, and the covariance (13, 13) that all
-        would have."""
-        state, scales, system = _State(pairs, start), FIRST_SCALES, None
+        self, pairs: PairSet, start: Fit, free: NDArray[np.bool_], levels: Sequence[int] = ()
+    ) -> tuple[Fit, NDArray[np.float64]]:
+        """Fit from coarse to fine over the free parameters (13,) bool, and the covariance (13, 13) that all would
+        have."""
+        fit, system = start, None
         levels = levels or self.levels
         for level in levels:
             settled = (SETTLED if level == levels[-1] else SETTLED_COARSE) * np.sqrt(CORRELATED / self.prior)
-            for _ in range(ITERATIONS):
-                system = self._linearize(pairs, state, level, scales)
+            small = 0
+            for _ in range(ITERATIONS if level == levels[-1] else COARSE_ITERATIONS):
+                system = self._linearize(pairs, fit, level, fit.scales)
                 step = system.step(free)
-                state.move(step, system.parts)
-                scales = system.scales
-                if np.all(np.abs(step[:NUM_PARAMETERS]) < settled):
+                fit = fit.moved(pairs, step, system)
+                small = small + 1 if np.all(np.abs(step[:NUM_PARAMETERS]) < settled) else 0
+                if small == STEADY:
                     break
         assert system is not None
-        return state.calibration, self._covariance(system, state, int(np.count_nonzero(free)))
+        return fit, self._covariance(pairs, system, int(np.count_nonzero(free)))
 
-    def costs(self, pairs: Sequence[Pair], calibration: Calibration) -> NDArray[np.float64]:
-        """Mean robust cost (P,) of pairs whose poses are fitted with a calibration."""
-        state, system = _State(pairs, calibration), None
-        for level in self.levels[-2:]:
+    def with_poses(self, pairs: PairSet, start: Fit, levels: Sequence[int] = ()) -> tuple[Fit, NDArray[np.float32]]:
+        """Fit of the poses alone to the calibration of another fit, and the last residuals (2, n)."""
+        fit, system = start, None
+        for level in levels or self.levels[-2:]:
             for _ in range(FIT_ITERATIONS):
-                system = self._linearize(pairs, state, level, COST_SCALES)
-                state.move(system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system.parts)
+                system = self._linearize(pairs, fit, level, COST_SCALES, known=True)
+                fit = fit.moved(pairs, system.step(np.zeros(NUM_PARAMETERS, dtype=bool)), system)
         assert system is not None
-        return np.array(
-            [sum(_robust_mean(r / scale) for r, scale in zip(residuals, COST_SCALES, strict=True))
-             for residuals in system.parts.residuals]
-        )  # fmt: skip
+        return fit, system.parts.residuals
 
-    def _covariance(self, system: _System, state: _State, free: int) -> NDArray[np.float64]:
+    def costs(self, pairs: PairSet, start: Fit) -> NDArray[np.float64]:
+        """Mean robust cost (P,) of pairs whose poses are fitted with the calibration of a fit."""
+        _, residuals = self.with_poses(pairs, start)
+        scaled = np.abs(residuals) / np.array(COST_SCALES, np.float32)[:, None]
+        robust = np.where(scaled < HUBER, scaled * scaled, HUBER * (2 * scaled - HUBER))
+        seen = np.isfinite(robust)
+        of_pair = pairs.residual_starts[:-1]
+        sums = np.add.reduceat(np.where(seen, robust, 0), of_pair, axis=1, dtype=np.float64)
+        return (sums / np.maximum(np.add.reduceat(seen, of_pair, axis=1, dtype=np.int64), 1)).sum(axis=0)
+
+    def _covariance(self, pairs: PairSet, system: _System, free: int) -> NDArray[np.float64]:
         """Sandwich (13, 13) with the scores of frames as its meat."""
         own, rest = slice(0, NUM_PARAMETERS), slice(NUM_PARAMETERS, None)
         # the poses follow the parameters: Schur complement, for the curvature and for every score
         across = _solved(system.H[rest, rest], system.H[rest, own]).T
         bread = np.linalg.inv(system.H[own, own] - across @ system.H[rest, own])
-        scores = np.zeros((len(state.tracked), NUM_PARAMETERS))
-        of_pose = across.T.reshape(-1, POSE, NUM_PARAMETERS)[state.frames]  # (P, 2, 6, 13)
+        scores = np.zeros((len(pairs.Ts_camera_world), NUM_PARAMETERS))
+        of_pose = across.T.reshape(-1, POSE, NUM_PARAMETERS)[pairs.numbers]  # (P, 2, 6, 13)
         b_pose = system.parts.b[:, own.stop :].reshape(-1, 2, POSE)
         score = system.parts.b[:, own] - np.einsum("pfkc,pfk->pc", of_pose, b_pose)
-        for frames in state.frames.T:
+        for frames in pairs.numbers.T:
             np.add.at(scores, frames, score)
         few = len(scores) / max(len(scores) - free, 1)
         meat = few * scores.T @ scores + CORRELATED * np.diag(self.prior)
         return bread @ meat @ bread
 
-    def _linearize(self, pairs: Sequence[Pair], state: _State, level: int, scales: tuple[float, float]) -> _System:
-        parts = self._linearize_pairs(pairs, state, level, scales)
-        size, places = NUM_PARAMETERS + POSE * len(state.tracked), state.places
+    def _linearize(
+        self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
+    ) -> _System:
+        """Normal equations at an image size; those of a ``known`` calibration are only of the poses."""
+        parts = self._linearize_pairs(pairs, fit, level, scales, known=known)
+        tracked, places = pairs.Ts_camera_world, pairs.places
+        size = NUM_PARAMETERS + POSE * len(tracked)
         flat = size * places[:, :, None] + places[:, None, :]
         H = np.asarray(np.bincount(flat.reshape(-1), parts.H.reshape(-1), size * size), np.float64)
         H, b = H.reshape(size, size), np.asarray(np.bincount(places.reshape(-1), parts.b.reshape(-1), size), np.float64)
-        diagonal = np.concatenate([self.prior, np.tile(CORRELATED * POSE_SIGMA**-2, len(state.tracked))])
-        away = se3.log_all(state.Ts_camera_world @ se3.inverse(state.tracked))
+        diagonal = np.concatenate([self.prior, np.tile(CORRELATED * POSE_SIGMA**-2, len(tracked))])
+        away = se3.log_all(fit.Ts_camera_world @ se3.inverse(tracked))
         H[np.arange(size), np.arange(size)] += diagonal
-        b += diagonal * np.concatenate([self.given.step_to(state.calibration), away.reshape(-1)])
-        residuals = [np.concatenate([one[kind] for one in parts.residuals]) for kind in (0, 1)]
-        new = (1.4826 * _median_abs(values, old) for values, old in zip(residuals, scales, strict=True))
-        color, depth = (max(scale, LEAST_SCALE) for scale in new)
-        return _System(H, b, parts, (color, depth))
+        b += diagonal * np.concatenate([self.given.step_to(fit.calibration), away.reshape(-1)])
+        return _System(H, b, parts, new_scales(parts.residuals, scales))
 
     def _linearize_pairs(
-        self, pairs: Sequence[Pair], state: _State, level: int, scales: tuple[float, float]
+        self, pairs: PairSet, fit: Fit, level: int, scales: tuple[float, float], *, known: bool = False
     ) -> _PairSystems:
-        Ts, calibration = state.Ts_second_first, state.calibration
+        first, second = pairs.numbers.T
+        Ts, calibration = fit.Ts_camera_world[second] @ se3.inverse(fit.Ts_camera_world[first]), fit.calibration
         H, b = np.empty((len(pairs), UNKNOWNS, UNKNOWNS)), np.empty((len(pairs), UNKNOWNS))
-        place, lens = calibration.T_color_depth[:3].astype(np.float32), calibration.lens.astype(np.float32)
-        intrinsics, size = calibration.camera.scaled(level).intrinsics, self.levels.index(level)
-        noise, residuals = single(SensorNoise(self.sensor.sigma_base, self.sensor.sigma_scale)), []
-        for number, (pair, T, light) in enumerate(zip(pairs, Ts.astype(np.float32), state.light, strict=True)):
-            first, second = pair.first, pair.second
-            residuals.append(np.empty((2, len(first.points)), np.float32))
-            linearize_pair(
-                first.points, first.tangents, T[:3], second.depth, second.camera.intrinsics,
-                first.intensities[size], second.intensities[size],
-                first.velocity.astype(np.float32), second.velocity.astype(np.float32),
-                np.float32(first.color_offset + calibration.delay), np.float32(second.color_offset + calibration.delay),
-                place, intrinsics, lens, np.float32(1 / (1 << level)), np.float32(calibration.readout),
-                np.float32(light[0]), np.float32(light[1]), np.float32(SAME_SURFACE), noise,
-                np.float32(1 / scales[0]), np.float32(1 / scales[1]), np.float32(HUBER), residuals[-1], H[number],
-                b[number],
-            )  # fmt: skip
-        return _without_light(H, b, state.light, Ts, residuals)
+        residuals = np.empty((2, pairs.residual_starts[-1]), np.float32)
+        linearize_pairs(
+            pairs.numbers, pairs.starts, pairs.points, pairs.tangents, Ts[:, :3].astype(np.float32), pairs.depths,
+            pairs.camera.intrinsics, pairs.images[self.levels.index(level)], pairs.twists,
+            (pairs.color_offsets + calibration.delay).astype(np.float32),
+            calibration.T_color_depth[:3].astype(np.float32), calibration.camera.scaled(level).intrinsics,
+            calibration.lens.astype(np.float32), np.float32(1 / (1 << level)), np.float32(calibration.readout),
+            fit.light.astype(np.float32), np.float32(SAME_SURFACE), self.noise, np.float32(1 / scales[0]),
+            np.float32(1 / scales[1]), np.float32(HUBER), SHARED if known else 0, pairs.residual_starts, residuals, H,
+            b,
+        )  # fmt: skip
+        return _without_light(H, b, fit.light, Ts, residuals)
 
 
 def _without_light(
@@ -229,7 +232,7 @@ def _without_light(
     b: NDArray[np.float64],
     light: NDArray[np.float64],
     Ts: NDArray[np.float64],
-    residuals: list[NDArray[np.float32]],
+    residuals: NDArray[np.float32],
 ) -> _PairSystems:
     """Normal equations of all pairs in the parameters and the poses of the frames, from those of ``linearize_pair``.
 
@@ -271,12 +274,8 @@ def _times(matrices: NDArray[np.float64], vectors: NDArray[np.float64]) -> NDArr
     return (matrices @ vectors[:, :, None])[:, :, 0]
 
 
-def _robust_mean(values: NDArray[np.float32]) -> float:
-    """Mean Huber cost of the known values."""
-    r = np.abs(values[np.isfinite(values)])
-    return float(np.mean(np.where(r < HUBER, r * r, HUBER * (2 * r - HUBER)))) if len(r) else 0.0
-
-
-def _median_abs(values: NDArray[np.float32], otherwise: float) -> float:
-    known = np.abs(values[np.isfinite(values)])
-    return float(np.median(known)) if len(known) else otherwise
+def new_scales(residuals: NDArray[np.float32], scales: tuple[float, float]) -> tuple[float, float]:
+    """Robust standard deviations of intensity and depth differences (2, n); as before where none is known."""
+    known = (np.abs(values[np.isfinite(values)]) for values in residuals)
+    new = [1.4826 * float(median(r)) if len(r) else scale for r, scale in zip(known, scales, strict=True)]
+    return max(new[0], LEAST_SCALE), max(new[1], LEAST_SCALE)

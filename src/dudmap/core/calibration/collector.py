@@ -20,13 +20,15 @@ class KeyframeCollector:
 
     Args:
         color_camera: Camera of the colour images as recorded.
+        max_gap: Largest time between the two neighbours of a keyframe, seconds, if less than ``MAX_GAP``.
 
     Attributes:
         keyframes: In the order of time.
     """
 
-    def __init__(self, color_camera: Camera) -> None:
+    def __init__(self, color_camera: Camera, max_gap: float = MAX_GAP) -> None:
         self.color_camera = color_camera
+        self.max_gap = min(max_gap, MAX_GAP)
         self.keyframes: list[ColorKeyframe] = []
         self._interval = INTERVAL
         self._before: tuple[float, NDArray[np.float64]] | None = None
@@ -46,7 +48,7 @@ class KeyframeCollector:
         if self._pending is not None:
             middle, T, mask = self._pending
             before = self._before
-            if before is not None and now - before[0] <= MAX_GAP and self._is_due(middle.timestamp):
+            if before is not None and now - before[0] <= self.max_gap and self._is_due(middle.timestamp):
                 velocity = central_velocity(before, (now, T_world_camera))
                 self.keyframes.append(keyframe(middle, self.color_camera, T, velocity, mask))
                 if len(self.keyframes) > MAX_KEYFRAMES:

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig
-from dudmap.core.calibration.adjustment import Adjustment
+from dudmap.core.calibration.adjustment import Adjustment, Fit
 from dudmap.core.calibration.keyframes import ColorKeyframe
-from dudmap.core.calibration.pairs import Pair, select_across, select_pairs
+from dudmap.core.calibration.pairs import PairSet, select_across, select_pairs
 from dudmap.core.geometry.calibration import NUM_PARAMETERS, PARAMETERS, Calibration
 
 GROUPS: dict[str, tuple[str, ...]] = {
@@ -25,6 +25,8 @@ MIN_PAIRS = 14
 """Pairs of either half of the time without which nothing is estimated: one more than parameters."""
 PAIRS = 80
 """Pairs that decide what is estimated; half as many more, across the halves, enter the result."""
+STRIDE = 2
+"""Every so many points of a frame decide what is estimated; all of them enter the result."""
 MATERIAL = {"timing": 0.01, "lens": 0.01, "geometry": 0.05}
 """Share by which it must decrease: less is not worth leaving the given values, however certain it is. A depth image
 bent by one or two per cent, as that of a Kinect is, can be told from a colour camera elsewhere only in part: on a
@@ -55,10 +57,10 @@ class Estimate:
 
 @dataclass(frozen=True, eq=False)
 class _Trial:
-    """Calibrations from both halves of the time with some free parameters, and the costs of the other halves' pairs."""
+    """Fits to both halves of the time with some free parameters, and the costs of the other halves' pairs with them."""
 
     free: NDArray[np.bool_]
-    known: list[Calibration]
+    fits: list[Fit]
     costs: list[NDArray[np.float64]]
 
     def improvement(self, other: "_Trial") -> tuple[float, float]:
@@ -109,26 +111,34 @@ class CalibrationEstimator:
     def estimate(self, keyframes: Sequence[ColorKeyframe], count: int = PAIRS) -> Estimate:
         """Calibration that explains pairs of frames, as far as they prove it.
 
-        Groups of parameters leave the given values one after the other, that with the most evidence first, as long as
-        their estimate from either half of the time predicts the pairs of the other half better. What merely absorbs
-        errors of another kind, such as a bent depth image, does so differently from place to place and fails.
+        Groups of parameters leave the given values one after the other, of those that prove themselves that with the
+        most evidence first: their estimate from either half of the time predicts the pairs of the other half better.
+        What merely absorbs errors of another kind, such as a bent depth image, does so differently from place to place
+        and fails.
 
         Args:
             keyframes: In the order of time.
             count: Number of pairs, half of them in each half of the time.
         """
         middle = len(keyframes) // 2
-        halves = [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
+        within = [select_pairs(part, count // 2) for part in (keyframes[:middle], keyframes[middle:])]
+        if min(len(pairs) for pairs in within) < MIN_PAIRS:
+            return Estimate(self.given, dict.fromkeys(GROUPS, float("nan")), 0.0, sum(map(len, within)))
+        halves = [PairSet(pairs, STRIDE) for pairs in within]
         everything = np.ones(NUM_PARAMETERS, dtype=bool)
-        if min(len(pairs) for pairs in halves) < MIN_PAIRS:
-            return Estimate(self.given, dict.fromkeys(GROUPS, float("nan")), 0.0, sum(map(len, halves)))
-        known = [self.given, self.given]  # from the first and from the second half
-        start = _Trial(~everything, known, [self.adjustment.costs(halves[1 - n], known[n]) for n in (0, 1)])
+        fits = [
+            self.adjustment.with_poses(pairs, Fit.tracked(pairs, self.given), self.adjustment.levels)[0]
+            for pairs in halves
+        ]
+        start = _Trial(~everything, fits, [self.adjustment.costs(halves[1 - n], fits[1 - n]) for n in (0, 1)])
         proven, evidence = self._proven(halves, start)
-        pairs = [*halves[0], *halves[1], *select_across(keyframes[:middle], keyframes[middle:], count // 2)]
-        free = proven.free
-        found, covariance = self.adjustment.solve(pairs, proven.known[1], free) if free.any() else (self.given, None)
-        _, uncertain = self.adjustment.solve(pairs, found, everything, self.adjustment.levels[-1:])
+        pairs = PairSet([*within[0], *within[1], *select_across(keyframes[:middle], keyframes[middle:], count // 2)])
+        free, levels = proven.free, self.adjustment.levels
+        fit, covariance = Fit.tracked(pairs, proven.fits[1].calibration), None
+        if free.any():
+            fit, covariance = self.adjustment.solve(pairs, fit, free)
+        found = fit.calibration
+        _, uncertain = self.adjustment.solve(pairs, fit, everything, levels[-1:])
         sigma = np.sqrt(np.diag(uncertain))
         if covariance is not None:
             sigma[free] = np.sqrt(np.diag(covariance)[free])
@@ -136,15 +146,16 @@ class CalibrationEstimator:
         gain = 1 - float(np.concatenate(proven.costs).mean() / np.concatenate(start.costs).mean())
         return Estimate(replace(found, sigma=sigma, estimated=estimated), evidence, gain, len(pairs))
 
-    def _proven(self, halves: list[list[Pair]], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
+    def _proven(self, halves: list[PairSet], start: "_Trial") -> tuple["_Trial", dict[str, float]]:
         """Groups that prove themselves, one after the other and at last the rest together, and the evidence of all."""
         trial, evidence, rest = start, dict[str, float](), list(GROUPS)
         while rest:
             trials = {name: self._trial(halves, trial, [name]) for name in rest}
             evidence |= {name: other.improvement(trial)[0] for name, other in trials.items()}
-            best = max(rest, key=lambda name: evidence[name])
-            if not trials[best].proves(trial, best):
+            proven = [name for name in rest if trials[name].proves(trial, name)]
+            if not proven:
                 break
+            best = max(proven, key=lambda name: evidence[name])
             trial = self._with_translation(halves, trial, trials[best])
             rest.remove(best)
         if len(rest) > 1:
@@ -154,7 +165,7 @@ class CalibrationEstimator:
         return trial, evidence
 
     def _together(
-        self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]
+        self, halves: list[PairSet], before: "_Trial", names: Sequence[str]
     ) -> tuple["_Trial", dict[str, float]]:
         """Groups none of which explains anything without the others, and the evidence of each beside the others.
 
@@ -173,23 +184,26 @@ class CalibrationEstimator:
             trial = fewer[needless[0]]
         return before, {}
 
-    def _trial(self, halves: list[list[Pair]], before: "_Trial", names: Sequence[str]) -> "_Trial":
+    def _trial(self, halves: list[PairSet], before: "_Trial", names: Sequence[str]) -> "_Trial":
         """What groups of parameters would explain in addition to those that are free."""
-        return self._freed(halves, before, before.free | mask_of([member for name in names for member in GROUPS[name]]))
+        free = before.free | mask_of([member for name in names for member in GROUPS[name]])
+        return self._freed(halves, before.fits, free)
 
-    def _with_translation(self, halves: list[list[Pair]], before: "_Trial", trial: "_Trial") -> "_Trial":
+    def _with_translation(self, halves: list[PairSet], before: "_Trial", trial: "_Trial") -> "_Trial":
         """The same with the translation, if the rest of the geometry has just left its given values."""
         if not (trial.free & ~before.free)[mask_of(GROUPS["geometry"])].any():
             return trial
-        return self._freed(halves, trial, trial.free | mask_of(TRANSLATION))
+        return self._freed(halves, trial.fits, trial.free | mask_of(TRANSLATION))
 
-    def _freed(self, halves: list[list[Pair]], before: "_Trial", free: NDArray[np.bool_]) -> "_Trial":
+    def _freed(self, halves: list[PairSet], starts: list[Fit], free: NDArray[np.bool_]) -> "_Trial":
+        """Fits with some free parameters, from others on."""
         # only the geometry can displace the colours by so much that the smallest images have to begin
         levels = self.adjustment.levels if (free & mask_of(GROUPS["geometry"])).any() else self.adjustment.levels[-2:]
 
-        def fitted(n: int) -> tuple[Calibration, NDArray[np.float64]]:
-            known, _ = self.adjustment.solve(halves[n], before.known[n], free, levels)
-            return known, self.adjustment.costs(halves[1 - n], known)
+        def fitted(n: int) -> tuple[Fit, NDArray[np.float64]]:
+            fit, _ = self.adjustment.solve(halves[n], starts[n], free, levels)
+            other = replace(starts[1 - n], calibration=fit.calibration)
+            return fit, self.adjustment.costs(halves[1 - n], other)
 
         with ThreadPoolExecutor(self.workers) as pool:
             (one, other), (cost, other_cost) = zip(*pool.map(fitted, (0, 1)), strict=True)

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.entries import Entry, Excerpt
 from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
 from dudmap.lab.benchmark.table import Column, grid, shown
 
@@ -59,12 +59,11 @@ def measure_columns(
 
 
 def _measure(measurement: Measurement) -> Row:
-    from dudmap.lab.benchmark.conditions import CachedRecording
     from dudmap.lab.synthetic.recording import SyntheticSequence
 
     sequence = measurement.entry.open()
     if isinstance(sequence, SyntheticSequence):
-        sequence = CachedRecording(sequence)
+        sequence = Excerpt(sequence).load()
     rows: list[Row] = []
     for name, config in measurement.configs.items():
         frames = measurement.entry.max_frames

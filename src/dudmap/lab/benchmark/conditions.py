@@ -6,8 +6,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.evaluation.segmentation import SCORED_COVERAGE
-
 if TYPE_CHECKING:
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.trajectory import Trajectory
@@ -86,35 +84,3 @@ class DepartingMovers:
     def mask(self, index: int) -> NDArray[np.bool_]:
         """True dynamic mask (H, W)."""
         return self._parts[index >= self._until].mask(index)
-
-
-class CachedRecording:
-    """Recording rendered into memory once, for several systems."""
-
-    calibration = None
-
-    def __init__(self, recording: "SyntheticSequence | DepartingMovers") -> None:
-        self.name, self.camera, self.timestamps = recording.name, recording.camera, recording.timestamps
-        self.ground_truth = recording.ground_truth
-        self._frames = [recording[index] for index in range(len(recording))]
-        self._masks = [recording.mask(index) for index in range(len(recording))]
-
-    def __len__(self) -> int:
-        return len(self._frames)
-
-    def __getitem__(self, index: int) -> "Frame":
-        return self._frames[index]
-
-    def mask(self, index: int) -> NDArray[np.bool_]:
-        """True dynamic mask (H, W)."""
-        return self._masks[index]
-
-    def coverage(self) -> float:
-        """Mean true dynamic share of the image over the frames above ``SCORED_COVERAGE``."""
-        shares = np.array([mask.mean() for mask in self._masks])
-        return float(shares[shares > SCORED_COVERAGE].mean()) if (shares > SCORED_COVERAGE).any() else 0.0
-
-    def camera_speed(self) -> float:
-        """Mean speed of the camera, m/s."""
-        steps = np.linalg.norm(np.diff(self.ground_truth.Ts_world_camera[:, :3, 3], axis=0), axis=1)
-        return float(steps.sum() / (self.timestamps[-1] - self.timestamps[0]))

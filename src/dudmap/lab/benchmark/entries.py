@@ -1,4 +1,4 @@
-"""Entries of a benchmark suite: descriptions of recordings, which another process can open."""
+"""Recordings of a benchmark: descriptions that another process can open, and frames that are read once."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Any
 from dudmap.errors import DatasetError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.mesh import Mesh
     from dudmap.io.sequences import Sequence
 
@@ -81,3 +85,35 @@ def local_entries(data: Path) -> list[Entry]:
     if not found:
         raise DatasetError(f"no recording found in {data}; `dudmap info` says what it finds in a folder")
     return found
+
+
+class Excerpt:
+    """The first frames of a recording, all without a number, each of which is read or rendered once."""
+
+    def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
+        self.recording, self.timestamps = recording, recording.timestamps[:frames]
+        self._frames: dict[int, Frame] = {}
+        self._masks: dict[int, NDArray[np.bool_] | None] = {}
+
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - name, camera, calibration, ground truth, ...
+        return getattr(self.recording, name)
+
+    def __len__(self) -> int:
+        return len(self.timestamps)
+
+    def __getitem__(self, index: int) -> "Frame":
+        if index not in self._frames:
+            self._frames[index] = self.recording[index]
+        return self._frames[index]
+
+    def mask(self, index: int) -> "NDArray[np.bool_] | None":
+        """True dynamic mask (H, W) of a frame if known."""
+        if index not in self._masks:
+            self._masks[index] = self.recording.mask(index)
+        return self._masks[index]
+
+    def load(self) -> "Excerpt":
+        """Read or render all frames and masks now, so that this falls into the time of nobody."""
+        for index in range(len(self)):
+            _ = self[index], self.mask(index)
+        return self

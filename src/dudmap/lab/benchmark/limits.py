@@ -13,9 +13,13 @@ from functools import cache, lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
+import numpy as np
+
 from dudmap.config import Config
 from dudmap.errors import DudmapError
-from dudmap.lab.benchmark.conditions import FPS, SIZE, CachedRecording, Condition
+from dudmap.evaluation.segmentation import SCORED_COVERAGE
+from dudmap.lab.benchmark.conditions import FPS, SIZE, Condition
+from dudmap.lab.benchmark.entries import Excerpt
 from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
 
 if TYPE_CHECKING:
@@ -159,12 +163,14 @@ def _measure_chunk(chunk: list[ConditionJob]) -> Row:
 
 def measure_condition(condition: Condition, systems: Mapping[str, tuple[Config, Path]]) -> None:
     """Measure every system on the same frames of one condition, and write the figures to its file."""
-    recording = CachedRecording(condition.sequence())
+    recording = Excerpt(condition.sequence()).load()
+    shares = np.array([recording.mask(index).mean() for index in range(len(recording))])
+    steps = np.linalg.norm(np.diff(recording.ground_truth.Ts_world_camera[:, :3, 3], axis=0), axis=1)
+    speed = float(steps.sum() / (recording.timestamps[-1] - recording.timestamps[0]))
+    scored = shares[shares > SCORED_COVERAGE]
     surfaces = _surfaces(condition.camera_path, condition.frames)
-    conditions = {
-        "coverage_measured": round(recording.coverage(), 4),
-        "camera_speed": round(recording.camera_speed(), 4),
-    }
+    coverage = float(scored.mean()) if len(scored) else 0.0
+    conditions = {"coverage_measured": round(coverage, 4), "camera_speed": round(speed, 4)}
     for config, file in systems.values():
         row: Row = dict(conditions)
         try:
@@ -195,16 +201,10 @@ def _surfaces(camera_path: str, frames: int) -> "tuple[Surface, Surface]":
 
 def limit(rows: list[Row], sweep: str, system: str, x: float | str) -> float | None:
     """Largest coverage up to which a system copes at all measured coverages for ``x``; None if at none."""
-    cells = sorted(
-        (row for row in rows if (row["sweep"], row["system"], row["x"]) == (sweep, system, x)), key=_coverage
-    )
+    cells = [row for row in rows if (row["sweep"], row["system"], row["x"]) == (sweep, system, x)]
     reached = None
-    for row in cells:
+    for row in sorted(cells, key=lambda row: row["coverage"]):
         if not row.get("copes"):
             break
         reached = row["coverage"]
     return reached
-
-
-def _coverage(row: Row) -> float:
-    return row["coverage"]

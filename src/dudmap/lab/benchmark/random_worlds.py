@@ -33,29 +33,33 @@ SENSORS = ("kinect_v1", "kinect_v2", "realsense_d435", "realsense_l515", "iphone
 NOISES = ("kinect", "realsense", "d435", "kinect_v2", "l515", "iphone")
 NAMED, FAULTY, BLURRED = 0.4, 0.3, 0.3
 """Probability of a named camera, of each fault of any other sensor, and of its motion blur."""
-Draw = Callable[[np.random.Generator], Any]
-FAULTS: dict[str, Draw] = {
-    "color_translation": lambda rng: _rounded(rng.uniform((-0.03, -0.01, -0.01), (0.03, 0.01, 0.01))),
-    "color_rotation_deg": lambda rng: _rounded(rng.uniform(-0.7, 0.7, 3)),
-    "color_focal_ratio": lambda rng: _rounded(rng.uniform(0.92, 1.08)),
-    "color_center_shift": lambda rng: _rounded(rng.uniform(-4, 4, 2)),
-    "color_delay": lambda rng: _rounded(rng.uniform(-0.015, 0.03)),
-    "color_readout": lambda rng: _rounded(rng.uniform(0.005, 0.03)),
-    "color_distortion": lambda rng: _rounded(rng.uniform((-0.1, -0.1, -2e-3, -2e-3), (0.15, 0.1, 2e-3, 2e-3))),
-    "auto_exposure": lambda rng: _rounded(rng.uniform(0.1, 0.6)),
-    "white_balance_drift": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
-    "vignetting": lambda rng: _rounded(rng.uniform(0.05, 0.4)),
-    "jpeg_quality": lambda rng: float(rng.integers(50, 96)),
-    "depth_scale_error": lambda rng: _rounded(rng.uniform(-0.01, 0.01)),
-    "depth_offset": lambda rng: _rounded(rng.uniform(-0.01, 0.01)),
-    "depth_bands": lambda rng: _rounded(rng.uniform(2e-4, 1.5e-3)),
-    "depth_distortion": lambda rng: _rounded(rng.uniform(1e-3, 0.01)),
-    "flying_pixels": lambda rng: _rounded(rng.uniform(0.1, 0.8)),
-    "multipath": lambda rng: _rounded(rng.uniform(0.1, 0.5)),
-    "dropped_frames": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
-    "late_frames": lambda rng: _rounded(rng.uniform(0.01, 0.1)),
+FAULTS: dict[str, tuple[Any, Any]] = {
+    "color_translation": ((-0.03, -0.01, -0.01), (0.03, 0.01, 0.01)),
+    "color_rotation_deg": ((-0.7,) * 3, (0.7,) * 3),
+    "color_focal_ratio": (0.92, 1.08),
+    "color_center_shift": ((-4, -4), (4, 4)),
+    "color_delay": (-0.015, 0.03),
+    "color_readout": (0.005, 0.03),
+    "color_distortion": ((-0.1, -0.1, -2e-3, -2e-3), (0.15, 0.1, 2e-3, 2e-3)),
+    "auto_exposure": (0.1, 0.6),
+    "white_balance_drift": (0.01, 0.1),
+    "vignetting": (0.05, 0.4),
+    "jpeg_quality": (50, 96),
+    "depth_scale_error": (-0.01, 0.01),
+    "depth_offset": (-0.01, 0.01),
+    "depth_bands": (2e-4, 1.5e-3),
+    "depth_distortion": (1e-3, 0.01),
+    "flying_pixels": (0.1, 0.8),
+    "multipath": (0.1, 0.5),
+    "dropped_frames": (0.01, 0.1),
+    "late_frames": (0.01, 0.1),
 }
-"""Size of each fault: what named cameras and recordings show, and a little more."""
+"""Range of each fault: what named cameras and recordings show, and a little more. JPEG quality is a whole number."""
+
+
+def _drawn(fault: str, rng: np.random.Generator) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
+    low, high = FAULTS[fault]
+    return float(rng.integers(low, high)) if fault == "jpeg_quality" else _rounded(rng.uniform(low, high))
 
 
 def _rounded(value: Any) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
@@ -93,7 +97,7 @@ def draw_world(seed: int, number: int) -> dict[str, Any]:
             world["speed"] = _rounded(np.exp(rng.uniform(np.log(0.05), np.log(2.0))))
     if rng.random() < NAMED:
         return world | {"sensor": str(rng.choice(SENSORS))}
-    faults = {name: draw(rng) for name, draw in FAULTS.items() if rng.random() < FAULTY}
+    faults = {name: _drawn(name, rng) for name in FAULTS if rng.random() < FAULTY}
     blur = _rounded(rng.uniform(0.1, 0.6)) if rng.random() < BLURRED else 0.0
     return world | {"noise": str(rng.choice(NOISES)), "faults": faults, "motion_blur": blur}
 

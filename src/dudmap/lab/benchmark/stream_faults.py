@@ -2,18 +2,19 @@
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import Config
-from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError, FrameError
 from dudmap.io.sequences import Sequence
+from dudmap.lab.benchmark.entries import Excerpt
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream
 
 SILENT_ERROR = 0.03
@@ -68,28 +69,6 @@ class FaultRun:
         return "skipped and counted" if self.rejected else "handled"
 
 
-class Excerpt:
-    """The first frames of a recording, each of which is read once."""
-
-    def __init__(self, recording: Sequence, frames: int) -> None:
-        self.recording = recording
-        self.name, self.camera, self.calibration = recording.name, recording.camera, recording.calibration
-        self.timestamps, self.ground_truth = recording.timestamps[:frames], recording.ground_truth
-        self._frames: dict[int, Frame] = {}
-
-    def __len__(self) -> int:
-        return len(self.timestamps)
-
-    def __getitem__(self, index: int) -> Frame:
-        if index not in self._frames:
-            self._frames[index] = self.recording[index]
-        return self._frames[index]
-
-    def mask(self, index: int) -> NDArray[np.bool_] | None:
-        """True dynamic mask (H, W) of a frame if known."""
-        return self.recording.mask(index)
-
-
 def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Sequence:
     """A synthetic scene with people, images of 4:3 with a view of 62 degrees, the noise of a Kinect."""
     from dudmap.lab import synthetic
@@ -118,7 +97,7 @@ def measure_stream_faults(
     """
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
-    kept = Excerpt(recording, min(frames or len(recording), len(recording)))
+    kept = cast("Sequence", Excerpt(recording, frames))
     streams = {name: FaultyStream(kept, name) for name in ["none", *(n for n in faults or FAULTS if n != "none")]}
     clean: FaultRun | None = None
     for name, stream in streams.items():

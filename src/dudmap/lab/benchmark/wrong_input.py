@@ -14,7 +14,7 @@ from dudmap.core.slam import Slam
 from dudmap.errors import ConfigError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
-from dudmap.lab.benchmark.stream_faults import Excerpt
+from dudmap.lab.benchmark.entries import Excerpt
 from dudmap.lab.benchmark.table import grid
 from dudmap.lab.synthetic.stream_faults import black, scaled
 
@@ -53,7 +53,7 @@ class SpoiltSequence(Excerpt):
     def __init__(self, recording: Sequence, name: str, frames: int) -> None:
         super().__init__(recording, frames)
         self.name = name
-        self.camera = replace(self.camera, depth_scale=self.camera.depth_scale / FACTORS.get(name, 1.0))
+        self.camera = replace(recording.camera, depth_scale=recording.camera.depth_scale / FACTORS.get(name, 1.0))
 
     def __getitem__(self, index: int) -> Frame:
         return SPOILT[self.name](super().__getitem__(index))
@@ -92,7 +92,7 @@ def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str
     if recording.ground_truth is None:
         raise ConfigError(f"{recording.name} has no true poses; expected a recording with groundtruth.txt")
     for name in names:
-        sequence = SpoiltSequence(recording, name, min(frames, len(recording)))
+        sequence = SpoiltSequence(recording, name, frames)
         slam = Slam(sequence.camera, config, calibration=sequence.calibration)
         results = [slam.process(sequence[index]) for index in range(len(sequence))]
         tracked = sum(result.T_world_camera is not None for result in results)

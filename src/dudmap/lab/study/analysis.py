@@ -11,13 +11,11 @@ from dudmap.lab.study import figures, indices, judgement, response_surface, scre
 from dudmap.lab.study.designs import DesignOptions, Point
 from dudmap.lab.study.effects import anova, interactions, main_effects
 from dudmap.lab.study.factors import Factor, coded_points
-from dudmap.lab.study.pareto import pareto_front
 from dudmap.lab.study.report import Report
 from dudmap.lab.study.responses import RESPONSES
 from dudmap.lab.study.tables import Table
 
 if TYPE_CHECKING:
-    from dudmap.lab.study.judgement import Confirmation
     from dudmap.lab.study.response_surface import Optimum, Surface
 
 MOST_FAILURES = 10
@@ -39,14 +37,14 @@ class Prediction:
         best: Its optimum.
         point: Values of all factors at the optimum; those without numbers have their best level.
         best_point: Values of all factors at the best point of the design.
-        judgement: What speaks against the optimum before it is confirmed.
+        reasons: What speaks against the optimum before it is confirmed, each a sentence.
     """
 
     surface: "Surface"
     best: "Optimum"
     point: Point
     best_point: Point
-    judgement: "judgement.Judgement"
+    reasons: tuple[str, ...]
 
 
 def usable(table: Table, name: str, log: bool = False) -> Table:
@@ -213,11 +211,11 @@ def describe_surface(report: Report, predicted: Prediction, heading: str) -> Non
         else f"There is no single stationary point; eigenvalues {eigenvalues}."
     )
     report.text(f"Optimum within the bounds: {best.predicted:.4g} at {values_text(best.values)}.")
-    if predicted.judgement.credible:
+    if not predicted.reasons:
         report.text("Nothing in the runs speaks against it; a confirmation is still needed.")
     else:
         report.text("It must not be believed:")
-        report.items(predicted.judgement.reasons)
+        report.items(predicted.reasons)
 
 
 def values_text(values: Point | dict[str, float]) -> str:
@@ -226,12 +224,6 @@ def values_text(values: Point | dict[str, float]) -> str:
         f"{key.rpartition('.')[2]} {value:.4g}" if isinstance(value, float) else f"{key.rpartition('.')[2]} {value}"
         for key, value in values.items()
     )
-
-
-def describe_confirmation(report: Report, confirmation: "Confirmation | str") -> None:
-    """Add what the confirmation runs showed."""
-    report.heading("Confirmation")
-    report.text(str(confirmation))
 
 
 def point_table(table: Table, factors: Sequence[Factor], names: Sequence[str]) -> Table:
@@ -244,6 +236,26 @@ def point_table(table: Table, factors: Sequence[Factor], names: Sequence[str]) -
         {**{factor.key: "first" for factor in factors}, **{key: "mean" for key in keys if key in table}}
     )
     return means.rename(columns={RESPONSES[name].key: name for name in names}).reset_index(drop=True)
+
+
+def pareto_front(points: Table, names: Sequence[str]) -> Table:
+    """Rows of the Pareto front, sorted by the first response (Optuna's ``best_trials``).
+
+    Args:
+        points: One row per point with a column per response.
+        names: Names of two or more responses.
+    """
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    directions: Any = ["minimize" if RESPONSES[name].better == "low" else "maximize" for name in names]
+    study = optuna.create_study(directions=directions)
+    complete = points.dropna(subset=list(names))
+    for number in complete.index:
+        values = [float(value) for value in complete.loc[number, list(names)]]
+        study.add_trial(optuna.trial.create_trial(values=values, user_attrs={"row": int(number)}))
+    front = [trial.user_attrs["row"] for trial in study.best_trials] if len(complete) else []
+    return complete.loc[front].sort_values(names[0], ascending=RESPONSES[names[0]].better == "low")
 
 
 def describe_pareto(report: Report, table: Table, factors: Sequence[Factor], names: Sequence[str]) -> None:

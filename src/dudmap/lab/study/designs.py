@@ -57,10 +57,8 @@ def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
     found: list[Point]
     if options.kind == "full-factorial":
         found = _full_factorial(factors)
-    elif options.kind == "fractional-factorial":
-        found = [_two_level(factors, row) for row in _fractional(factors, options)]
-    elif options.kind == "plackett-burman":
-        found = [_two_level(factors, row) for row in _plackett_burman(factors, options)]
+    elif options.kind in ("fractional-factorial", "plackett-burman"):
+        found = [_two_level(factors, row) for row in DESIGNS[options.kind](factors, options)]
     else:
         words = [factor.key for factor in factors if not factor.numeric]
         if words:
@@ -136,52 +134,32 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
     return np.vstack([rows, -rows]) if options.foldover else rows
 
 
-def _central_composite(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from pyDOE3 import ccdesign
+def _response_surface(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    """Central composite or Box-Behnken design."""
+    from pyDOE3 import bbdesign, ccdesign
 
-    if len(factors) < 2:
-        raise ConfigError("a central-composite design needs two factors or more")
-    return np.asarray(ccdesign(len(factors), center=(0, 1), face="faced"))
-
-
-def _box_behnken(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from pyDOE3 import bbdesign
-
-    if len(factors) < 3:
-        raise ConfigError("a box-behnken design needs three factors or more")
-    return np.asarray(bbdesign(len(factors), center=1))
+    composite = options.kind == "central-composite"
+    if len(factors) < (2 if composite else 3):
+        raise ConfigError(f"a {options.kind} design needs {'two' if composite else 'three'} factors or more")
+    count = len(factors)
+    return np.asarray(ccdesign(count, center=(0, 1), face="faced") if composite else bbdesign(count, center=1))
 
 
-def _latin_hypercube(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from scipy.stats.qmc import LatinHypercube
+def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
+    """Latin hypercube, or Sobol, Saltelli or Morris design."""
+    from SALib.sample import morris, sobol
+    from scipy.stats.qmc import LatinHypercube, Sobol
 
-    return 2 * LatinHypercube(len(factors), rng=np.random.default_rng(options.seed)).random(options.samples) - 1
-
-
-def _sobol(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from scipy.stats.qmc import Sobol
-
-    _check_power(options)
-    sampler = Sobol(len(factors), rng=np.random.default_rng(options.seed))
-    return 2 * sampler.random_base2(options.samples.bit_length() - 1) - 1
-
-
-def _saltelli(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from SALib.sample.sobol import sample
-
-    _check_power(options)
-    return sample(problem(factors), options.samples, calc_second_order=True, seed=options.seed)
-
-
-def _morris(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    from SALib.sample.morris import sample
-
-    return sample(problem(factors), options.samples, num_levels=MORRIS_LEVELS, seed=options.seed)
-
-
-def _check_power(options: DesignOptions) -> None:
-    if options.samples & (options.samples - 1):
-        raise ConfigError(f"a {options.kind} design has {options.samples} samples; expected a power of two")
+    kind, samples, rng = options.kind, options.samples, np.random.default_rng(options.seed)
+    if kind in ("sobol", "saltelli") and samples & (samples - 1):
+        raise ConfigError(f"a {kind} design has {samples} samples; expected a power of two")
+    if kind == "latin-hypercube":
+        return 2 * LatinHypercube(len(factors), rng=rng).random(samples) - 1
+    if kind == "sobol":
+        return 2 * Sobol(len(factors), rng=rng).random_base2(samples.bit_length() - 1) - 1
+    if kind == "saltelli":
+        return sobol.sample(problem(factors), samples, calc_second_order=True, seed=options.seed)
+    return morris.sample(problem(factors), samples, num_levels=MORRIS_LEVELS, seed=options.seed)
 
 
 def problem(factors: Sequence[Factor]) -> dict[str, Any]:
@@ -197,11 +175,7 @@ DESIGNS: dict[str, Callable[[Sequence[Factor], DesignOptions], Coded]] = {
     "full-factorial": lambda factors, options: np.empty((0, len(factors))),
     "fractional-factorial": _fractional,
     "plackett-burman": _plackett_burman,
-    "central-composite": _central_composite,
-    "box-behnken": _box_behnken,
-    "latin-hypercube": _latin_hypercube,
-    "sobol": _sobol,
-    "saltelli": _saltelli,
-    "morris": _morris,
+    **dict.fromkeys(("central-composite", "box-behnken"), _response_surface),
+    **dict.fromkeys(("latin-hypercube", "sobol", "saltelli", "morris"), _sampled),
 }
 """Designs by name, as coded points; full-factorial takes the levels themselves (``_full_factorial``)."""

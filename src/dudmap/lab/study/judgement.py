@@ -1,7 +1,7 @@
 """Whether the optimum of a response surface is to be believed: reasons against it, and confirmation runs."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -66,20 +66,8 @@ def influence(surface: Surface) -> Influence | None:
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Judgement:
-    """Reasons not to believe the optimum of a surface, each a sentence; none if there is nothing against it."""
-
-    reasons: tuple[str, ...] = field(default=())
-
-    @property
-    def credible(self) -> bool:
-        """Whether nothing speaks against the optimum."""
-        return not self.reasons
-
-
-def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influence | None) -> Judgement:
-    """Everything that speaks against the optimum of a surface before it is confirmed."""
+def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influence | None) -> tuple[str, ...]:
+    """Reasons not to believe the optimum of a surface before it is confirmed, each a sentence."""
     reasons = []
     if surface.r2_predicted < ENOUGH_EXPLAINED:
         reasons.append(
@@ -113,7 +101,7 @@ def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influe
         reasons.append(
             f"The lack of fit is significant (F = {fit.f:.2f}, p = {fit.p:.2g}): the response is not quadratic."
         )
-    return Judgement(tuple(reasons))
+    return tuple(reasons)
 
 
 @dataclass(frozen=True)

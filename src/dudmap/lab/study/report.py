@@ -3,9 +3,7 @@
 import base64
 import html
 from collections.abc import Iterable
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
 
 from dudmap.lab.benchmark.table import grid
 from dudmap.lab.study.tables import Table
@@ -17,68 +15,64 @@ STYLE = (
 )
 
 
-class Block(NamedTuple):
-    """Part of a report.
-
-    Attributes:
-        kind: What it is.
-        text: Heading, paragraph, or caption; of a list, one line per item.
-        table: Header and rows of a table.
-        image: PNG file of a figure.
-    """
-
-    kind: Literal["heading", "text", "list", "table", "figure"]
-    text: str = ""
-    table: tuple[list[str], list[list[str]]] = ([], [])
-    image: bytes = b""
-
-
-@dataclass
 class Report:
     """A report that is filled from top to bottom.
 
-    Attributes:
+    Args:
         title: Its title.
-        blocks: Its parts in order.
     """
 
-    title: str
-    blocks: list[Block] = field(default_factory=list)
+    def __init__(self, title: str) -> None:
+        self.title = title
+        self._markdown, self._html = [f"# {title}\n"], [f"<h1>{html.escape(title)}</h1>"]
+        self._figures: dict[str, bytes] = {}
 
     def heading(self, text: str) -> None:
         """Begin a section."""
-        self.blocks.append(Block("heading", text))
+        self._add(f"## {text}\n", f"<h2>{html.escape(text)}</h2>")
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self.blocks.append(Block("text", text))
+        self._add(f"{text}\n", f"<p>{html.escape(text)}</p>")
 
     def items(self, lines: Iterable[str]) -> None:
         """Add a list."""
-        self.blocks.append(Block("list", "\n".join(lines)))
+        lines = list(lines)
+        listed = "".join(f"<li>{html.escape(line)}</li>" for line in lines)
+        self._add("".join(f"* {line}\n" for line in lines), f"<ul>{listed}</ul>")
 
     def table(self, frame: Table) -> None:
         """Add a table without its index."""
+        header = [str(column) for column in frame.columns]
         rows = [[shown(value) for value in row] for row in frame.itertuples(index=False)]
-        self.blocks.append(Block("table", table=([str(column) for column in frame.columns], rows)))
+        lines = ["".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
+                 for tag, row in [("th", header), *(("td", row) for row in rows)]]  # fmt: skip
+        self._add(grid(header, rows, words=1), "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>")
 
     def figure(self, image: bytes, caption: str) -> None:
-        """Add a figure."""
-        self.blocks.append(Block("figure", caption, image=image))
+        """Add a figure, the bytes of a PNG file."""
+        name, text, data = f"{len(self._markdown)}.png", html.escape(caption), base64.b64encode(image).decode()
+        self._figures[name] = image
+        self._add(
+            f"![{caption}](figures/{name})\n\n{caption}\n",
+            f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>',
+        )
+
+    def _add(self, markdown: str, page: str) -> None:
+        self._markdown.append(markdown)
+        self._html.append(page)
 
     def save(self, folder: Path) -> None:
         """Write report.md, report.html and figures/<number>.png."""
         (folder / "figures").mkdir(parents=True, exist_ok=True)
         for left in (folder / "figures").glob("*.png"):
             left.unlink()
-        markdown, page = [f"# {self.title}\n"], [f"<h1>{html.escape(self.title)}</h1>"]
-        for number, block in enumerate(self.blocks, 1):
-            markdown.append(_markdown(block, number, folder))
-            page.append(_html(block))
-        (folder / "report.md").write_text("\n".join(markdown), encoding="utf-8")
+        for name, image in self._figures.items():
+            (folder / "figures" / name).write_bytes(image)
+        (folder / "report.md").write_text("\n".join(self._markdown), encoding="utf-8")
         (folder / "report.html").write_text(
             f'<!doctype html><html lang="en"><meta charset="utf-8"><title>{html.escape(self.title)}</title>'
-            f"<style>{STYLE}</style><body>{''.join(page)}</body></html>\n",
+            f"<style>{STYLE}</style><body>{''.join(self._html)}</body></html>\n",
             encoding="utf-8",
         )
 
@@ -88,33 +82,3 @@ def shown(value: object) -> str:
     if isinstance(value, float):
         return "" if value != value else f"{value:.4g}"
     return str(value)
-
-
-def _markdown(block: Block, number: int, folder: Path) -> str:
-    if block.kind == "heading":
-        return f"## {block.text}\n"
-    if block.kind == "list":
-        return "".join(f"* {line}\n" for line in block.text.splitlines())
-    if block.kind == "table":
-        return grid(*block.table, words=1)
-    if block.kind == "figure":
-        (folder / "figures" / f"{number}.png").write_bytes(block.image)
-        return f"![{block.text}](figures/{number}.png)\n\n{block.text}\n"
-    return f"{block.text}\n"
-
-
-def _html(block: Block) -> str:
-    text = html.escape(block.text)
-    if block.kind == "heading":
-        return f"<h2>{text}</h2>"
-    if block.kind == "list":
-        return "<ul>" + "".join(f"<li>{line}</li>" for line in text.splitlines()) + "</ul>"
-    if block.kind == "table":
-        header, rows = block.table
-        lines = ["".join(f"<{tag}>{html.escape(cell)}</{tag}>" for cell in row)
-                 for tag, row in [("th", header), *(("td", row) for row in rows)]]  # fmt: skip
-        return "<table>" + "".join(f"<tr>{line}</tr>" for line in lines) + "</table>"
-    if block.kind == "figure":
-        data = base64.b64encode(block.image).decode()
-        return f'<figure><img alt="{text}" src="data:image/png;base64,{data}"><figcaption>{text}</figcaption></figure>'
-    return f"<p>{text}</p>"

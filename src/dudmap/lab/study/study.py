@@ -1,7 +1,8 @@
 """A whole study: its runs, its confirmation, its tables and its report."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -9,7 +10,7 @@ from dudmap.errors import ConfigError
 from dudmap.lab.study.conduct import Progress, conduct, table_of
 from dudmap.lab.study.effects import effects_by_recording
 from dudmap.lab.study.executor import Executor
-from dudmap.lab.study.plan import MAX_RUNS, Plan, sequence_names
+from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, sequence_names
 from dudmap.lab.study.tables import Table
 
 if TYPE_CHECKING:
@@ -47,22 +48,21 @@ def run_study(
     try:
         plan.check(max_runs)
         runs = plan.runs()
-        state = conduct(runs, out, executor, keep=keep, report=report)
+        do = partial(conduct, root=out, executor=executor, keep=keep, report=report)
+        state = do(runs)
         table = table_of(runs, out)
         table.to_csv(out / "runs.csv", index=False)
         predicted = predict_optimum(table, plan.factors, plan.responses[0], plan.responses[0] in plan.log)
         confirmation: Confirmation | str = "There is nothing to confirm."
         if not isinstance(predicted, str) and plan.confirm:
-            confirmation = _confirm(plan, predicted, out, executor, keep=keep, report=report)
-        each = confirm_each(plan, table, out, executor, keep=keep, report=report) if plan.each else None
+            confirmation = _confirm(plan, predicted, out, do)
+        each = confirm_each(plan, table, out, do) if plan.each else None
     finally:
         executor.close()
     return write_report(plan, table, predicted, confirmation, out, executor.workers, state, each)
 
 
-def confirm_each(
-    plan: Plan, table: Table, out: Path, executor: Executor, *, keep: bool, report: Callable[[Progress], None]
-) -> Table:
+def confirm_each(plan: Plan, table: Table, out: Path, do: Callable[[Sequence[Run]], Progress]) -> Table:
     """Model, optimum and confirmation of every recording on its own; also written to each.csv.
 
     One row per recording: values of the factors at the optimum, R2 of the model, R2 when each run is left out in turn,
@@ -87,14 +87,14 @@ def confirm_each(
         row = {"recording": recording, **point, "R2": surface.r2, "R2 left out": surface.r2_predicted}
         row |= {"best run": float(plain(surface.best_seen)), "predicted": float(plain(predicted.best.predicted))}
         file = f"confirmation-{recording}.csv"
-        found = _confirm(alone, predicted, out, executor, keep=keep, report=report, file=file)
+        found = _confirm(alone, predicted, out, do, file)
         if isinstance(found, str):
             rows.append(row | {"held": found})
             continue
         row |= {"measured": float(plain(found.measured)), "best point": float(plain(found.best_point))}
         runs = pd.read_csv(out / file)
         row["lost at the optimum"] = float(runs.loc[runs["at"] == "optimum", "lost"].mean())
-        warned = "no" if predicted.judgement.credible else "yes"
+        warned = "yes" if predicted.reasons else "no"
         rows.append(row | {"held": "yes" if found.held else "no", "warned before": warned})
     each = pd.DataFrame(rows)
     each.to_csv(out / "each.csv", index=False)
@@ -105,10 +105,7 @@ def _confirm(
     plan: Plan,
     predicted: "Prediction",
     out: Path,
-    executor: Executor,
-    *,
-    keep: bool,
-    report: Callable[[Progress], None],
+    do: Callable[[Sequence[Run]], Progress],
     file: str = "confirmation.csv",
 ) -> "Confirmation | str":
     """Run the optimum and the best point of the design on the same recordings."""
@@ -119,7 +116,7 @@ def _confirm(
 
     name = plan.responses[0]
     at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)
-    conduct([*at_optimum, *at_best], out, executor, keep=keep, report=report)
+    do([*at_optimum, *at_best])
     tables = [table_of(at_optimum, out), table_of(at_best, out)]
     pd.concat(tables, keys=["optimum", "best point of the design"], names=["at"]).reset_index("at").to_csv(
         out / file, index=False
@@ -168,7 +165,8 @@ def write_report(
             report.heading(name)
             report.text(f"{error}.")
         if name == plan.responses[0]:
-            analysis.describe_confirmation(report, confirmation)
+            report.heading("Confirmation")
+            report.text(str(confirmation))
             if each is not None:
                 report.heading(f"{analysis.heading_of(name, False)}: each recording on its own")
                 report.table(each)
@@ -196,6 +194,6 @@ def outcome(predicted: "Prediction | str", confirmation: "Confirmation | str") -
     if isinstance(predicted, str):
         return predicted
     lines = [f"Predicted optimum: {predicted.best.predicted:.4g} at {values_text(predicted.point)}."]
-    if not predicted.judgement.credible:
-        lines += ["It must not be believed:", *(f"- {reason}" for reason in predicted.judgement.reasons)]
+    if predicted.reasons:
+        lines += ["It must not be believed:", *(f"- {reason}" for reason in predicted.reasons)]
     return "\n".join([*lines, str(confirmation)])

@@ -6,7 +6,7 @@ configuration on the same recording, so that recordings count equally. The propo
 results only, and results are kept: a search that was stopped proposes the same again and finds its results.
 """
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -180,8 +180,8 @@ class Search:
         sampler = optuna.samplers.TPESampler(seed=self.options.seed)
         directions: Any = ["minimize"] * len(self.plan.responses)
         study = optuna.create_study(directions=directions, sampler=sampler)
-        for batch in self._batches():
-            trials = [study.ask() for _ in range(batch)]
+        for begin in range(0, self.options.trials, BATCH):
+            trials = [study.ask() for _ in range(min(BATCH, self.options.trials - begin))]
             points = [suggest(trial, self.plan.factors) for trial in trials]
             kept = [n for n, keep in enumerate(self._promising(points)) if keep]
             found = dict(zip(kept, self.ratios([points[n] for n in kept], self.plan), strict=True))
@@ -196,10 +196,6 @@ class Search:
         different = {str(trial.user_attrs["point"]): trial for trial in reversed(best)}
         chosen = sorted(different.values(), key=lambda trial: trial.values)[:MOST_JUDGED]
         return [(trial.user_attrs["point"], tuple(trial.values)) for trial in chosen]
-
-    def _batches(self) -> Iterator[int]:
-        for begin in range(0, self.options.trials, BATCH):
-            yield min(BATCH, self.options.trials - begin)
 
     def _promising(self, points: list[Point]) -> list[bool]:
         """Whether each point survives the early frames: Optuna's percentile pruner on the first response.
@@ -219,7 +215,10 @@ class Search:
             value = float("inf") if ratios is None else float(geometric_mean(ratios)[0])
             trial.report(value, step=1)
             out.append(ratios is not None and not trial.should_prune())
-            self._early.tell(trial, value if np.isfinite(value) else None, state=_state(value))
+            if ratios is None:
+                self._early.tell(trial, state=optuna.trial.TrialState.FAIL)
+            else:
+                self._early.tell(trial, value)
         return out
 
     def verdicts(self) -> list[Verdict]:
@@ -234,18 +233,11 @@ class Search:
         raw = [1.0 if ratios is None else improvement_p(ratios[:, 0]) for ratios in found]
         corrected: Any = multipletests(raw, method="holm")[1]
         nothing = (float("nan"),) * len(self.plan.responses)
+        judged = [nothing if ratios is None else tuple(geometric_mean(ratios)) for ratios in found]
         return [
-            Verdict(
-                point, training, nothing if ratios is None else tuple(geometric_mean(ratios)), float(p), ratios is None
-            )
-            for (point, training), ratios, p in zip(front, found, corrected, strict=True)
+            Verdict(point, training, figures, float(p), ratios is None)
+            for (point, training), figures, ratios, p in zip(front, judged, found, corrected, strict=True)
         ]
-
-
-def _state(value: float) -> "optuna.trial.TrialState":
-    import optuna
-
-    return optuna.trial.TrialState.COMPLETE if np.isfinite(value) else optuna.trial.TrialState.FAIL
 
 
 def improvement_p(ratios: Numbers) -> float:

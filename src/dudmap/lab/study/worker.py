@@ -10,14 +10,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, cast
 
 from dudmap.errors import DudmapError
+from dudmap.lab.benchmark.entries import Entry, Excerpt
 from dudmap.lab.study.plan import Run
 from dudmap.lab.study.store import StudyFolder
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from dudmap.core.frames.frame import Frame
     from dudmap.evaluation.surface import Surface
     from dudmap.io.sequences import Sequence
 
@@ -86,69 +83,42 @@ def measure_run(run: Run, out: Path | None) -> dict[str, Any]:
     from dudmap.lab.benchmark.measure import measure_sequence
 
     reset_peak_memory()
-    content = json.dumps([str(run.entry.path), dict(run.entry.parameters)], sort_keys=True, default=str)
-    sequence = _recording(_Hashed(content, run))
+    same = SameRecording(run.entry)
     return measure_sequence(
-        sequence, run.config, _surfaces(_Hashed(content, run)) if run.surfaces else None, out,
+        _recording(same), run.config, _surfaces(same) if run.surfaces else None, out,
         run.entry.max_frames, SAMPLES, calibrate=run.calibrate, ahead=0,
     )  # fmt: skip
 
 
-@dataclass(frozen=True)
-class _Hashed:
-    """Run that is equal to others on the same recording."""
+class SameRecording:
+    """Entry that is equal to others of the same recording, as the key of a cache."""
 
-    content: str
-    run: Run
+    def __init__(self, entry: Entry) -> None:
+        self.entry = entry
+        self._content = json.dumps([str(entry.path), dict(entry.parameters)], sort_keys=True, default=str)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Hashed) and self.content == other.content
+        return isinstance(other, SameRecording) and self._content == other._content
 
     def __hash__(self) -> int:
-        return hash(self.content)
-
-
-class KeptRecording:
-    """Recording whose frames stay in memory once they were read or rendered, for the runs that follow."""
-
-    def __init__(self, recording: "Sequence") -> None:
-        self._recording = recording
-        self._frames: dict[int, Frame] = {}
-        self._masks: dict[int, NDArray[np.bool_] | None] = {}
-
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - camera, ground truth, ... of the recording
-        return getattr(self._recording, name)
-
-    def __len__(self) -> int:
-        return len(self._recording)
-
-    def __getitem__(self, index: int) -> "Frame":
-        if index not in self._frames:
-            self._frames[index] = self._recording[index]
-        return self._frames[index]
-
-    def mask(self, index: int) -> "NDArray[np.bool_] | None":
-        """See ``Sequence``."""
-        if index not in self._masks:
-            self._masks[index] = self._recording.mask(index)
-        return self._masks[index]
+        return hash(self._content)
 
 
 @lru_cache(maxsize=1)
-def _recording(of: _Hashed) -> "Sequence":
+def _recording(of: SameRecording) -> "Sequence":
     """Recording of a run; a short one is read or rendered once for all runs that follow each other."""
-    sequence = of.run.entry.open()
-    frames = min(len(sequence), of.run.entry.max_frames or len(sequence))
+    sequence = of.entry.open()
+    frames = min(len(sequence), of.entry.max_frames or len(sequence))
     size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES
-    return cast("Sequence", KeptRecording(sequence)) if size <= CACHED_BYTES else sequence
+    return cast("Sequence", Excerpt(sequence)) if size <= CACHED_BYTES else sequence
 
 
 @lru_cache(maxsize=4)
-def _surfaces(of: _Hashed) -> "tuple[Surface, Surface] | None":
+def _surfaces(of: SameRecording) -> "tuple[Surface, Surface] | None":
     """True surfaces of a recording with their search trees."""
     from dudmap.evaluation.surface import Surface
 
-    found = of.run.entry.surfaces(of.run.entry.open())
+    found = of.entry.surfaces(of.entry.open())
     return None if found is None else (Surface(found[0], "the true surface"), Surface(found[1], "its observed part"))
 
 

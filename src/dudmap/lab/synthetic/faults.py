@@ -1,7 +1,7 @@
 """Faults of real RGB-D sensors, with which a synthetic recording can be rendered."""
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, dataclass, field, fields, replace
 from itertools import pairwise
 from typing import Any
 
@@ -12,32 +12,15 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 
-LIMITS: dict[str, tuple[float, float]] = {
-    "color_translation": (-1.0, 1.0),
-    "color_rotation_deg": (-30.0, 30.0),
-    "color_focal_ratio": (0.3, 3.0),
-    "color_center_shift": (-500.0, 500.0),
-    "color_delay": (-1.0, 1.0),
-    "color_readout": (-0.2, 0.2),
-    "color_distortion": (-1.0, 1.0),
-    "auto_exposure": (0.0, 10.0),
-    "white_balance_drift": (0.0, 0.5),
-    "vignetting": (0.0, 0.9),
-    "jpeg_quality": (0.0, 100.0),
-    "depth_scale_error": (-0.2, 0.2),
-    "depth_offset": (-0.2, 0.2),
-    "depth_bands": (0.0, 0.02),
-    "depth_distortion": (0.0, 0.1),
-    "flying_pixels": (0.0, 1.0),
-    "multipath": (0.0, 0.95),
-    "dropped_frames": (0.0, 0.8),
-    "late_frames": (0.0, 1.0),
-}
-"""Smallest and largest accepted value of every fault."""
 BAND_ROWS, MOST_BANDS = 16, 24
 """Rows of a colour image with a rolling shutter are rendered in up to ``MOST_BANDS`` bands of one time each, of at
 least ``BAND_ROWS`` rows; the time of a row is then wrong by at most 1/30 of the readout at 240 rows, 1/48 from 384
 rows on. Blurred images need fewer: there it is wrong by at most half the step between two moments of the exposure."""
+
+
+def _fault(usual: Any, low: float, high: float) -> Any:  # noqa: ANN401 - a number or a tuple of numbers
+    """Field with the smallest and the largest value that is accepted."""
+    return field(default=usual, metadata={"limits": (low, high)})
 
 
 @dataclass(frozen=True)
@@ -79,34 +62,34 @@ class SensorFaults:
         ConfigError: A value is outside ``LIMITS`` or has the wrong number of elements.
     """
 
-    color_translation: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    color_rotation_deg: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    color_focal_ratio: float = 1.0
-    color_center_shift: tuple[float, float] = (0.0, 0.0)
-    color_delay: float = 0.0
-    color_readout: float = 0.0
-    color_distortion: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
-    auto_exposure: float = 0.0
-    white_balance_drift: float = 0.0
-    vignetting: float = 0.0
-    jpeg_quality: float = 0.0
-    depth_scale_error: float = 0.0
-    depth_offset: float = 0.0
-    depth_bands: float = 0.0
-    depth_distortion: float = 0.0
-    flying_pixels: float = 0.0
-    multipath: float = 0.0
-    dropped_frames: float = 0.0
-    late_frames: float = 0.0
+    color_translation: tuple[float, float, float] = _fault((0.0, 0.0, 0.0), -1.0, 1.0)
+    color_rotation_deg: tuple[float, float, float] = _fault((0.0, 0.0, 0.0), -30.0, 30.0)
+    color_focal_ratio: float = _fault(1.0, 0.3, 3.0)
+    color_center_shift: tuple[float, float] = _fault((0.0, 0.0), -500.0, 500.0)
+    color_delay: float = _fault(0.0, -1.0, 1.0)
+    color_readout: float = _fault(0.0, -0.2, 0.2)
+    color_distortion: tuple[float, float, float, float] = _fault((0.0, 0.0, 0.0, 0.0), -1.0, 1.0)
+    auto_exposure: float = _fault(0.0, 0.0, 10.0)
+    white_balance_drift: float = _fault(0.0, 0.0, 0.5)
+    vignetting: float = _fault(0.0, 0.0, 0.9)
+    jpeg_quality: float = _fault(0.0, 0.0, 100.0)
+    depth_scale_error: float = _fault(0.0, -0.2, 0.2)
+    depth_offset: float = _fault(0.0, -0.2, 0.2)
+    depth_bands: float = _fault(0.0, 0.0, 0.02)
+    depth_distortion: float = _fault(0.0, 0.0, 0.1)
+    flying_pixels: float = _fault(0.0, 0.0, 1.0)
+    multipath: float = _fault(0.0, 0.0, 0.95)
+    dropped_frames: float = _fault(0.0, 0.0, 0.8)
+    late_frames: float = _fault(0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value, usual = getattr(self, field.name), field.default
-            low, high = LIMITS[field.name]
+        for fault in fields(self):
+            value, usual = getattr(self, fault.name), fault.default
+            low, high = LIMITS[fault.name]
             size = len(usual) if isinstance(usual, tuple) else 1
             if np.size(value) != size or not np.all((np.asarray(value) >= low) & (np.asarray(value) <= high)):
                 what = "a number" if size == 1 else f"{size} numbers"
-                raise ConfigError(f"fault {field.name} is {value}; expected {what} from {low:g} to {high:g}")
+                raise ConfigError(f"fault {fault.name} is {value}; expected {what} from {low:g} to {high:g}")
 
     @property
     def T_depth_color(self) -> NDArray[np.float64]:
@@ -130,7 +113,8 @@ class SensorFaults:
     @property
     def color_is_separate(self) -> bool:
         """Whether colour is seen from another place, at another time or through another lens than depth."""
-        return any(np.any(getattr(self, name) != getattr(SensorFaults, name)) for name in SEPARATING)
+        separating = [fault for fault in fields(self) if fault.name.startswith("color_")]
+        return any(np.any(np.not_equal(getattr(self, fault.name), fault.default)) for fault in separating)
 
     def row_times(self, height: int, margin: int = 0) -> NDArray[np.float64]:
         """Exposure (H + 2 margin,) of the rows from -margin on relative to the stamp, seconds; H = ``height``."""
@@ -172,16 +156,8 @@ class SensorFaults:
         }
 
 
-SEPARATING = (
-    "color_translation",
-    "color_rotation_deg",
-    "color_focal_ratio",
-    "color_center_shift",
-    "color_delay",
-    "color_readout",
-    "color_distortion",
-)
-"""Faults that change from where, when or through which lens the colour camera sees the scene."""
+LIMITS: dict[str, tuple[float, float]] = {fault.name: fault.metadata["limits"] for fault in fields(SensorFaults)}
+"""Smallest and largest accepted value of every fault."""
 
 
 def parse_faults(assignments: Sequence[str], base: SensorFaults | None = None) -> SensorFaults:

@@ -5,6 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.lab.synthetic.scene import pose
+
 STEP = 0.01
 """Sampling interval of a path, seconds."""
 
@@ -67,13 +69,14 @@ class FloorPath:
 
     def at(self, t: float) -> tuple[NDArray[np.float64], float, float]:
         """Position (2,) in metres, heading in radians and covered distance in metres at time ``t``."""
-        x = float(np.interp(t, self.stamps, self.positions[:, 0]))
-        y = float(np.interp(t, self.stamps, self.positions[:, 1]))
-        return (
-            np.array([x, y]),
-            float(np.interp(t, self.stamps, self.yaws)),
-            float(np.interp(t, self.stamps, self.walked)),
-        )
+        columns = (self.positions[:, 0], self.positions[:, 1], self.yaws, self.walked)
+        x, y, yaw, walked = (float(np.interp(t, self.stamps, column)) for column in columns)
+        return np.array([x, y]), yaw, walked
+
+    def pose(self, t: float, height: float) -> NDArray[np.float64]:
+        """Pose (4, 4) of what stands at a height in metres and faces along the path, at time ``t``."""
+        position, yaw, _ = self.at(t)
+        return pose((*position, height), float(np.degrees(yaw)))
 
     def present(self, t: float) -> bool:
         """Whether the object exists at time ``t``."""

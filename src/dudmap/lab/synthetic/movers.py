@@ -78,6 +78,11 @@ class Staging:
         """Requested speed, else ``natural`` (m/s at life size) scaled to the scene."""
         return self.speed if self.speed is not None else natural * self.scene.mover_scale
 
+    def crossing(self, speed: float, entry_speed: float) -> FloorPath:
+        """Path along the walk line of the scene, m/s in the middle of the view and at its ends."""
+        line, inside = self.scene.walk_line, self.start_dynamic
+        return crossing(line, speed, self.duration, start_inside=inside, entry_speed=entry_speed)
+
 
 def person_on(
     path: FloorPath,
@@ -89,8 +94,7 @@ def person_on(
     """Person walking along a path; ``carrying`` is a function of time for the lift of the arms in [0, 1]."""
 
     def reference(t: float) -> Matrix:
-        position, yaw, _ = path.at(t)
-        return pose((*position, ground), float(np.degrees(yaw)))
+        return path.pose(t, ground)
 
     def parts(t: float) -> Matrix:
         return figure.poses(reference(t), path.at(t)[2], carrying(t))
@@ -127,13 +131,9 @@ def _figure(staging: Staging, outfit: int, speed: float) -> Figure:
 def _walker(staging: Staging, outfit: int, shift: float, reverse: bool, delay: float) -> SyntheticMover:
     scene, speed = staging.scene, staging.pace(1.2)
     path = crossing(
-        shifted(scene.walk_line, shift * scene.mover_scale, reverse),
-        speed,
-        staging.duration,
-        enter=1.0 + delay,
-        start_inside=staging.start_dynamic,
-        entry_speed=1.2 * scene.mover_scale,
-    )
+        shifted(scene.walk_line, shift * scene.mover_scale, reverse), speed, staging.duration,
+        enter=1.0 + delay, start_inside=staging.start_dynamic, entry_speed=1.2 * scene.mover_scale,
+    )  # fmt: skip
     return person_on(path, _figure(staging, outfit, speed), scene.ground)
 
 
@@ -210,12 +210,10 @@ def _carrier(staging: Staging, put_down: bool) -> list[SyntheticMover]:
 def _ball(staging: Staging) -> list[SyntheticMover]:
     scene, size = staging.scene, staging.scene.mover_scale
     radius, speed = 0.2 * size, staging.pace(0.8)
-    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=speed)
+    path = staging.crossing(speed, speed)
 
     def reference(t: float) -> Matrix:
-        position, yaw, walked = path.at(t)
-        rolled = pose((*position, scene.ground + radius), float(np.degrees(yaw)))
-        return rolled @ pose(pitch=float(np.degrees(walked / radius)))
+        return path.pose(t, scene.ground + radius) @ pose(pitch=float(np.degrees(path.at(t)[2] / radius)))
 
     skin = Material("checks", (1.5 / size, 1.5 / size), tint=(1.2, 0.7, 0.5))
     return [rigid("ball", [ellipsoid((0, 0, 0), (radius,) * 3, skin)], reference, path.present)]
@@ -224,7 +222,7 @@ def _ball(staging: Staging) -> list[SyntheticMover]:
 def _balloon(staging: Staging) -> list[SyntheticMover]:
     scene, size = staging.scene, staging.scene.mover_scale
     speed = staging.pace(0.4)
-    path = crossing(scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=1.0)
+    path = staging.crossing(speed, 1.0)
 
     def reference(t: float) -> Matrix:
         position, _, _ = path.at(t)
@@ -251,20 +249,13 @@ def _cart_solids(size: float) -> list[Primitive]:
 
 
 def _cart(path: FloorPath, scene: Scene, name: str) -> SyntheticMover:
-    def reference(t: float) -> Matrix:
-        position, yaw, _ = path.at(t)
-        return pose((*position, scene.ground), float(np.degrees(yaw)))
-
-    return rigid(name, _cart_solids(scene.mover_scale), reference, path.present)
+    return rigid(name, _cart_solids(scene.mover_scale), lambda t: path.pose(t, scene.ground), path.present)
 
 
 def _creeper(staging: Staging) -> list[SyntheticMover]:
     """Cart that enters quickly and then crosses the view at 5 cm/s."""
     speed = staging.pace(0.05)
-    quick = max(speed, 1.0 * staging.scene.mover_scale)
-    path = crossing(
-        staging.scene.walk_line, speed, staging.duration, start_inside=staging.start_dynamic, entry_speed=quick
-    )
+    path = staging.crossing(speed, max(speed, staging.scene.mover_scale))
     return [_cart(path, staging.scene, "creeper")]
 
 

@@ -40,7 +40,7 @@ def _tremor(rng: np.random.Generator, times: Array, size: float) -> Array:
     return size * np.sin(2 * np.pi * frequency * times[:, None, None] + phase).sum(axis=2) / np.sqrt(2.0)
 
 
-def _aimed(scene: Scene, positions: Array, targets: Array) -> Array:
+def _aimed(positions: Array, targets: Array) -> Array:
     """Camera poses (N, 4, 4) at positions (N, 3) looking at targets (N, 3)."""
     return np.stack([look_at(eye, target) for eye, target in zip(positions, targets, strict=True)])
 
@@ -71,12 +71,31 @@ def handheld(
     """Hand-held camera aimed at the target: mean speed in m/s (at life size), mean rotation rate in degrees/s."""
     shift = _within(scene, _wander(rng, times, speed * max(scene.mover_scale, 0.3), quick))
     shift += _tremor(rng, times, 0.0005 * tremor * scene.mover_scale)
-    Ts = _aimed(scene, scene.home[:3, 3] + shift, np.tile(scene.target, (len(times), 1)))
+    Ts = _aimed(scene.home[:3, 3] + shift, np.tile(scene.target, (len(times), 1)))
     step = float(np.median(np.diff(times))) if len(times) > 1 else 1.0
     own = np.mean([se3.rotation_angle(se3.inverse(a) @ b) for a, b in pairwise(Ts)] or [0.0]) / step
     left = np.sqrt(max(np.radians(turn) ** 2 - own**2, np.radians(0.35 * turn) ** 2))
     swing = _wander(rng, times, left, quick) * (0.7, 1.0, 0.5)
     return _shaken(Ts, swing + _tremor(rng, times, np.radians(0.04) * tremor))
+
+
+def _turned(offset: Array, angle: Array) -> Array:
+    """Offset (3,) rotated about the vertical by angles (N,) in radians, as (N, 3)."""
+    c, s = np.cos(angle), np.sin(angle)
+    return np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1)
+
+
+def _at_target(scene: Scene, rng: np.random.Generator, times: Array, eyes: Array, tremor_deg: float = 0.04) -> Array:
+    """Poses at eyes (N, 3) aimed at the target of the scene, with a tremor of the hand."""
+    Ts = _aimed(eyes, np.tile(scene.target, (len(times), 1)))
+    return _shaken(Ts, _tremor(rng, times, np.radians(tremor_deg)))
+
+
+def _turning(scene: Scene, rng: np.random.Generator, times: Array, angle: Array, speed: float) -> Array:
+    """Camera near home, at a mean speed in m/s (at life size), turned from the target by angles (N,) in radians."""
+    aims = _turned(scene.target - scene.home[:3, 3], angle)
+    eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, speed * scene.mover_scale))
+    return _shaken(_aimed(eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
 
 
 def _still(scene: Scene, times: Array) -> Array:
@@ -85,43 +104,26 @@ def _still(scene: Scene, times: Array) -> Array:
 
 def _pan(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     """Rotation about the vertical, 40 degrees to either side at 20 degrees per second on average."""
-    offset = scene.target - scene.home[:3, 3]
-    angle = np.radians(40.0) * np.sin(2 * np.pi * times / 8.0)
-    c, s = np.cos(angle), np.sin(angle)
-    aims = np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1)
-    eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, 0.03 * scene.mover_scale))
-    return _shaken(_aimed(scene, eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
+    return _turning(scene, rng, times, np.radians(40.0) * np.sin(2 * np.pi * times / 8.0), 0.03)
+
+
+def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
+    """Rotation by 405 degrees about the vertical, so that the last frames show the first view again."""
+    return _turning(scene, rng, times, np.radians(405.0) * (times / max(times[-1], 1e-9)), 0.1)
 
 
 def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     """Motion around the target on an arc of 30 degrees to either side."""
-    target = np.asarray(scene.target)
-    offset = scene.home[:3, 3] - target
-    angle = np.radians(30.0) * np.sin(2 * np.pi * times / 20.0)
-    c, s = np.cos(angle), np.sin(angle)
-    around = np.stack(
-        [c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1
-    )
-    eyes = scene.home[:3, 3] + _within(scene, target + around - scene.home[:3, 3])
-    return _shaken(_aimed(scene, eyes, np.tile(target, (len(times), 1))), _tremor(rng, times, np.radians(0.04)))
+    home, target = scene.home[:3, 3], np.asarray(scene.target)
+    around = _turned(home - target, np.radians(30.0) * np.sin(2 * np.pi * times / 20.0))
+    return _at_target(scene, rng, times, home + _within(scene, target + around - home))
 
 
 def _dolly(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     """Motion towards the target and back, at most 0.3 m/s."""
     ahead = scene.home[:3, 2] * scene.mover_scale * 0.5 * np.sin(0.6 * times)[:, None]
     eyes = scene.home[:3, 3] + _within(scene, ahead + _wander(rng, times, 0.05 * scene.mover_scale))
-    return _shaken(_aimed(scene, eyes, np.tile(scene.target, (len(times), 1))), _tremor(rng, times, np.radians(0.06)))
-
-
-def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Rotation by 405 degrees about the vertical, so that the last frames show the first view again."""
-    share = times / max(times[-1], 1e-9)
-    angle = np.radians(405.0) * share
-    offset = scene.target - scene.home[:3, 3]
-    c, s = np.cos(angle), np.sin(angle)
-    aims = np.stack([c * offset[0] - s * offset[1], s * offset[0] + c * offset[1], np.full_like(c, offset[2])], axis=1)
-    eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, 0.1 * scene.mover_scale))
-    return _shaken(_aimed(scene, eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
+    return _at_target(scene, rng, times, eyes, 0.06)
 
 
 def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: SyntheticMover) -> Array:
@@ -135,7 +137,7 @@ def follow(scene: Scene, rng: np.random.Generator, times: Array, mover: Syntheti
     weights = np.exp(-np.arange(0.0, 1.2, 0.05) / 0.3)
     aims = np.stack([sum(w * aim(t - 0.05 * k) for k, w in enumerate(weights)) / weights.sum() for t in times])
     eyes = scene.home[:3, 3] + _within(scene, _wander(rng, times, 0.12 * scene.mover_scale))
-    return _shaken(_aimed(scene, eyes, aims), _tremor(rng, times, np.radians(0.05)))
+    return _shaken(_aimed(eyes, aims), _tremor(rng, times, np.radians(0.05)))
 
 
 PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {

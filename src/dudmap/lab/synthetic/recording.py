@@ -149,18 +149,10 @@ class SyntheticSequence:
     def static_twin(self) -> "SyntheticSequence":
         """Recording with the same camera path and sensor noise, but without movers."""
         return SyntheticSequence(
-            self.scene,
-            [],
-            self.ground_truth,
-            self.camera,
-            noise=self._noise,
-            seed=self._seed,
-            fps=self._fps,
-            motion_blur=self._motion_blur,
-            exposure_change=self._exposure_change,
-            faults=self.faults,
-            parameters=self.parameters | {"movers": []},
-        )
+            self.scene, [], self.ground_truth, self.camera,
+            noise=self._noise, seed=self._seed, fps=self._fps, motion_blur=self._motion_blur,
+            exposure_change=self._exposure_change, faults=self.faults, parameters=self.parameters | {"movers": []},
+        )  # fmt: skip
 
     def mover_numbers(self, index: int) -> NDArray[np.int16]:
         """Identity (H, W) of the mover that a pixel shows, 0 for none; includes movers at rest."""

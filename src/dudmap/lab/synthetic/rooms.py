@@ -5,17 +5,15 @@ other measures, and a material of the scene or of the furniture. A row with ``re
 several, each with one of these numbers in place of every "*".
 """
 
-import tomllib
 from collections.abc import Iterator
 from dataclasses import replace
-from functools import cache
-from importlib.resources import files
 from typing import Any
 
 import numpy as np
 
 from dudmap.errors import ConfigError
 from dudmap.lab.synthetic import furniture
+from dudmap.lab.synthetic.data import tables
 from dudmap.lab.synthetic.scene import (
     Light,
     Material,
@@ -38,12 +36,7 @@ MAKERS: dict[str, Any] = {
 """Functions that make a solid, or a list of them, from the values of a row."""
 
 
-@cache
-def _tables() -> dict[str, dict[str, Any]]:
-    return tomllib.loads(files("dudmap.lab.synthetic").joinpath("scenes.toml").read_text(encoding="utf-8"))
-
-
-SCENES = tuple(_tables())
+SCENES = tuple(tables("scenes.toml"))
 """Names of the scenes."""
 
 
@@ -55,30 +48,22 @@ def build_scene(name: str) -> Scene:
     """
     if name not in SCENES:
         raise ConfigError(f"unknown scene {name!r}; known scenes: {', '.join(SCENES)}")
-    table = dict(_tables()[name])
+    table = dict(tables("scenes.toml")[name])
     if "painted" in table:
         scene = build_scene(table["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]
         solids = [replace(p, material=paint) for p, paint in zip(scene.primitives, plain, strict=True)]
         return replace(scene, name=name, primitives=solids)
-    materials = furniture.MATERIALS | {
-        key: Material(**{name: _fixed(value) for name, value in row.items()})
-        for key, row in table.pop("materials").items()
-    }
+    materials = furniture.MATERIALS | {key: Material(**row) for key, row in table.pop("materials").items()}
     return Scene(
         name=name,
         primitives=[solid for row in table.pop("solids") for solid in _solids(row, materials)],
         home=look_at(**table.pop("home")),
         rest=pose(**table.pop("rest")),
         hinge=pose(**table.pop("hinge")),
-        lights=tuple(Light(_fixed(light.pop("position")), **light) for light in map(dict, table.pop("lights"))),
-        **{key: _fixed(value) for key, value in table.items()},
+        lights=tuple(Light(**light) for light in table.pop("lights")),
+        **table,
     )
-
-
-def _fixed(value: Any) -> Any:  # noqa: ANN401 - any value of a TOML file
-    """Value with tuples in place of lists."""
-    return tuple(map(_fixed, value)) if isinstance(value, list) else value
 
 
 def _solids(row: dict[str, Any], materials: dict[str, Material]) -> Iterator[Primitive]:
@@ -86,7 +71,7 @@ def _solids(row: dict[str, Any], materials: dict[str, Material]) -> Iterator[Pri
     row = dict(row)
     for number in np.arange(*row.pop("repeat")) if "repeat" in row else (None,):
         values = [
-            [number if x == "*" else x for x in value] if isinstance(value, list) else value for value in row.values()
+            [number if x == "*" else x for x in value] if isinstance(value, tuple) else value for value in row.values()
         ]
         kind, *keys = row
         named = dict(zip(keys, values[1:], strict=True))

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
+from dudmap.lab.synthetic.data import tables
 from dudmap.lab.synthetic.kernels import depth_noise as kernels
 from dudmap.lab.synthetic.render import Rendering, over_rows
 
@@ -96,26 +98,12 @@ class TimeOfFlightModel:
         return np.array([*numbers, self.grazing, self.edge_loss, self.speckle])
 
 
-SENSORS: dict[str, SensorModel | TimeOfFlightModel | None] = {
-    "kinect": SensorModel(0.075, 1.425e-3, 1 / 8, 0.35, 0.5, 4.5, 7.0, 0, 0.20, 0.35, 0.002, 1.2, 2.0),
-    "realsense": SensorModel(0.050, 1.9e-3, 1 / 32, 0.6, 0.3, 5.0, 9.0, 2, 0.12, 0.15, 0.004, 2.5, 2.5),
-    "none": None,
-    # Grunnet-Jepsen et al. 2018, Best-known methods for tuning RealSense D400: sigma_z = z^2 subpixel / (f b) with a
-    # subpixel error of 0.08 (cited), f = 848 px / (2 tan 45 deg) = 424 px (view of 90 degrees at 848 px, and disparity
-    # steps of 1/32 px: Grunnet-Jepsen et al. 2019, Subpixel linearity improvement, read), b = 50 mm: 3.8 mm at 1 m.
-    # Range from the D400 datasheet, cited.
-    # Correlation, fattening and losses as of "realsense".
-    "d435": SensorModel(0.050, 3.8e-3, 1 / 32, 0.6, 0.3, 4.0, 9.0, 2, 0.12, 0.15, 0.004, 2.5, 2.5),
-    # Fankhauser et al. 2015, Kinect v2 for mobile robot navigation: axial noise 1.5 - 0.5 z + 0.3 z^2 mm plus the slant
-    # term with 0.1 mm. Range from the manufacturer; lateral noise, losses and correlation assumed.
-    "kinect_v2": TimeOfFlightModel((1.5e-3, -0.5e-3, 0.3e-3), 0.1e-3, 0.4, 0.5, 4.5, 6.0, 0.1, 0.3, 0.003, 0.8, 2.0),
-    # Intel, LiDAR Camera L515 datasheet (2021): standard deviation 2.5 mm at 1 m and 15.5 mm at 9 m, taken as linear;
-    # range 0.25 to 9 m. The rest assumed.
-    "l515": TimeOfFlightModel((0.9e-3, 1.6e-3, 0.0), 0.1e-3, 0.4, 0.25, 6.0, 9.0, 0.15, 0.4, 0.005, 0.8, 2.0),
-    # Baruch et al. 2021, ARKitScenes: depth of 256 x 192 pixels; Luetzenburg et al. 2021: about 1 cm, range 5 m. How
-    # the 1 cm divides into noise (0.3 %, smooth over several pixels by the upsampling) and bias is assumed.
-    "iphone": TimeOfFlightModel((2e-3, 3e-3, 0.0), 0.1e-3, 0.8, 0.2, 4.0, 5.0, 0.05, 0.0, 0.0, 3.0, 1.5, 256),
-}
+def _model(row: dict[str, Any]) -> SensorModel | TimeOfFlightModel | None:
+    return None if not row else TimeOfFlightModel(**row) if "noise" in row else SensorModel(**row)
+
+
+SENSORS = {name: _model(row) for name, row in tables("sensors.toml")["noise"].items()}
+"""Noise models by name; None is an ideal sensor. ``sensors.toml`` has the values and their sources."""
 
 
 class Sensor:

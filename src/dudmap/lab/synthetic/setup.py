@@ -121,18 +121,10 @@ def sequence(
         "exposure_change": exposure_change,
     }
     return SyntheticSequence(
-        world,
-        actors,
-        ground_truth,
-        camera,
-        noise=noise,
-        seed=seed,
-        fps=fps,
-        motion_blur=motion_blur,
-        exposure_change=exposure_change,
-        faults=faults,
+        world, actors, ground_truth, camera,
+        noise=noise, seed=seed, fps=fps, motion_blur=motion_blur, exposure_change=exposure_change, faults=faults,
         parameters=parameters,
-    )
+    )  # fmt: skip
 
 
 def _check(name: str, value: float, low: float, high: float) -> None:

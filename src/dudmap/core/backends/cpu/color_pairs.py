@@ -7,7 +7,7 @@ from dudmap.core.formulas.pixel import elements, rotate, sigma, transform
 
 f32 = np.float32
 UNKNOWNS = 21
-SHARED = 13
+SHARED, POSE = 13, 6
 """Parameters of the calibration (13), relative pose as a twist (6), gain and offset of the intensities (2)."""
 MARGIN = f32(8)
 """Border of the colour images that is not used, pixels: twice the wider Gaussian of their filter."""
@@ -48,7 +48,7 @@ def _central(image, u, v):
     return value, du, dv
 
 
-@kernel
+@scalar
 def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, z, D):
     """Intensity that a colour image gives a point of its depth camera, and how the point moves in it.
 
@@ -122,7 +122,7 @@ def _color(image, place, twist, intrinsics, lens, scale, offset, readout, x, y, 
     return value, gu, gv
 
 
-@kernel
+@scalar
 def _across_surface(D, tangents, T):
     """Derivatives (2 x 2, row by row) of a pixel by a step along two tangents of the surface, turned by ``T``."""
     a, b, c = rotate(T, tangents[0], tangents[1], tangents[2])
@@ -133,10 +133,19 @@ def _across_surface(D, tangents, T):
     )  # fmt: skip
 
 
-@kernel
+@scalar
+def _product(a, b, count):
+    """Sum of the products of the first ``count`` elements."""
+    total = f32(0)
+    for n in range(count):
+        total += a[n] * b[n]
+    return total
+
+
+@scalar
 def linearize_pair(
     points, tangents, T, depth, depth_intrinsics, first, second, first_twist, second_twist, first_offset, second_offset,
-    place, intrinsics, lens, scale, readout, gain, bias, step, noise, by_color, by_depth, huber, residuals, H, b,
+    place, intrinsics, lens, scale, readout, gain, bias, step, noise, by_color, by_depth, huber, begin, residuals, H, b,
 ):  # fmt: skip
     """Normal equations of the differences between two frames at the points of the first.
 
@@ -162,6 +171,7 @@ def linearize_pair(
         by_color: Reciprocal standard deviation of the intensity difference.
         by_depth: Reciprocal standard deviation of the depth difference in units of ``noise``.
         huber: Constant of the robust weight, standard deviations.
+        begin: First unknown that is wanted: 0, or SHARED for a calibration that is known; what is before it stays 0.
         residuals: (2, n) float32 out: intensity difference, depth difference over ``noise``; NaN where there is none.
         H: (UNKNOWNS, UNKNOWNS) float64 out.
         b: (UNKNOWNS,) float64 out, gradient.
@@ -171,7 +181,11 @@ def linearize_pair(
     h, w = depth.shape
     fx, fy, cx, cy = depth_intrinsics[0], depth_intrinsics[1], depth_intrinsics[2], depth_intrinsics[3]
     J, one, two = np.zeros(UNKNOWNS, f32), np.zeros((2, 16), f32), np.zeros((2, 16), f32)
-    H[:], b[:] = 0.0, 0.0
+    # derivatives and, last, residuals of all points times the root of their weights, unknown by unknown: sums of
+    # products over the points are vectorised, those over the unknowns of a point are not
+    of_color = np.empty((UNKNOWNS + 1, points.shape[0]), f32)
+    of_depth = np.empty((POSE + 1, points.shape[0]), f32)
+    colored, measured = 0, 0
     nan, half = f32(np.nan), f32(0.5)
     for n in range(points.shape[0]):
         residuals[0, n], residuals[1, n] = nan, nan
@@ -201,10 +215,11 @@ def linearize_pair(
         weight = huber / max(abs(r), huber)
         J[13], J[14], J[15] = sx, sy, sz
         J[16], J[17], J[18] = y * sz - z * sy, z * sx - x * sz, x * sy - y * sx
-        for k in range(SHARED, SHARED + 6):
-            for m in range(SHARED, k + 1):
-                H[k, m] += weight * scaled * scaled * J[k] * J[m]
-            b[k] += weight * scaled * J[k] * r
+        root = np.sqrt(weight)
+        for k in range(POSE):
+            of_depth[k, measured] = root * scaled * J[SHARED + k]
+        of_depth[POSE, measured] = root * r
+        measured += 1
         before, fu, fv = _color(first, place, first_twist, intrinsics, lens, scale, first_offset, readout, X, Y, Z, one)
         after, gu, gv = _color(
             second, place, second_twist, intrinsics, lens, scale, second_offset, readout, x, y, z, two
@@ -227,8 +242,8 @@ def linearize_pair(
         difference = after - gain * before - bias
         residuals[0, n] = difference
         r = difference * by_color
-        weight = huber / max(abs(r), huber) * by_color * by_color
-        for k in range(SHARED):
+        root = np.sqrt(huber / max(abs(r), huber)) * by_color
+        for k in range(begin, SHARED):
             J[k] = gu * (two[0, k] - a0 * one[0, k] - a1 * one[1, k]) + gv * (
                 two[1, k] - a2 * one[0, k] - a3 * one[1, k]
             )
@@ -236,11 +251,53 @@ def linearize_pair(
             J[k] = gu * two[0, k] + gv * two[1, k]
         J[16], J[17], J[18] = y * J[15] - z * J[14], z * J[13] - x * J[15], x * J[14] - y * J[13]
         J[19], J[20] = -before, f32(-1)
-        for k in range(UNKNOWNS):
-            part = weight * J[k]
-            for m in range(k + 1):
-                H[k, m] += part * J[m]
-            b[k] += part * difference
+        for k in range(begin, UNKNOWNS):
+            of_color[k, colored] = root * J[k]
+        of_color[UNKNOWNS, colored] = root * difference
+        colored += 1
+    H[:], b[:] = 0.0, 0.0
+    for k in range(begin, UNKNOWNS):
+        b[k] = _product(of_color[k], of_color[UNKNOWNS], colored)
+        for m in range(begin, k + 1):
+            H[k, m] = _product(of_color[k], of_color[m], colored)
+    for k in range(POSE):
+        b[SHARED + k] += _product(of_depth[k], of_depth[POSE], measured)
+        for m in range(k + 1):
+            H[SHARED + k, SHARED + m] += _product(of_depth[k], of_depth[m], measured)
     for k in range(UNKNOWNS):
         for m in range(k):
             H[m, k] = H[k, m]
+
+
+@kernel
+def linearize_pairs(
+    pairs, starts, points, tangents, Ts, depths, depth_intrinsics, images, twists, offsets, place, intrinsics, lens,
+    scale, readout, lights, step, noise, by_color, by_depth, huber, begin, residual_starts, residuals, Hs, bs,
+):  # fmt: skip
+    """``linearize_pair`` of several pairs of frames.
+
+    Args:
+        pairs: (P, 2) int64, numbers of the first and the second frame of each.
+        starts: (F + 1,) int64, where the points of each frame begin in ``points`` and ``tangents``.
+        points, tangents: (n, 3) and (n, 6) float32 of all F frames.
+        Ts: (P, 3, 4) float32.
+        depths: (F, h, w) float32.
+        images: (F, h, w) float32.
+        twists, offsets: (F, 6) and (F,) float32, motion and delay of the middle row of the colour image of each frame.
+        lights: (P, 2) float32, gain and bias.
+        residual_starts: (P + 1,) int64, where the residuals of each pair begin.
+        residuals: (2, r) float32 out.
+        Hs: (P, UNKNOWNS, UNKNOWNS) float64 out.
+        bs: (P, UNKNOWNS) float64 out.
+
+    The others are as for ``linearize_pair``.
+    """
+    for n in range(len(pairs)):
+        first, second = pairs[n, 0], pairs[n, 1]
+        own = slice(starts[first], starts[first + 1])
+        linearize_pair(
+            points[own], tangents[own], Ts[n], depths[second], depth_intrinsics, images[first], images[second],
+            twists[first], twists[second], offsets[first], offsets[second], place, intrinsics, lens, scale, readout,
+            lights[n, 0], lights[n, 1], step, noise, by_color, by_depth, huber, begin,
+            residuals[:, residual_starts[n] : residual_starts[n + 1]], Hs[n], bs[n],
+        )  # fmt: skip

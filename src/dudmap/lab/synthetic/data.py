@@ -1,0 +1,18 @@
+"""Data files of this package."""
+
+import tomllib
+from functools import cache
+from importlib.resources import files
+from typing import Any
+
+
+@cache
+def tables(name: str) -> dict[str, Any]:
+    """Tables of a TOML file of this package, with tuples in place of its lists; do not change them."""
+    return _fixed(tomllib.loads(files("dudmap.lab.synthetic").joinpath(name).read_text(encoding="utf-8")))
+
+
+def _fixed(value: Any) -> Any:  # noqa: ANN401 - any value of a TOML file
+    if isinstance(value, dict):
+        return {key: _fixed(one) for key, one in value.items()}
+    return tuple(map(_fixed, value)) if isinstance(value, list) else value
