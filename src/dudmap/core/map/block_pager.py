@@ -13,10 +13,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.map import morton
+from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of
 from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
-from dudmap.core.map.region_store import RegionStore
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+from dudmap.core.scratch_store import ScratchStore
 
 REGION_BITS = 4
 REGION = 1 << REGION_BITS
@@ -60,7 +61,7 @@ class BlockPager:
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
         self.failure = ""
-        self._store: RegionStore | None = None
+        self._store: ScratchStore | None = None
         self._executor: ThreadPoolExecutor | None = None
         self._next_serial = 0
         self.clear()
@@ -195,7 +196,11 @@ class BlockPager:
     def _read(self, region: Region) -> BlockRecords:
         if self._archive is not None and region in self._archived:
             return self._archive(region)
-        return self._stored.read(region)
+        parts = self._stored.read(str(region))
+        return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
+
+    def _write(self, region: Region, records: BlockRecords) -> None:
+        self._stored.write(str(region), [blob for level in blobs_of(records) for blob in level])
 
     def _make_room(
         self,
@@ -264,7 +269,7 @@ class BlockPager:
             if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
                 del self._writing[pending]
         records = blocks.records(entries)
-        self._writing[region] = records, self._submit(self._stored.write, region, records)
+        self._writing[region] = records, self._submit(self._write, region, records)
 
     def _settle(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
         """Forget what has been written; take back what could not be."""
@@ -280,9 +285,9 @@ class BlockPager:
                 self.failure = ""
 
     @property
-    def _stored(self) -> RegionStore:
+    def _stored(self) -> ScratchStore:
         if self._store is None:
-            self._store = RegionStore()
+            self._store = ScratchStore("blocks of the map")
         return self._store
 
     def _submit(self, work, *arguments) -> Future:  # noqa: ANN001, ANN002 - as of Executor.submit
