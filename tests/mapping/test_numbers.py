@@ -105,7 +105,7 @@ def test_merged_sums_of_many_maps_saturate(maps, steps, weight, shade):
         maps * weight * shade * one, maps * weight * one, maps * weight * 1020 * np.ones((1, 512, 3), np.int64),
         np.zeros(1, np.int64),
     )  # fmt: skip
-    out = fused(sums, MAX_STEPS, 64, 4)
+    out = fused(sums, MAX_STEPS, 64, 2**40)  # never free space
     found = unpacked(out.geometry[0, 0])
     assert found == (np.clip(steps, -MAX_STEPS, MAX_STEPS), min(maps * weight, MAX_COUNT), shade)
     assert (out.colors[0, 0] >> 20) & 0x3FF == 1020
