@@ -11,6 +11,7 @@ from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.system import restore, take_snapshot
 from dudmap.core.geometry import se3
 from dudmap.core.map.block_pager import MAX_PENDING, REGION, BlockPager
+from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.incremental_mesh import IncrementalMesh
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
@@ -186,7 +187,7 @@ def scattered(*starts):
     blocks = VoxelBlocks()
     coords = np.array([(start + REGION * n, 0, 0) for start in starts for n in range(20)], np.int32)
     blocks.allocate(blocks.entries_at(coords, len(coords)), 1)
-    return blocks
+    return BlockTree(blocks, ())
 
 
 def seen(pager, blocks, start):

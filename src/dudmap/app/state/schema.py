@@ -36,9 +36,9 @@ core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level co
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
 core.geometry.lens:Lens core.geometry.mesh:Mesh core.geometry.other_view:OtherView core.geometry.trajectory:Trajectory
-core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:_Away,BlockPager core.map.block_tree:BlockTree
+core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager core.map.block_tree:BlockTree
 core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks core.map.incremental_mesh:IncrementalMesh
-core.map.integrator:StorageScale,Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
+core.map.integrator:Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
 core.map.paged_map:PagedMap core.map.refinement:Refinement
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
 core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectFusion
@@ -65,7 +65,7 @@ core.tracking.tracker:TrackingResult,Minimum,Tracker
 NOT_STORED = {
     "Atlas": ("make_volume",),
     "BlockPager": (
-        "_store", "_executor", "_away", "_writing", "_reading", "_unchanged_since", "_serial", "_archived", "_archive",
+        "_store", "_executor", "_away", "_writing", "_reading", "_returned", "_archived", "_archive",
     ),
     "FrameStore": ("registered", "_first_own", "_file", "_encoder", "_pending", "archived"),
     "KeyframeDatabase": ("_sift",),
