@@ -51,7 +51,7 @@ core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
 core.places.loop_correction:LoopCorrector core.places.loop_verification:LoopQuery,LoopVerifier
 core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge
-core.places.prior_map:PriorMap core.places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews
+core.places.prior_map:PriorMap core.places.redundancy:SimilarityTest,_Place,RedundantViews
 core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap core.result:FrameResult
 core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
 core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
