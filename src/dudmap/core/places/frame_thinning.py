@@ -61,7 +61,7 @@ class FrameThinning:
     def thin(self) -> None:
         """Test a few frames if one was stored since the last call; call it with every frame."""
         history = self.atlas.history
-        if history is None or len(history) <= UNTOUCHED or self.atlas.rebuildings:
+        if history is None or len(history) <= UNTOUCHED or self.atlas.rebuildings or self.atlas.repainting:
             return
         if history.serials[-1] == self._newest:
             return
