@@ -41,7 +41,6 @@ def run(
     ahead: int = AHEAD,
     live: bool = False,
     passes: int = 1,
-    depth_model: str | Path | None = None,
     calibration: "Calibration | None" = None,
     calibrate: bool = False,
     saved_map: "SavedMap | None" = None,
@@ -81,7 +80,6 @@ def run(
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
-        depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         calibration: Of the colour camera; None takes that of the recording.
         calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
@@ -100,7 +98,6 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.app.pipeline.calibration import calibrate_start
-    from dudmap.core.calibration.depth_model import DepthModel
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -123,13 +120,12 @@ def run(
     map_folder = None if saved_map is None else saved_map.folder
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
-        live=live, passes=passes, depth_model=_resolved(depth_model), saved_map=_resolved(map_folder),
+        live=live, passes=passes, saved_map=_resolved(map_folder),
         localize=localize, max_memory=max_memory, storing=storing,
     )  # fmt: skip
     with locked(out):
         display = RunProgress(count * passes, bar=progress)
         job = Job(sequence, out, options, display, open_masks(masks, sequence), observers)
-        model = None if depth_model is None else DepthModel.load(Path(depth_model))
         prepare_run_folder(out, masks, save_masks=save_masks)
         store = None
         if storing is not None:
@@ -138,9 +134,9 @@ def run(
         if calibrate:
             calibration = calibrate_start(sequence, config, count, display.note if progress else None)
         calibration = calibration or sequence.calibration
-        slam = job.system(depth_model=model, calibration=calibration, live=live, saved_map=saved_map, localize=localize)
+        slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
         record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
-        state = RunState(slam, record, calibration, model)
+        state = RunState(slam, record, calibration)
         if store is not None:
             store.begin(state)
         return job.carry_out(state, store)
@@ -259,7 +255,7 @@ class Job:
 
     def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
         """A new system with what is known of the camera; for a second pass with the first."""
-        return self.system(first_pass=first_pass, depth_model=state.model, calibration=state.calibration)
+        return self.system(first_pass=first_pass, calibration=state.calibration)
 
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "checks.csv", "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz",
+    "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
     "merge.json", "report.html",
 )  # fmt: skip
 SCORES = (
@@ -188,10 +188,6 @@ def write_run_folder(
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
-    if config.sensor.distortion:
-        model = slam.learnt_depth_model()
-        metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
-        steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:
         steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
     problems = []

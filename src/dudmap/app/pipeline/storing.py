@@ -24,7 +24,6 @@ from dudmap.own_folder import remove_files
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dudmap.core.calibration.depth_model import DepthModel
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.slam import Slam
@@ -62,7 +61,6 @@ class RunOptions(BaseModel):
     ahead: int = AHEAD
     live: bool = False
     passes: int = 1
-    depth_model: Path | None = None
     saved_map: Path | None = None
     localize: bool = False
     max_memory: int | None = None
@@ -92,7 +90,7 @@ class RunState:
 
     Attributes:
         slam, record: The system and the metrics of the pass that goes on.
-        calibration, model: Of the camera, as given.
+        calibration: Of the camera, as given.
         number: Number of the pass, from 0.
         next: Number of the frame that comes next.
         first_slam, first_record: System and metrics of the first pass, during the second.
@@ -101,7 +99,6 @@ class RunState:
     slam: "Slam"
     record: RunRecord
     calibration: "Calibration | None" = None
-    model: "DepthModel | None" = None
     number: int = 0
     next: int = 0
     first_slam: "Slam | None" = None

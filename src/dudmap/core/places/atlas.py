@@ -290,7 +290,7 @@ class Atlas:
         """Set new poses of the stored frames of the current submap, and replace its map.
 
         Trajectory and keyframes receive the correction interpolated in time between the stored frames; one that was
-        removed has that of the frame that shows its place now.
+        removed has that of the frame that replaces it.
 
         Args:
             nodes: Numbers of all stored frames of the submap, in order of time.
