@@ -76,14 +76,14 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "state.db"
         database = StateDatabase(path)
-        snapshot, wall, cpu = timed(take_snapshot, state.tree(), database)
+        snapshot, wall, cpu = timed(take_snapshot, state, database)
         print(f"whole snapshot:   {1000 * wall:7.1f} ms in the way of the frames ({1000 * cpu:.1f} ms processor)")
         _, wall, cpu = timed(database.write, snapshot, {})
         print(f"whole write:      {1000 * wall:7.1f} ms in the background ({1000 * cpu:.1f} ms processor)")
         del snapshot
         for frame in frames:
             state.slam.process(frame)
-        snapshot, wall, cpu = timed(take_snapshot, state.tree(), database)
+        snapshot, wall, cpu = timed(take_snapshot, state, database)
         changed = sum(len(one.slots) for one in snapshot.maps)
         print(f"next snapshot:    {1000 * wall:7.1f} ms in the way of the frames ({1000 * cpu:.1f} ms processor), "
               f"{changed} changed blocks")  # fmt: skip
@@ -103,8 +103,7 @@ def main() -> None:
 
         def go_on() -> RunState:
             reader, again = StateReader(path), StateDatabase(path)
-            current = {"slam": Slam(CAMERA, state.slam.config), "record": RunRecord()}
-            return RunState.of_tree(restore(reader, current, again))
+            return restore(reader, RunState(Slam(CAMERA, state.slam.config), RunRecord()), again)
 
         found, wall, cpu = timed(go_on)
         assert len(found.slam.atlas.poses) == len(state.slam.atlas.poses)

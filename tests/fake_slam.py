@@ -75,7 +75,6 @@ class FakeSlam:
         camera,
         config,
         first_pass=None,
-        depth_model=None,
         calibration=None,
         live=False,
         saved_map=None,

@@ -1,4 +1,7 @@
-"""Files that are either written completely or not at all."""
+"""Files that are either written completely or not at all.
+
+What cannot be written is an ``OSError`` with the name of the file that was asked for.
+"""
 
 import errno
 import os
@@ -26,9 +29,6 @@ def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> It
         path: The file.
         sync: Wait until the file and its name are on the disk. Without it a power cut may lose the file, also the old.
         own: The folder of the file is one that dudmap made itself, and must be no link.
-
-    Raises:
-        OSError: The file cannot be written; ``filename`` is that of ``path``.
     """
     with _unfinished(Path(path), sync, own) as (_, number), open(number, "wb") as file:
         yield file
@@ -36,11 +36,7 @@ def atomic_file(path: str | Path, *, sync: bool = True, own: bool = False) -> It
 
 @contextmanager
 def atomic_path(path: str | Path, *, sync: bool = True) -> Iterator[Path]:
-    """A temporary path with the ending of ``path``, for writers that want a name; see ``atomic_file``.
-
-    Raises:
-        OSError: The file cannot be written.
-    """
+    """A temporary path with the ending of ``path``, for writers that want a name; see ``atomic_file``."""
     with _unfinished(Path(path), sync, own=False) as (temporary, number):
         os.close(number)
         yield temporary
@@ -64,11 +60,7 @@ def _unfinished(path: Path, sync: bool, own: bool) -> Iterator[tuple[Path, int]]
 
 
 def put_in_place(temporary: Path, path: Path, *, sync: bool = True) -> None:
-    """Give a complete file on the same disk its name, as ``atomic_file`` does.
-
-    Raises:
-        OSError: It cannot be brought to the disk or renamed.
-    """
+    """Give a complete file on the same disk its name, as ``atomic_file`` does."""
     if sync:
         bring_to_disk(temporary)
     temporary.replace(path)
@@ -88,11 +80,7 @@ def write_text(path: str | Path, text: str) -> None:
 
 
 def bring_to_disk(path: Path) -> None:
-    """Wait until the content of a file, or the names in a folder, are on the disk.
-
-    Raises:
-        OSError: They cannot be brought there.
-    """
+    """Wait until the content of a file, or the names in a folder, are on the disk."""
     handle = os.open(path, os.O_RDONLY if os.name == "posix" else os.O_RDWR)
     try:
         os.fsync(handle)

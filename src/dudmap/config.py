@@ -39,9 +39,6 @@ class SensorConfig(ConfigSection):
     sigma_scale: float = Field(default=0.0019, ge=0, le=0.1)
     """Growth of the standard deviation with the square of the depth, 1/m; the default is the
     coefficient that Nguyen et al. (2012) measured on a Kinect."""
-    distortion: bool = False
-    """Estimate the static distortion of the depth images after the run and write it to ``depth_model.npz``, which the
-    option ``--depth-model`` of later runs with the same camera applies."""
     color_time_sigma: float = Field(default=0.009, ge=0, le=0.1)
     """Standard deviation of the time between the colour and the depth of a pixel, seconds; the default is that of the
     row times of a rolling shutter that reads out for 30 ms (30 ms / sqrt 12). 0 for synchronous global shutters."""

@@ -3,6 +3,9 @@
 Whoever hands over a recording, a map or a configuration decides what is in these files. All readers of them go through
 this module, so that a pipe does not block, a device does not fill the memory, and a declared size is compared with what
 is there before memory is taken for it.
+
+A file that cannot be read, is no plain file or is too large is an ``OSError``. Content that is not as its format says,
+is nested too deeply, or would unpack to too much is a ``ValueError``, or what zipfile and zlib raise (``DAMAGE``).
 """
 
 import errno
@@ -18,7 +21,7 @@ import tomllib
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import IO, Any
 
@@ -66,9 +69,6 @@ def open_plain(path: str | Path, *, pointers: bool = False) -> IO[bytes]:
     Args:
         path: The file.
         pointers: Whether a pointer of Git LFS is opened as any text.
-
-    Raises:
-        OSError: There is no such file, or it is a folder, pipe, socket or device, or a pointer of Git LFS.
     """
     try:
         _check_plain(os.stat(path).st_mode, path)
@@ -95,11 +95,7 @@ def _check_plain(mode: int, path: str | Path) -> None:
 
 
 def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
-    """Content of a plain file of at most ``largest`` bytes.
-
-    Raises:
-        OSError: The file cannot be read, is no plain file, or is larger.
-    """
+    """Content of a plain file of at most ``largest`` bytes."""
     with open_plain(path) as file:
         data = file.read(min(os.fstat(file.fileno()).st_size, largest) + 1)
     if len(data) > largest:
@@ -108,31 +104,17 @@ def read_bytes(path: str | Path, largest: int = LARGEST_FILE) -> bytes:
 
 
 def read_text(path: str | Path, largest: int = LARGEST_TEXT) -> str:
-    """Content of a UTF-8 text file of at most ``largest`` bytes, with line ends as ``\\n``.
-
-    Raises:
-        OSError: The file cannot be read, is no plain file, or is larger.
-        UnicodeDecodeError: It is not UTF-8.
-    """
+    """Content of a UTF-8 text file of at most ``largest`` bytes, with line ends as ``\\n``."""
     return read_bytes(path, largest).decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_json(path: str | Path) -> Any:  # noqa: ANN401 - any JSON value
-    """Value of a JSON file; whole numbers beyond 64 bit become floats.
-
-    Raises:
-        OSError: The file cannot be read, is no plain file, or is too large.
-        ValueError: It is not UTF-8 or not JSON, or nested too deeply.
-    """
+    """Value of a JSON file; whole numbers beyond 64 bit become floats."""
     return parse_json(read_text(path, LARGEST_TREE))
 
 
 def parse_json(text: str | bytes, *, exact: bool = False) -> Any:  # noqa: ANN401 - any JSON value
-    """Value of a JSON text; whole numbers beyond 64 bit become floats unless ``exact``.
-
-    Raises:
-        ValueError: It is not UTF-8 or not JSON, too large, or nested too deeply.
-    """
+    """Value of a JSON text; whole numbers beyond 64 bit become floats unless ``exact``."""
     raw = text if isinstance(text, bytes) else text.encode("utf-8", "surrogatepass")
     if sum(map(raw.count, (b",", b"[", b"{"))) > LARGEST_COUNT:
         raise ValueError(f"it has more than {LARGEST_COUNT} values")
@@ -164,21 +146,12 @@ def _number(text: str) -> int | float:
 
 
 def read_toml(path: str | Path) -> dict[str, Any]:
-    """Content of a TOML file.
-
-    Raises:
-        OSError: The file cannot be read, is no plain file, or is too large.
-        ValueError: It is not UTF-8 or not TOML (``tomllib.TOMLDecodeError``), or nested too deeply.
-    """
+    """Content of a TOML file."""
     return parse_toml(read_text(path, LARGEST_TOML))
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Content of a TOML text.
-
-    Raises:
-        tomllib.TOMLDecodeError: It is not TOML, or nested too deeply.
-    """
+    """Content of a TOML text."""
     try:
         return _shallow(tomllib.loads(text))
     except RecursionError:
@@ -188,12 +161,7 @@ def parse_toml(text: str) -> dict[str, Any]:
 
 
 def inflated(packed: bytes, largest: int) -> bytes:
-    """Content of a zlib stream of at most ``largest`` bytes.
-
-    Raises:
-        ValueError: It is larger or cut off.
-        zlib.error: It is damaged.
-    """
+    """Content of a zlib stream of at most ``largest`` bytes."""
     unpacker = zlib.decompressobj()
     data = unpacker.decompress(packed, largest)
     if not unpacker.eof:
@@ -202,39 +170,28 @@ def inflated(packed: bytes, largest: int) -> bytes:
 
 
 @contextmanager
-def damaged(kind: type[DudmapError], what: object) -> Iterator[None]:
+def damaged(kind: type[DudmapError], what: object, errors: tuple[type[Exception], ...] | None = None) -> Iterator[None]:
     """Turn what a parser raises for damaged content into one sentence of class ``kind`` about ``what``.
 
-    It stands around readers, behind their own checks, for the defects that these do not name.
-
-    Raises:
-        DudmapError: Of that class; our own errors pass unchanged.
+    It stands around readers, behind their own checks, for the defects that these do not name. ``errors`` are those
+    that mean damage, by default ``DAMAGE`` and the errors of OpenCV; our own errors pass unchanged.
     """
     import cv2
 
+    caught = errors or (*DAMAGE, cv2.error)
     try:
         yield
     except DudmapError:
         raise
-    except (*DAMAGE, cv2.error) as error:
+    except caught as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise
         raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
 
 
-@contextmanager
-def foreign(kind: type[DudmapError], what: object) -> Iterator[None]:
-    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh.
-
-    Raises:
-        DudmapError: Of class ``kind``; our own errors pass unchanged.
-    """
-    try:
-        yield
-    except DudmapError:
-        raise
-    except Exception as error:
-        raise kind(f"cannot read {what}, it is damaged or not as its format says: {describe(error)}") from error
+def foreign(kind: type[DudmapError], what: object) -> AbstractContextManager[None]:
+    """As ``damaged``, around packages whose exceptions for damaged content have no common base: rosbags, trimesh."""
+    return damaged(kind, what, (Exception,))
 
 
 def describe(error: BaseException) -> str:
@@ -248,24 +205,14 @@ def describe(error: BaseException) -> str:
 
 @contextmanager
 def open_arrays(path: str | Path) -> "Iterator[Mapping[str, NDArray[Any]]]":
-    """Open a NumPy archive (``.npz``) as mapping of names to arrays of numbers or text, read when asked for.
-
-    Raises:
-        OSError: The file cannot be read or is no plain file.
-        ValueError, KeyError, zipfile.BadZipFile, zlib.error: It is damaged, holds objects, or declares larger arrays
-            than are in it; also inside of the block.
-    """
+    """Open a NumPy archive (``.npz``) as mapping of names to arrays of numbers or text, read when asked for."""
     with open_plain(path) as file, zipfile.ZipFile(file) as archive:
         check_unpacked(archive, os.fstat(file.fileno()).st_size)
         yield _Arrays(archive)
 
 
 def check_unpacked(archive: zipfile.ZipFile, packed: int) -> None:
-    """Check what a ZIP file of ``packed`` bytes says it unpacks to; more than it says is never read.
-
-    Raises:
-        ValueError: It is too much for a file of its size.
-    """
+    """Check what a ZIP file of ``packed`` bytes says it unpacks to; more than it says is never read."""
     limit = min(LARGEST_ARCHIVE, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed))
     total = sum(info.file_size for info in archive.infolist())
     if total > limit:
@@ -294,11 +241,7 @@ class _Arrays(Mapping[str, NDArray[Any]]):
 
 
 def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
-    """Array of a stream of ``size`` bytes in NumPy's format; ``name`` is used in messages.
-
-    Raises:
-        ValueError: It is damaged, holds objects, or its header declares another size than the stream has.
-    """
+    """Array of a stream of ``size`` bytes in NumPy's format; ``name`` is used in messages."""
     version = np.lib.format.read_magic(file)
     read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}.get(version)
     if read is None:
@@ -324,11 +267,6 @@ def read_array(file: IO[bytes], size: int, name: str) -> NDArray[Any]:
 
 
 def load_array(path: str | Path) -> NDArray[Any]:
-    """Array of a ``.npy`` file.
-
-    Raises:
-        OSError: The file cannot be read or is no plain file.
-        ValueError: It is damaged, holds objects, or its header declares another size than the file has.
-    """
+    """Array of a ``.npy`` file."""
     with open_plain(path) as file:
         return read_array(file, os.fstat(file.fileno()).st_size, str(path))

@@ -2,6 +2,8 @@
 
 A run may go on in a folder that comes from elsewhere, or replace its results. Files are found relative to the open
 folder, so that a link in it leads nowhere, and only names that dudmap itself gives are ever deleted.
+
+A link, a pipe, or anything else that is no plain file or folder of its own is an ``OSError`` that names it.
 """
 
 import errno
@@ -53,11 +55,7 @@ class OwnFolder:
             return None
 
     def open(self, name: str, flags: int) -> int:
-        """Open a plain file that has this one name.
-
-        Raises:
-            OSError: It is a link, pipe or anything else, has a second name, or cannot be opened.
-        """
+        """Open a plain file that has this one name."""
         self.check(name, alone=True)
         number = os.open(self._place(name), flags | NO_LINK, 0o644, dir_fd=self._at)
         if not stat.S_ISREG(os.fstat(number).st_mode):  # not that it was replaced in the meantime
@@ -71,21 +69,13 @@ class OwnFolder:
         return os.open(self._place(name), os.O_RDWR | os.O_CREAT | os.O_EXCL | NO_LINK, 0o666, dir_fd=self._at)
 
     def check(self, name: str, *, alone: bool = False) -> None:
-        """Check that a name is free or that of a plain file, which with ``alone`` has no second name.
-
-        Raises:
-            OSError: It is that of something else.
-        """
+        """Check that a name is free or that of a plain file, which with ``alone`` has no second name."""
         status = self.status(name)
         if status is not None and not (stat.S_ISREG(status.st_mode) and (status.st_nlink == 1 or not alone)):
             raise _refused(self.path / name, "is a link or no plain file")
 
     def files(self, form: str) -> list[str]:
-        """Names of the plain files that a regular expression describes wholly.
-
-        Raises:
-            OSError: Something else has such a name.
-        """
+        """Names of the plain files that a regular expression describes wholly."""
         names = os.listdir(self.path if self._at is None else self._at)
         found = sorted(name for name in names if re.fullmatch(form, name))
         for name in found:
@@ -104,20 +94,15 @@ class OwnFolder:
 
 
 def make_folder(path: Path) -> None:
-    """Make a folder in one of ours, unless it is there.
-
-    Raises:
-        OSError: A link or a file has its name.
-    """
+    """Make a folder in one of ours, unless it is there."""
     path.mkdir(exist_ok=True)
     OwnFolder(path).close()
 
 
 def remove_files(folder: Path, written: Mapping[str, str]) -> None:
-    """Delete the files of a folder that ``written`` describes: a regular expression per sub-folder, ``""`` for itself.
+    """Delete the files of a folder that ``written`` describes: a pattern per sub-folder, ``""`` for the folder itself.
 
-    Raises:
-        OSError: A sub-folder is a link, or something other than a plain file has such a name; nothing is deleted then.
+    Nothing is deleted if a sub-folder is a link, or something other than a plain file has such a name.
     """
     there = {name: form for name, form in written.items() if not name or os.path.lexists(folder / name)}
     found = {}

@@ -151,7 +151,7 @@ def test_mistakes_are_one_sentence(folders, tmp_path):
         ((run, "--plots"), "name one with --reference"),
         (("mesh", tmp_path / "empty", recording), "there is no mesh"),
         (("mesh", tmp_path / "broken.ply", recording), "cannot read the mesh"),
-        (("mesh", run, recording, "--distances", "1cm"), "expected metres with commas"),
+        (("mesh", run, recording, "--distances", "1cm"), "expected numbers separated by commas"),
         (("mesh", run, recording, "--ghost-distance", "0"), "expected a positive number"),
         (("masks", tmp_path / "empty", recording), "run with --save-masks"),
     ]

@@ -41,11 +41,11 @@ def test_another_world_frame_is_no_error():
     result = ate(Trajectory(reference.timestamps, world @ reference.Ts_world_camera), reference)
     assert result.alignment == "se3"
     assert result.num_pairs == len(reference)
-    assert max(result.max, result.rot_max_deg) < 1e-6
+    assert max(result.trans.max, result.rot_deg.max) < 1e-6
     np.testing.assert_allclose(result.T_reference_estimate, se3.inverse(world), atol=1e-9)
     unaligned = ate(Trajectory(reference.timestamps, world @ reference.Ts_world_camera), reference, align="none")
     assert unaligned.rmse > 1
-    assert unaligned.rot_mean_deg == pytest.approx(np.degrees(se3.rotation_angle(world)), abs=1e-6)
+    assert unaligned.rot_deg.mean == pytest.approx(np.degrees(se3.rotation_angle(world)), abs=1e-6)
 
 
 def test_known_offset_of_half_of_the_poses():
@@ -56,10 +56,10 @@ def test_known_offset_of_half_of_the_poses():
     turn = se3.exp(np.array([0, 0, 0, 0, 0, np.radians(3.0)]))
     result = ate(Trajectory(reference.timestamps, Ts @ turn), reference)
     assert result.rmse == pytest.approx(0.01, rel=0.02)
-    assert result.median == pytest.approx(0.01, rel=0.05)
-    assert result.rot_rmse_deg == pytest.approx(3.0, abs=0.1)
+    assert result.trans.median == pytest.approx(0.01, rel=0.05)
+    assert result.rot_deg.rmse == pytest.approx(3.0, abs=0.1)
     fixed = ate(Trajectory(reference.timestamps, Ts), reference, align="origin")
-    np.testing.assert_allclose(fixed.errors, 0.02 * (np.arange(len(Ts)) % 2), atol=1e-12)
+    np.testing.assert_allclose(fixed.trans_errors, 0.02 * (np.arange(len(Ts)) % 2), atol=1e-12)
 
 
 def test_poses_are_paired_one_to_one_and_nearest_first():
@@ -79,10 +79,10 @@ def test_fixed_camera_takes_its_rotation_from_the_orientations():
     drift = np.array([se3.exp(np.array([0.001 * k, 0, 0, 0, 0.0005 * k, 0])) for k in range(frames)])
     result = ate(Trajectory(reference.timestamps, drift), reference, align="se3")
     assert result.alignment == "se3-orientations"
-    assert result.rot_max_deg == pytest.approx(np.degrees(0.0005 * frames / 2), rel=0.05)
+    assert result.rot_deg.max == pytest.approx(np.degrees(0.0005 * frames / 2), rel=0.05)
     start = ate(Trajectory(reference.timestamps, drift), reference, align="origin")
-    assert start.max == pytest.approx(0.001 * (frames - 1), rel=1e-3)
-    assert start.rot_max_deg == pytest.approx(np.degrees(0.0005 * (frames - 1)), rel=1e-3)
+    assert start.trans.max == pytest.approx(0.001 * (frames - 1), rel=1e-3)
+    assert start.rot_deg.max == pytest.approx(np.degrees(0.0005 * (frames - 1)), rel=1e-3)
 
 
 @pytest.mark.parametrize("turning", [True, False])
@@ -96,7 +96,7 @@ def test_turning_camera_and_rail_in_another_world_frame(turning):
     world = se3.exp(np.array([1.0, 2.0, 3.0, 0.7, -0.4, 1.1]))
     result = ate(Trajectory(reference.timestamps, world @ reference.Ts_world_camera), reference)
     assert result.alignment == "se3-orientations"
-    assert max(result.max, result.rot_max_deg) < 1e-6
+    assert max(result.trans.max, result.rot_deg.max) < 1e-6
 
 
 @pytest.mark.parametrize(("delta", "unit"), [(1.0, "s"), (30, "frames"), (0.5, "m")])
@@ -124,7 +124,7 @@ def test_relative_error_is_that_of_the_definition(delta, unit):
     result = rpe(estimate, reference, delta, unit)
     np.testing.assert_allclose(result.trans_errors, translations, atol=1e-9)
     np.testing.assert_allclose(result.rot_errors_deg, angles, atol=1e-6)
-    assert result.trans_rmse == pytest.approx(np.sqrt(np.mean(np.square(translations))))
+    assert result.trans.rmse == pytest.approx(np.sqrt(np.mean(np.square(translations))))
 
 
 def test_on_a_recording_without_gaps_the_rule_of_the_tum_script_gives_the_same():
@@ -216,10 +216,10 @@ def test_absolute_error_equals_that_of_evo(align, flags, files, tmp_path):
     ours = ate(*files, align=align)
     theirs = evo("evo_ape", tmp_path, *flags)
     for name in ("rmse", "mean", "median", "max"):
-        assert getattr(ours, name) == pytest.approx(theirs[name], rel=1e-6), name
+        assert getattr(ours.trans, name) == pytest.approx(theirs[name], rel=1e-6), name
     theirs = evo("evo_ape", tmp_path, *flags, "-r", "angle_deg")
     for name in ("rmse", "mean", "median", "max"):
-        assert getattr(ours, f"rot_{name}_deg") == pytest.approx(theirs[name], rel=1e-5), name
+        assert getattr(ours.rot_deg, name) == pytest.approx(theirs[name], rel=1e-5), name
 
 
 @pytest.mark.parametrize(
@@ -229,8 +229,7 @@ def test_absolute_error_equals_that_of_evo(align, flags, files, tmp_path):
 def test_relative_error_equals_that_of_evo(delta, unit, flags, files, tmp_path):
     """evo knows no seconds: at 30 Hz one second is 30 frames."""
     ours = rpe(*files, delta, unit)
-    for name, relation in (("trans", "trans_part"), ("rot", "angle_deg")):
+    for name, relation in (("trans", "trans_part"), ("rot_deg", "angle_deg")):
         theirs = evo("evo_rpe", tmp_path, *flags, "--all_pairs", "-r", relation)
-        suffix = "_deg" if name == "rot" else ""
-        assert getattr(ours, f"{name}_rmse{suffix}") == pytest.approx(theirs["rmse"], rel=1e-5)
-        assert getattr(ours, f"{name}_max{suffix}") == pytest.approx(theirs["max"], rel=1e-5)
+        assert getattr(ours, name).rmse == pytest.approx(theirs["rmse"], rel=1e-5)
+        assert getattr(ours, name).max == pytest.approx(theirs["max"], rel=1e-5)

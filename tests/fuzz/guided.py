@@ -29,7 +29,6 @@ with atheris.instrument_imports(include=["dudmap", "rosbags"]):
     import dudmap.app.state.system
     import dudmap.app.viewing.run_files
     import dudmap.config
-    import dudmap.core.calibration.depth_model
     import dudmap.core.geometry.mesh
     import dudmap.core.map.adaptive_volume
     import dudmap.core.map.volume

@@ -32,7 +32,6 @@ LOADERS = {
     "adaptive map": Loader(maps.adaptive_map_file, maps.load_map),
     "state of a run": Loader(maps.state, maps.load_state),
     "keyframes": Loader(maps.keyframes, maps.load_keyframe_file),
-    "depth model": Loader(maps.depth_model, maps.load_depth_model),
     "configuration": Loader(partial(files.text, "config.toml", files.configuration), files.load_config),
     "calibration": Loader(partial(files.text, "calibration.toml", files.calibration), files.load_calibration),
     "trajectory": Loader(partial(files.text, "trajectory.txt", files.trajectory), files.load_trajectory),

@@ -1,4 +1,4 @@
-"""Maps, the stored state of a run, keyframes and depth models, each with a writer of a small valid one."""
+"""Maps, the stored state of a run and keyframes, each with a writer of a small valid one."""
 
 import tempfile
 from pathlib import Path
@@ -116,20 +116,6 @@ def load_keyframe_file(path):
     from dudmap.core.places.saved_map import load_keyframes
 
     load_keyframes(path)
-
-
-def depth_model(folder):
-    from dudmap.core.calibration.depth_model import TERMS, DepthModel
-
-    n = len(TERMS)
-    DepthModel(np.zeros(n), np.eye(n), np.ones(2), 3).save(folder / "depth_model.npz")
-    return folder / "depth_model.npz"
-
-
-def load_depth_model(path):
-    from dudmap.core.calibration.depth_model import DepthModel
-
-    DepthModel.load(path).correction  # noqa: B018
 
 
 def merged_folder(folder):

@@ -9,7 +9,7 @@ from verdict import Loader, check_sentence
 
 import layouts
 from dudmap.errors import FrameError
-from dudmap.io.sequences import corbs, epfl, frame_files, icl_nuim, intrinsics, open_sequence, redwood
+from dudmap.io.sequences import numbered_folders, open_sequence, tum
 
 CAMERA = "60,60,31.5,23.5,64,48"
 
@@ -48,8 +48,10 @@ LARGE = (
 )  # fmt: skip
 """Layouts whose images have the size that their data set's camera says, 640x480 or 512x424."""
 CAMERAS = (
-    icl_nuim.CAMERA, corbs.CAMERA, epfl.CAMERA, redwood.CAMERA, frame_files.SEVEN_SCENES_DEPTH,
-    frame_files.SEVEN_SCENES_COLOR, *(values for _, name, values in intrinsics.KNOWN if name == "Bonn"),
+    numbered_folders.ICL_NUIM, numbered_folders.SEVEN_SCENES_DEPTH, numbered_folders.SEVEN_SCENES_COLOR,
+    *(reader.published[1] for reader in (
+        tum.BonnSequence, tum.CorbsSequence, numbered_folders.EpflSequence, numbered_folders.RedwoodSequence,
+    )),
 )  # fmt: skip
 """These cameras."""
 

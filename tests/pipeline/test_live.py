@@ -67,7 +67,7 @@ def test_the_recording_is_complete_though_the_run_folder_cannot_be_written(slam,
     def full(*_, **__):
         raise DudmapError("no space left")
 
-    monkeypatch.setattr("dudmap.app.pipeline.live.write_run_folder", full)
+    monkeypatch.setattr("dudmap.app.pipeline.run.write_run_folder", full)
     file = tmp_path / "walk.mcap"
     with pytest.raises(DudmapError, match="no space left"):
         run_live(ReplayCamera(sequence), Config(), tmp_path / "out", record=file, progress=False)

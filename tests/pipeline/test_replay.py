@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from dudmap.app.pipeline.frame_source import SourceFrame
-from dudmap.app.pipeline.replay import WaitingRoom, in_real_time, replay
+from dudmap.app.pipeline.replay import FrameQueue, in_real_time, replay
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.errors import DatasetError
@@ -68,22 +68,22 @@ def test_a_replay_ends_when_told():
 
 
 def test_only_frames_of_the_last_moment_wait():
-    room = WaitingRoom()
+    queue = FrameQueue()
     for number, arrived in enumerate([0.0, 0.2, 0.26, 0.29, 0.32]):
-        room.put(SourceFrame(number, "", arrival=arrived))
-    assert room.take().number == 2, "that at 0.2 is too old"
-    room.put(SourceFrame(5, "", arrival=9.0))
-    room.close()
-    assert room.take().number == 5
-    assert room.take() is None
-    assert room.take() is None
+        queue.put(SourceFrame(number, "", arrival=arrived))
+    assert queue.take().number == 2, "that at 0.2 is too old"
+    queue.put(SourceFrame(5, "", arrival=9.0))
+    queue.close()
+    assert queue.take().number == 5
+    assert queue.take() is None
+    assert queue.take() is None
 
 
 def test_a_consumer_waits_for_the_next():
-    room, taken = WaitingRoom(), []
-    thread = threading.Thread(target=lambda: taken.append(room.take().read))
+    queue, taken = FrameQueue(), []
+    thread = threading.Thread(target=lambda: taken.append(queue.take().read))
     thread.start()
-    room.put(SourceFrame(0, "late"))
+    queue.put(SourceFrame(0, "late"))
     thread.join(timeout=5)
     assert taken == ["late"]
 

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from dudmap.app.pipeline.frame_source import read_ahead
+from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.config import Config
 from dudmap.core.geometry.mesh import Mesh
@@ -65,9 +66,19 @@ def test_the_run_folder(slam, recording, tmp_path):
     assert float(rows[2]["track"]) == 2.0
 
 
+class Noting(RunObserver):
+    """Notes number and result of every frame."""
+
+    def __init__(self, seen):
+        self.seen = seen
+
+    def frame(self, index, read, result, ms):
+        self.seen.append((index, result))
+
+
 def test_frames_arrive_in_order_and_no_more_than_wanted(slam, recording, tmp_path):
     seen = []
-    report = go(recording, tmp_path / "out", max_frames=6, observe=lambda i, reading, result: seen.append((i, result)))
+    report = go(recording, tmp_path / "out", max_frames=6, observers=(Noting(seen),))
     assert [i for i, _ in seen] == list(range(6))
     np.testing.assert_allclose([result.timestamp for _, result in seen], 100 + 0.1 * np.arange(6))
     assert report.metrics["frames"] == 6
@@ -142,10 +153,10 @@ def test_what_was_computed_is_written_whatever_happens(slam, recording, tmp_path
 def test_the_second_pass_is_what_is_written(slam, recording, tmp_path):
     slam.script = {2: "lost", SECOND + 5: "similar"}
     seen = []
-    go(recording, tmp_path / "out", passes=2, save_masks=True, observe=lambda index, *_: seen.append(index))
+    go(recording, tmp_path / "out", passes=2, save_masks=True, observers=(Noting(seen),))
     metrics = metrics_of(tmp_path / "out")
     assert (metrics["frames"], metrics["tracked"], metrics["lost"], metrics["skipped_similar"]) == (8, 8, 0, 1)
-    assert seen == list(range(8))
+    assert [index for index, _ in seen] == [*range(8), *range(8)]
     assert len(list((tmp_path / "out/masks").iterdir())) == 8
 
 

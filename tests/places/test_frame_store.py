@@ -8,8 +8,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.frame_store import FrameStore
-from dudmap.core.places.glimpse import DEPTH_UNIT
+from dudmap.core.places.frame_store import DEPTH_UNIT, FrameStore
 from dudmap.errors import MapError
 
 CAMERA = Camera(fx=131.25, fy=131.25, cx=79.5, cy=59.5, width=160, height=120)

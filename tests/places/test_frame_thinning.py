@@ -14,9 +14,8 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places import frame_thinning
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_file import FrameFile
-from dudmap.core.places.frame_store import FrameStore
+from dudmap.core.places.frame_store import DEPTH_UNIT, FrameStore
 from dudmap.core.places.frame_thinning import FrameThinning, chained
-from dudmap.core.places.glimpse import DEPTH_UNIT, Glimpse, Visibility, pixels
 from dudmap.core.places.loop_correction import LoopCorrector
 from dudmap.core.places.loop_verification import LOCAL_FRAMES
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures
@@ -31,7 +30,7 @@ EVERYTHING = np.ones(CAMERA.shape, dtype=bool)
 
 @pytest.fixture(autouse=True)
 def nothing_untouched(monkeypatch):
-    monkeypatch.setattr(frame_thinning, "UNTOUCHED", 0)
+    monkeypatch.setattr(frame_thinning, "MIN_KEPT", 0)
 
 
 def at(x, y=0.0):
@@ -140,60 +139,6 @@ def test_the_number_depends_on_the_space_and_not_on_the_time():
     assert sorted(walker.history.serials) == walker.history.serials
     stored = np.array([T[0, 3] for T in walker.history.Ts_world_camera])
     assert np.all(np.abs(stored[:, None] - np.arange(0, 0.51, 0.05)).min(axis=0) < 1e-9)  # no place is left out
-
-
-@pytest.mark.parametrize("change", ["hidden", "taken away", "before", "masked"])
-def test_only_what_was_seen_again_is_replaced(change):
-    """Later frames see the wall through where something was; behind what was put there, or moves there, they do not."""
-    left = np.zeros(CAMERA.shape, dtype=bool)
-    left[:, :20] = True
-    thing = wall(0)
-    thing.depth[left] = 0.8
-    old, new = (thing, wall(1)) if change == "taken away" else (wall(1), thing)
-    walker, others = Walker(), EVERYTHING
-    if change == "before":  # by less than the truncation band behind the new readings
-        new = wall(1, 1.5 - 0.9 * CONFIG.volume.truncation_behind_voxels * CONFIG.volume.voxel_size)
-    if change == "masked":
-        new, others = old, ~left
-    for _ in range(ENOUGH + 4):
-        walker.see(at(0), old)
-    for _ in range(3 * ENOUGH):
-        walker.see(at(0), new, others)
-    remaining = sum(1 for t in walker.history.timestamps if 0 < t < ENOUGH + 4)
-    if change in ("taken away", "before"):
-        assert remaining == 0
-    else:  # those that the map still has there, and they do not become fewer
-        assert 2 * CONFIG.volume.free_after <= remaining <= ENOUGH + 4
-
-
-def test_readings_are_seen_again_as_the_fusion_sees_them():
-    """Points of a wall at 2 m, 3 m aside of which another camera stands, which sees them against a wall of its own."""
-    visibility = Visibility(CAMERA, CONFIG)
-    glimpse = Glimpse.of(np.full(CAMERA.shape, 2.0, np.float32), EVERYTHING)
-    points = visibility.points(glimpse)
-    v, u = pixels(CAMERA.shape)
-    rays = np.stack([(u - CAMERA.cx) / CAMERA.fx, (v - CAMERA.cy) / CAMERA.fy, np.ones(len(u))], axis=1)
-    np.testing.assert_allclose(points, np.concatenate([2 * rays, rays]), atol=DEPTH_UNIT)
-    band = CONFIG.volume.truncation_behind_voxels * CONFIG.volume.voxel_size
-    for distance, seen in ((2.0, True), (2.0 - 0.9 * band, True), (2.0 - 1.1 * band, False), (3.0, True), (0.0, False)):
-        other = Glimpse.of(np.full(CAMERA.shape, distance, np.float32), EVERYTHING)
-        found = visibility.observed(points, np.eye(4)[None], [other])[0]
-        assert np.all(found[: len(u)] == seen)
-        assert np.all(found[len(u) :] == (distance > 1.0 - band))
-    T = np.eye(4)
-    T[0, 3] = 0.5  # the other camera is 0.5 m to the left
-    expected = np.abs((points[:, 0] + 0.5) / points[:, 2] * CAMERA.fx) < CAMERA.width / 2
-    assert np.array_equal(visibility.observed(points, T[None], [glimpse])[0], expected)
-    assert not visibility.observed(points, se3.exp(np.array([0, 0, 0, 0, np.pi, 0]))[None], [glimpse]).any()
-
-
-def test_single_readings_need_not_be_seen_again():
-    depth = np.full(CAMERA.shape, 2.0, np.float32)
-    v, u = pixels(CAMERA.shape)
-    depth[v[5], u[5]] = 4.0  # a spurious reading behind the wall
-    depth[v[40], u[40] + 1] = 0
-    glimpse = Glimpse.of(depth, EVERYTHING)
-    assert np.flatnonzero(~glimpse.certain).tolist() == [5, 40]
 
 
 def test_what_a_return_may_be_compared_with_stays():

@@ -182,7 +182,7 @@ def test_what_is_missing_in_the_state_of_a_run(tmp_path):
     made = StateDatabase(tmp_path / "state.db")
     made.write(take_snapshot({"numbers": np.arange(10.0)}, made), {"next": 1})
     store, slam = SimpleNamespace(database=None), SimpleNamespace(device="cpu")
-    with pytest.raises(StateError, match=r"cannot read .*state\.db, it is damaged"):
+    with pytest.raises(StateError, match="found dict; expected RunState"):
         restored(StateReader(tmp_path / "state.db"), store, slam, slam)
 
 

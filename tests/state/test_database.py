@@ -2,6 +2,7 @@
 
 import sqlite3
 from contextlib import closing
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -266,9 +267,9 @@ def test_no_class_from_elsewhere_is_made():
         "dudmap.core.slam:np",
         "os:system",
     ):
-        tree = {"object": name, "id": 0, "attributes": {}}
+        reader = SimpleNamespace(state=lambda name=name: ({"object": name, "id": 0, "attributes": {}}, [], []))
         with pytest.raises(StateError, match="does not know"):
-            TreeReader([], [], None, None).restore(tree, None)
+            TreeReader(reader).restore(None)
 
 
 def test_what_is_shared_stays_shared_and_numbers_keep_their_type(tmp_path):

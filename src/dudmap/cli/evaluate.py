@@ -11,7 +11,7 @@ from dudmap.app.terminal import say
 from dudmap.atomic_file import write_text
 from dudmap.cli import options as o
 from dudmap.cli.output import DefaultGroup
-from dudmap.errors import ConfigError, DatasetError, DudmapError
+from dudmap.errors import DatasetError, DudmapError
 
 if TYPE_CHECKING:
     from dudmap.core.geometry.trajectory import Trajectory
@@ -58,13 +58,13 @@ def trajectory(
     """
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.evaluation.files import find_reference, find_trajectory, load_reference, tracked_share
-    from dudmap.evaluation.trajectory import trajectory_figures
+    from dudmap.evaluation.trajectory import path_figures, trajectory_figures
 
     file, folder = find_trajectory(estimate)
     found = Trajectory.load(file)
     truth = find_reference(reference, folder)
     figures: Figures = {"estimate": str(file), "reference": str(truth) if truth else None}
-    figures |= path_length(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
+    figures |= path_figures(found) | {"tracked_share": tracked_share(len(found), folder, truth)}
     alignment = cast("Align", align)  # checked by ate
     pictures: list[Path] = []
     target = _output_folder(out, folder if folder is not None else file.parent)
@@ -139,7 +139,7 @@ def mesh(
         found,
         true,
         observed=observed,
-        thresholds=_distances(thresholds),
+        thresholds=tuple(o.numbers(thresholds, None, "--distances")),
         ghost_distance=ghost_distance,
         samples=samples,
         points=points,
@@ -197,22 +197,6 @@ def masks(
         pictures = [target / "masks.png"]
         plot_masks(pictures[0], result)
     _report(figures, target / "masks.evaluation.json", pictures, as_json=as_json, title="masks")
-
-
-def path_length(estimate: "Trajectory") -> Figures:
-    """Number of poses, duration and path length of a trajectory."""
-    import numpy as np
-
-    steps = np.linalg.norm(np.diff(estimate.Ts_world_camera[:, :3, 3], axis=0), axis=1)
-    duration = float(estimate.timestamps[-1] - estimate.timestamps[0])
-    return {"poses": len(estimate), "duration_s": round(duration, 6), "path_length_m": round(float(steps.sum()), 6)}
-
-
-def _distances(text: str) -> tuple[float, ...]:
-    try:
-        return tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise ConfigError(f"--distances is {text!r}; expected metres with commas, e.g. 0.01,0.02,0.05") from None
 
 
 def _plot_trajectory(

@@ -15,7 +15,7 @@ _NAMES = "; ".join(f"{name}: {exporter.summary}" for name, exporter in EXPORTERS
 
 @app.command()
 def export(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: o.RunArgument,
     out: Annotated[Path, typer.Option(help=f"File to write; its ending or name tells the format. {_NAMES}.")],
     max_triangles: Annotated[int | None, typer.Option(min=4, help="Decimate the mesh to so many triangles.")] = None,
     crop: Annotated[

@@ -19,7 +19,7 @@ SHOWN_GAPS = 5
 
 @app.command()
 def info(
-    path: Annotated[Path, typer.Argument(help="Recording: folder, file or archive.", metavar="PATH")],
+    path: o.RecordingArgument,
     camera: o.CameraOption = None,
     fps: o.FpsOption = None,
     depth_unit: o.DepthUnitOption = None,

@@ -1,4 +1,7 @@
-"""Options that several commands share, and the values that are written as text in them."""
+"""Options that several commands share, and the values that are written as text in them.
+
+A text that cannot be understood is a ``ConfigError``.
+"""
 
 import re
 from functools import partial
@@ -47,10 +50,6 @@ JsonOption = Annotated[bool, output_option("--json", help="Print the result as o
 QuietOption = Annotated[bool, output_option("--quiet", help="No progress bar and no table.")]
 RunArgument = Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")]
 RecordingArgument = Annotated[Path, typer.Argument(help="Recording: folder, file or archive.")]
-OptionalRecordingArgument = Annotated[
-    Path | None, typer.Argument(help="Recording with true poses; default: synthetic rooms.")
-]
-
 CameraOption = Annotated[
     str | None,
     input_option(help="Intrinsics: fx,fy,cx,cy, then w,h and the depth_scale if need be.", metavar="NUMBERS"),
@@ -131,18 +130,15 @@ UpOption = Annotated[
 ]
 
 
-def numbers(text: str, count: int, option: str) -> list[float]:
-    """Numbers of an option, separated by commas.
-
-    Raises:
-        ConfigError: They are not so many finite numbers.
-    """
+def numbers(text: str, count: int | None, option: str) -> list[float]:
+    """Numbers of an option, separated by commas; any count of them for None."""
     try:
         found = [float(part) for part in text.split(",")]
     except ValueError:
         found = []
-    if len(found) != count or not all(map(isfinite, found)):
-        raise ConfigError(f"found {option} {text!r}; expected {count} numbers separated by commas")
+    if not found or len(found) != (count or len(found)) or not all(map(isfinite, found)):
+        what = f"{count} numbers" if count else "numbers"
+        raise ConfigError(f"found {option} {text!r}; expected {what} separated by commas")
     return found
 
 
@@ -155,11 +151,7 @@ def direction(text: str | None) -> tuple[float, float, float] | None:
 
 
 def image_size(text: str) -> tuple[int, int]:
-    """Width and height of ``--size``.
-
-    Raises:
-        ConfigError: It is no possible size.
-    """
+    """Width and height of ``--size``."""
     match = re.fullmatch(r"(\d+)[xX](\d+)", text.strip())
     if match is None or not all(16 <= int(number) <= 4096 for number in match.groups()):
         raise ConfigError(f"image size is {text!r}; expected WIDTHxHEIGHT from 16x16 to 4096x4096, such as 640x480")
@@ -167,11 +159,7 @@ def image_size(text: str) -> tuple[int, int]:
 
 
 def memory_size(text: str) -> int:
-    """Number of bytes of a text such as 1GB or 800MB.
-
-    Raises:
-        ConfigError: It is no amount of memory.
-    """
+    """Number of bytes of a text such as 1GB or 800MB."""
     from pydantic import ByteSize, TypeAdapter, ValidationError
 
     try:

@@ -14,7 +14,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def render(
-    run: Annotated[Path, typer.Argument(help="Run folder.")],
+    run: o.RunArgument,
     out: Annotated[Path, typer.Option(help="Video (.mp4, .avi), or folder for a recording in TUM layout.")],
     trajectory: Annotated[
         Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
@@ -33,6 +33,8 @@ def render(
     """Render the map as a camera would see it: a video, or a recording without anything that moves."""
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory
+    from dudmap.io.exporting.gravity import up_of
+    from dudmap.io.exporting.options import ExportOptions
     from dudmap.io.exporting.run_content import RunContent
 
     if (trajectory is None) == (not orbit):
@@ -41,7 +43,7 @@ def render(
     if trajectory is not None:
         path = Trajectory.load(trajectory)
     else:
-        path = rendering.orbit(content, rendering.up_for_orbit(content, o.direction(up)), sweep, max_frames, fps)
+        path = rendering.orbit(content, up_of(content, ExportOptions(up=o.direction(up))), sweep, max_frames, fps)
     with counted("rendering", quiet=quiet or as_json) as progress:
         count = rendering.render_run(
             content, path, out, size=None if size is None else o.image_size(size), fps=fps, progress=progress

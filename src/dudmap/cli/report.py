@@ -13,7 +13,7 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def report(
-    run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
+    run: o.RunArgument,
     out: Annotated[Path | None, typer.Option(help="HTML file; default: report.html in the run folder.")] = None,
     as_json: o.JsonOption = False,
 ) -> None:

@@ -69,12 +69,6 @@ def run(
             metavar="auto|given|FILE",
         ),
     ] = "auto",
-    depth_model: Annotated[
-        Path | None,
-        o.calibration_option(
-            help="depth_model.npz of an earlier run: distortion of the depth to remove.", metavar="FILE"
-        ),
-    ] = None,
     live: Annotated[
         bool, o.live_option("--live", help="Replay in real time; frames are dropped where processing is too slow.")
     ] = False,
@@ -142,7 +136,7 @@ def run(
         done = run_sequence(
             recording, parameters, out,
             max_frames=max_frames, save_masks=save_masks, masks=masks, progress=not quiet, live=live, passes=passes,
-            depth_model=depth_model, calibration=given, calibrate=calibration == "auto" and not live,
+            calibration=given, calibrate=calibration == "auto" and not live,
             saved_map=saved_map, localize=localize,
             max_memory=None if max_memory is None else o.memory_size(max_memory), observers=watching, storing=storing,
             warnings=warnings,

@@ -5,7 +5,7 @@ import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -21,11 +21,9 @@ app = typer.Typer(add_completion=False)
 
 @app.command()
 def view(
-    run: Annotated[Path, typer.Argument(help="Run folder of dudmap run.", metavar="RUN")],
-    host: Annotated[
-        str, typer.Option(help="Address to serve at; 0.0.0.0 lets other machines see the page.")
-    ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(help="Port to serve at.", min=1, max=65535)] = 8080,
+    run: o.RunArgument,
+    host: o.HostOption = "127.0.0.1",
+    port: o.PortOption = 8080,
     token: o.TokenOption = None,
 ) -> None:
     """Show a run folder in the browser until ctrl-C: map, camera, what moves, images, plots (extra view)."""

@@ -11,11 +11,9 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.backends.device import make_backend, resolve
 from dudmap.core.bootstrap import Bootstrap
-from dudmap.core.calibration.depth_model import DepthModel
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.dynamics.masks import full_mask
-from dudmap.core.frames.depth_correction import DepthCorrection
 from dudmap.core.frames.frame import Frame, FrameArrays
 from dudmap.core.frames.preprocess import Preprocessor
 from dudmap.core.frames.pyramid import Pyramid
@@ -59,8 +57,6 @@ class Slam(SlamResults):
         first_pass: A system that has processed the whole recording. The frames, given once more from the first on, are
             then registered and labelled with its map and fused into a new one, which leaves out what was taken for
             static before it moved or before it was seen through.
-        depth_model: What is known of the distortion of the depth from an earlier run with the same camera; it is
-            removed from every frame.
         calibration: Of the colour camera; None for colour that is registered to depth. One that was estimated is used
             as it is; another is where the estimation begins, with ``sensor.self_calibration``.
         live: A calibration is used as soon as it is found, and not at a fixed frame.
@@ -77,7 +73,6 @@ class Slam(SlamResults):
         camera: Camera,
         config: Config | None = None,
         first_pass: "Slam | None" = None,
-        depth_model: DepthModel | None = None,
         calibration: Calibration | None = None,
         live: bool = False,
         saved_map: SavedMap | None = None,
@@ -111,7 +106,6 @@ class Slam(SlamResults):
         self.relocalizer = Relocalizer(config, self.atlas, None if prior is None else prior.volume)
         self.redundancy = RedundantViews(config)
         self._last: FrameResult | None = None  # of the last frame, for one that repeats it
-        self._known_distortion = DepthCorrection() if depth_model is None else depth_model.correction
         self.loops = LoopCloser(config, self.atlas, self.tracker)
         self.objects = MovingObjects(config)
         self.localize = localize
@@ -145,7 +139,7 @@ class Slam(SlamResults):
         """
         if isinstance(frame, Frame):
             start = time.perf_counter()
-            observation = self._known_distortion.observation(self.preprocess(frame))
+            observation = self.preprocess(frame)
             pyramid = Pyramid.of(observation, self.camera, self.config)
             if self.predictor.ego_motion.active and self.color_motion.is_prepared(observation):
                 _ = pyramid.corners  # cached there for the comparison with other images

@@ -2,10 +2,7 @@
 
 from dataclasses import replace
 
-import numpy as np
-
 from dudmap.config import Config
-from dudmap.core.calibration.depth_model import DepthModel
 from dudmap.core.color_calibration import ColorCalibration
 from dudmap.core.dynamics.detector import DynamicDetector
 from dudmap.core.geometry.calibration import Calibration
@@ -18,7 +15,6 @@ from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.prior_map import PriorMap
 from dudmap.core.places.saved_map import SavedMap
 from dudmap.core.tracking.quality_monitor import QualityMonitor
-from dudmap.errors import ConfigError
 
 
 class SlamResults:
@@ -75,24 +71,6 @@ class SlamResults:
     def rigid_objects(self) -> list[RigidObject]:
         """The moving objects so far, where ``movers.meshes`` is set: shape and trajectory of those that are rigid."""
         return self.objects.rigid_objects({pose.timestamp: pose.T_world_camera for pose in self.atlas.poses})
-
-    def learnt_depth_model(self) -> DepthModel:
-        """Distortion of the depth, beyond the given model, that the frames kept for the rebuilding of the map show.
-
-        Raises:
-            ConfigError: No frames are kept, since ``relocalization``, or both ``loops`` and ``submaps`` are off.
-        """
-        from dudmap.core.calibration.depth_estimator import DepthView, estimate_distortion
-
-        store = self.atlas.history
-        if store is None:
-            raise ConfigError("the depth model is learnt from kept frames; enable relocalization, and loops or submaps")
-        main = self.atlas.by_size()[0]
-        views = [
-            DepthView.of(np.where(kept.static, kept.frame.depth, np.float32(0)), self.camera, kept.T_world_camera)
-            for kept, submap in zip(store, store.submaps, strict=True) if submap == main
-        ]  # fmt: skip
-        return estimate_distortion(views, self.camera, self.config.sensor)
 
     def as_prior_map(self) -> PriorMap:
         """The largest submap and what else a second pass over the same recording needs."""

@@ -1,4 +1,7 @@
-"""Input files of an evaluation: trajectory, mesh and reference of a run folder, a recording, or named directly."""
+"""Input files of an evaluation: trajectory, mesh and reference of a run folder, a recording, or named directly.
+
+What is missing or malformed is a ``DatasetError``, and a ``MapError`` if it is a mesh.
+"""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -24,11 +27,7 @@ class TrajectoryFile(NamedTuple):
 
 
 def find_trajectory(estimate: Path) -> TrajectoryFile:
-    """Trajectory of a run folder, or the file itself.
-
-    Raises:
-        DatasetError: The folder holds no trajectory.txt.
-    """
+    """Trajectory of a run folder, or the file itself."""
     if not estimate.is_dir():
         return TrajectoryFile(estimate, None)
     path = estimate / "trajectory.txt"
@@ -42,9 +41,6 @@ def find_reference(reference: Path | None, run: Path | None) -> Path | None:
 
     Returns:
         A file, or the folder or archive of a recording whose format knows its truth by other files.
-
-    Raises:
-        DatasetError: ``reference`` is given and there is no such file.
     """
     if reference is not None:
         path = reference / "groundtruth.txt" if reference.is_dir() else reference
@@ -62,9 +58,6 @@ def load_reference(path: Path) -> Trajectory:
 
     The groundtruth.txt of a recording is read as its format wants it: some data sets store the poses of markers, of a
     robot, or with other axes.
-
-    Raises:
-        DatasetError: The file is malformed, or the recording has no true poses.
     """
     inside = path.name == "groundtruth.txt" and reader_of(path.parent) not in (None, TumSequence)
     if path.is_file() and not inside and not is_recording(path):
@@ -77,11 +70,7 @@ def load_reference(path: Path) -> Trajectory:
 
 
 def load_mesh(path: Path) -> Mesh:
-    """Mesh of a file.
-
-    Raises:
-        MapError: The file is missing or not a mesh.
-    """
+    """Mesh of a file."""
     if not path.is_file():
         raise MapError(f"there is no mesh {path}; name a mesh file, or a folder that holds {path.name}")
     return Mesh.load(path)
@@ -103,9 +92,6 @@ def tracked_share(poses: int, run: Path | None, reference: Path | None) -> float
     """Share of the recording's frames that have a pose; None where the number of frames is unknown.
 
     The number of frames is that of the run's metrics.json, or else of the image lists beside the true trajectory.
-
-    Raises:
-        DatasetError: metrics.json or the list cannot be read.
     """
     frames = _num_frames(run, reference)
     return round(poses / frames, 6) if frames else None

@@ -1,4 +1,7 @@
-"""Plots of trajectory, surface and mask errors. Each function writes one PNG file."""
+"""Plots of trajectory, surface and mask errors. Each function writes one PNG file.
+
+A plot that cannot be written is a ``DudmapError``.
+"""
 
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -11,7 +14,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
 from dudmap.evaluation.reconstruction import SurfaceResult
 from dudmap.evaluation.segmentation import MaskResult
-from dudmap.evaluation.trajectory import AteResult, RpeResult
+from dudmap.evaluation.trajectory import AteResult, PoseErrors, RpeResult
 from dudmap.input_files import DAMAGE, open_arrays
 
 if TYPE_CHECKING:
@@ -48,28 +51,26 @@ def plot_trajectories(path: Path, estimate: Trajectory, reference: Trajectory, r
 
 def plot_error(path: Path, result: AteResult) -> None:
     """Position and orientation error over time."""
-    figure, (translation, rotation) = _figure(2, rows=True)
-    t = result.timestamps - result.timestamps[0]
-    translation.plot(t, 1000 * result.errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
-    _rules(translation, {"RMSE": 1000 * result.rmse, "median": 1000 * result.median})
-    translation.set(ylabel="position error, mm", title=f"absolute error, alignment: {result.alignment}")
-    rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
-    _rules(rotation, {"RMSE": result.rot_rmse_deg, "median": result.rot_median_deg})
-    rotation.set(xlabel="time, s", ylabel="orientation error, deg")
-    _save(figure, path)
+    labels = "position error, mm", "orientation error, deg", "time, s"
+    _plot_errors(path, result, f"absolute error, alignment: {result.alignment}", labels)
 
 
 def plot_rpe(path: Path, result: RpeResult) -> None:
     """Relative pose error over time."""
+    per = f"over {result.delta:g} {result.unit}"
+    labels = f"translation, mm {per}", f"rotation, deg {per}", "time of the first pose, s"
+    _plot_errors(path, result, f"relative pose error {per}", labels)
+
+
+def _plot_errors(path: Path, result: PoseErrors, title: str, labels: tuple[str, str, str]) -> None:
     figure, (translation, rotation) = _figure(2, rows=True)
     t = result.timestamps - result.timestamps[0]
-    per = f"over {result.delta:g} {result.unit}"
     translation.plot(t, 1000 * result.trans_errors, ".-", color=ESTIMATE, markersize=3, linewidth=0.8)
-    _rules(translation, {"RMSE": 1000 * result.trans_rmse, "median": 1000 * result.trans_median})
-    translation.set(ylabel=f"translation, mm {per}", title=f"relative pose error {per}")
+    _rules(translation, {"RMSE": 1000 * result.trans.rmse, "median": 1000 * result.trans.median})
+    translation.set(ylabel=labels[0], title=title)
     rotation.plot(t, result.rot_errors_deg, ".-", color=SECOND, markersize=3, linewidth=0.8)
-    _rules(rotation, {"RMSE": result.rot_rmse_deg, "median": result.rot_median_deg})
-    rotation.set(xlabel="time of the first pose, s", ylabel=f"rotation, deg {per}")
+    _rules(rotation, {"RMSE": result.rot_deg.rmse, "median": result.rot_deg.median})
+    rotation.set(xlabel=labels[2], ylabel=labels[1])
     _save(figure, path)
 
 
@@ -87,9 +88,6 @@ def draw_residuals(axes: "Axes", residuals: Path) -> None:
         axes: Where to draw.
         residuals: NPZ file with the histogram, ``edges`` (B + 1,) in standard deviations of the reading and ``counts``
             (B,), and the fitted mixture of two half-normal densities (static, dynamic), ``prior`` (2,), ``sigma`` (2,).
-
-    Raises:
-        DatasetError: The file does not hold these arrays.
     """
     try:
         with open_arrays(residuals) as data:

@@ -2,6 +2,9 @@
 
 Points are sampled uniformly over the area of one surface and measured to the nearest triangle of the other. A
 comparison of vertices would weight a mesh by its triangle density.
+
+A mesh without faces (unless point clouds are accepted) or with NaN is a ``MapError``, a distance or a number of samples
+that is not positive a ``ConfigError``.
 """
 
 from collections.abc import Iterable
@@ -123,7 +126,6 @@ def compare_surfaces(
     ghost_distance: float = GHOST_DISTANCE,
     samples: int = SAMPLES,
     points: bool = False,
-    seed: int = 0,
 ) -> SurfaceResult:
     """Accuracy, completeness, F-scores and ghosts of an estimated surface.
 
@@ -135,11 +137,6 @@ def compare_surfaces(
         ghost_distance: Estimated surface farther than this from the true one is a ghost, metres.
         samples: Number of points sampled on each surface.
         points: Accept point clouds, whose points serve as samples and which have no area.
-        seed: Seed of the sampling.
-
-    Raises:
-        MapError: A mesh has no faces (without ``points``) or holds NaN.
-        ConfigError: A distance or the number of samples is not positive.
     """
     thresholds = tuple(thresholds)
     for name, value in (
@@ -152,8 +149,8 @@ def compare_surfaces(
     truth = _surface(reference, "the reference", points)
     found = Surface(estimate, "the estimate", points=points)
     part = truth if observed is None else _surface(observed, "the observed part of the reference", points)
-    to_truth = truth.distances(found.samples(samples, seed))
-    to_found = found.distances(part.samples(samples, seed + 1))
+    to_truth = truth.distances(found.samples(samples, 0))
+    to_found = found.distances(part.samples(samples, 1))
     ghost_share = float(np.mean(to_truth > ghost_distance))
     edges = np.linspace(0.0, HISTOGRAM_LARGEST, HISTOGRAM_BINS + 1)
     return SurfaceResult(
@@ -179,12 +176,7 @@ def _surface(mesh: Mesh | Surface, name: str, points: bool) -> Surface:
 
 
 def error_mesh(estimate: Mesh, reference: Mesh, *, largest: float = GHOST_DISTANCE, points: bool = False) -> Mesh:
-    """The estimate with each vertex coloured by its distance to the reference, from blue at 0 to red at ``largest`` m.
-
-    Raises:
-        MapError: The reference has no faces (without ``points``) or holds NaN.
-        ConfigError: ``largest`` is not positive.
-    """
+    """The estimate, each vertex coloured by its distance to the reference: blue at 0 to red at ``largest`` metres."""
     if not (np.isfinite(largest) and largest > 0):
         raise ConfigError(f"the distance at the end of the colour scale is {largest}; expected a positive number")
     distances = Surface(reference, "the reference", points=points).distances(estimate.vertices)

@@ -22,6 +22,9 @@ ANCHORS = 400_000
 """Number of additional anchors that large triangles get, over the whole surface."""
 BATCH = 200_000
 """Points measured at a time; bounds the memory."""
+OVERLAP, REACH, ITERATIONS = 0.8, 0.3, 60
+"""Of a registration: share of the estimate that has a counterpart, largest distance of a pair in metres, and largest
+number of iterations."""
 
 
 class Surface:
@@ -72,18 +75,14 @@ class Surface:
         Stratified: one point per equal share of the area. ``trimesh.sample`` draws independently, which has more
         variance, and took ten times as long (0.27 s for 100,000 points).
         """
-        return self.samples_with_normals(count, seed)[0]
-
-    def samples_with_normals(self, count: int, seed: int = 0) -> tuple[Points, Points]:
-        """Points of ``samples`` and the unit normals (count, 3) of their triangles; zero for a point cloud."""
         random = np.random.default_rng(seed)
         if self.is_cloud:
             chosen = random.choice(len(self._vertices), count, replace=count > len(self._vertices))
-            return self._vertices[chosen], np.zeros((count, 3), np.float32)
+            return self._vertices[chosen]
         cumulated = np.cumsum(self._areas)
         steps = (np.arange(count) + random.random(count)) / count * cumulated[-1]  # stratified: one draw per equal area
         face = np.minimum(np.searchsorted(cumulated, steps), len(cumulated) - 1)
-        return _inside(self._corners[face], random), self._normals[face].astype(np.float32)
+        return _inside(self._corners[face], random)
 
     def distances(self, points: Points) -> NDArray[np.float32]:
         """Distances (N,) of points (N, 3) to the surface, metres.
@@ -172,40 +171,34 @@ def register(
     reference: Mesh,
     T_reference_estimate: NDArray[np.float64] | None = None,
     *,
-    overlap: float = 0.8,
-    reach: float = 0.3,
     samples: int = 30_000,
-    iterations: int = 60,
 ) -> SurfaceAlignment:
     """Trimmed point-to-plane ICP (Chen and Medioni 1992; trimming: Chetverikov et al. 2002).
 
-    Every iteration uses the ``overlap`` share of the points with the smallest distances, none farther than ``reach``,
+    Every iteration uses the share ``OVERLAP`` of the points with the smallest distances, none farther than ``REACH``,
     so that ghosts and missing parts have no influence.
 
     Args:
         estimate: Mesh to be moved.
         reference: Triangle mesh it is moved onto.
         T_reference_estimate: (4, 4) initial motion; None is the identity.
-        overlap: Share of the estimate that has a counterpart.
-        reach: Largest distance of a pair, metres.
         samples: Number of points sampled on the estimate.
-        iterations: Largest number of iterations.
 
     Raises:
-        MapError: A mesh has no faces, or too few points lie within ``reach``.
+        MapError: A mesh has no faces, or too few points lie within ``REACH``.
     """
     target = Surface(reference, "the reference")
     points = Surface(estimate, "the estimate").samples(samples).astype(np.float64)
     T = np.eye(4) if T_reference_estimate is None else T_reference_estimate.copy()
     rmse, free, steps = float("nan"), 0, 0
-    while steps < iterations:
+    while steps < ITERATIONS:
         steps += 1
         at = points @ T[:3, :3].T + T[:3, 3]
         distance, anchor, normal = target.nearest_planes(at.astype(np.float32))
-        count = distance <= min(reach, float(np.quantile(distance, overlap)))
+        count = distance <= min(REACH, float(np.quantile(distance, OVERLAP)))
         if np.count_nonzero(count) < 100:
             raise MapError(
-                f"only {np.count_nonzero(count)} of {samples} points of the estimate lie within {reach:g} m of the "
+                f"only {np.count_nonzero(count)} of {samples} points of the estimate lie within {REACH:g} m of the "
                 "reference; the two meshes do not overlap where they start: bring them into one frame first"
             )
         p, n = at[count], normal[count].astype(np.float64)

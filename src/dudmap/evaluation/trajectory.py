@@ -1,7 +1,12 @@
-"""Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V)."""
+"""Absolute and relative trajectory error of the TUM RGB-D benchmark (Sturm et al. 2012, section V).
+
+Trajectories that cannot be compared (no overlap in time, or fewer than three pairs) are a ``DatasetError``, arguments
+that are not acceptable a ``ConfigError``.
+"""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from functools import cached_property
+from typing import Any, Literal, NamedTuple, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +22,7 @@ Align = Literal["se3", "origin", "none"]
 Unit = Literal["s", "m", "frames"]
 
 STATISTICS = "rmse", "mean", "median", "max"
-"""Statistics of every error, in the order of the result classes."""
+"""Statistics of every error."""
 
 FEWEST_PAIRS = 3
 SMALLEST_SPREAD = 1e-3
@@ -27,89 +32,97 @@ PATH_TOLERANCE = 0.1
 """Relative tolerance of ``delta`` in metres: two poses 0.9 to 1.1 m apart along the path are a pair for 1 m."""
 
 
-@dataclass(frozen=True, eq=False)
-class AteResult:
-    """Absolute trajectory error.
-
-    Attributes:
-        rmse: Root mean square of the distances between aligned estimated and true positions, metres.
-        mean: Mean of these distances, metres.
-        median: Median, metres.
-        max: Largest, metres.
-        rot_rmse_deg: Root mean square of the angles between aligned estimated and true orientations, degrees.
-        rot_mean_deg: Mean of these angles, degrees.
-        rot_median_deg: Median, degrees.
-        rot_max_deg: Largest, degrees.
-        num_pairs: Number N of pose pairs.
-        timestamps: (N,) seconds, of the estimate.
-        errors: (N,) metres.
-        rot_errors_deg: (N,) degrees.
-        T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
-        alignment: How this motion was computed: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3``
-            was requested but the positions (all equal, or collinear) do not determine the rotation.
-    """
+@dataclass(frozen=True)
+class ErrorStatistics:
+    """Root mean square, mean, median and maximum of errors, in their unit."""
 
     rmse: float
     mean: float
     median: float
     max: float
-    rot_rmse_deg: float
-    rot_mean_deg: float
-    rot_median_deg: float
-    rot_max_deg: float
-    num_pairs: int
+
+    @classmethod
+    def of(cls, errors: Numbers) -> "ErrorStatistics":
+        """Statistics of errors (N,)."""
+        rmse = float(np.sqrt(np.mean(errors**2)))
+        return cls(rmse, float(errors.mean()), float(np.median(errors)), float(errors.max()))
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """Errors of N poses, or of the motions between N pairs of poses.
+
+    Attributes:
+        timestamps: (N,) seconds, of the estimate; of a motion that of its first pose.
+        trans_errors: (N,) lengths of the translations of the errors, metres.
+        rot_errors_deg: (N,) angles of their rotations, degrees.
+    """
+
     timestamps: Numbers
-    errors: Numbers
+    trans_errors: Numbers
     rot_errors_deg: Numbers
+
+    @classmethod
+    def of(cls, timestamps: Numbers, E: Numbers, *more: Any) -> Self:  # noqa: ANN401
+        """Result of the rigid motions E (N, 4, 4) that are the errors; ``more`` are the fields of the class itself."""
+        return cls(timestamps, np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E)), *more)
+
+    @property
+    def num_pairs(self) -> int:
+        """Number N of errors."""
+        return len(self.timestamps)
+
+    @cached_property
+    def trans(self) -> ErrorStatistics:
+        """Statistics of the translations, metres."""
+        return ErrorStatistics.of(self.trans_errors)
+
+    @cached_property
+    def rot_deg(self) -> ErrorStatistics:
+        """Statistics of the rotations, degrees."""
+        return ErrorStatistics.of(self.rot_errors_deg)
+
+    @property
+    def rmse(self) -> float:
+        """Root mean square of the translations, metres."""
+        return self.trans.rmse
+
+
+@dataclass(frozen=True, eq=False)
+class AteResult(PoseErrors):
+    """Absolute trajectory error.
+
+    Attributes:
+        T_reference_estimate: (4, 4) rigid motion that was applied to the estimate.
+        alignment: How this motion was computed: ``se3``, ``origin``, ``none``, or ``se3-orientations`` where ``se3``
+            was requested but the positions (all equal, or collinear) do not determine the rotation.
+    """
+
     T_reference_estimate: Numbers
     alignment: str
 
     def figures(self) -> dict[str, float]:
         """All statistics by name and unit, for tables and JSON."""
-        out = {f"ate_{key}_m": getattr(self, key) for key in STATISTICS}
-        return out | {f"ate_rot_{key}_deg": getattr(self, f"rot_{key}_deg") for key in STATISTICS}
+        out = {f"ate_{key}_m": getattr(self.trans, key) for key in STATISTICS}
+        return out | {f"ate_rot_{key}_deg": getattr(self.rot_deg, key) for key in STATISTICS}
 
 
 @dataclass(frozen=True, eq=False)
-class RpeResult:
+class RpeResult(PoseErrors):
     """Relative pose error over a fixed interval of time, path length or frames.
 
     Attributes:
-        trans_rmse: Root mean square of the translations of the relative errors, metres.
-        trans_mean: Mean of these lengths, metres.
-        trans_median: Median, metres.
-        trans_max: Largest, metres.
-        rot_rmse_deg: Root mean square of the angles of the relative errors, degrees.
-        rot_mean_deg: Mean of these angles, degrees.
-        rot_median_deg: Median, degrees.
-        rot_max_deg: Largest, degrees.
-        num_pairs: Number N of relative motions.
         delta: Length of the interval.
         unit: Unit of the interval.
-        timestamps: (N,) seconds, of the first pose of each pair.
-        trans_errors: (N,) metres.
-        rot_errors_deg: (N,) degrees.
     """
 
-    trans_rmse: float
-    trans_mean: float
-    trans_median: float
-    trans_max: float
-    rot_rmse_deg: float
-    rot_mean_deg: float
-    rot_median_deg: float
-    rot_max_deg: float
-    num_pairs: int
     delta: float
     unit: str
-    timestamps: Numbers
-    trans_errors: Numbers
-    rot_errors_deg: Numbers
 
     def figures(self) -> dict[str, float]:
         """All statistics by name and unit, for tables and JSON; meaningful for a delta of one unit."""
-        out = {f"rpe_trans_{key}_m_per_{self.unit}": getattr(self, f"trans_{key}") for key in STATISTICS}
-        return out | {f"rpe_rot_{key}_deg_per_{self.unit}": getattr(self, f"rot_{key}_deg") for key in STATISTICS}
+        out = {f"rpe_trans_{key}_m_per_{self.unit}": getattr(self.trans, key) for key in STATISTICS}
+        return out | {f"rpe_rot_{key}_deg_per_{self.unit}": getattr(self.rot_deg, key) for key in STATISTICS}
 
 
 class PosePairs(NamedTuple):
@@ -127,9 +140,6 @@ def pair_poses(estimate: Trajectory, reference: Trajectory, max_difference: floa
         estimate: Estimated poses.
         reference: True poses.
         max_difference: Largest difference of the timestamps of a pair, seconds.
-
-    Raises:
-        DatasetError: The trajectories do not overlap in time, or there are fewer than three pairs.
     """
     for name, trajectory in (("estimated", estimate), ("reference", reference)):
         if not len(trajectory):
@@ -165,10 +175,6 @@ def ate(
             rotations that align the orientations. ``origin``: A maps the first pose onto its partner, so that the
             error of a fixed camera is its drift from the start. ``none``: A is the identity.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, or fewer than three pairs.
-        ConfigError: ``align`` is not one of the three.
     """
     if align not in get_args(Align):
         raise ConfigError(f"align is {align!r}; expected one of {', '.join(get_args(Align))}")
@@ -180,8 +186,7 @@ def ate(
     elif align == "se3":
         T, alignment = _align(Ts_estimate, Ts_reference)
     E = se3.inverse(Ts_reference) @ (T @ Ts_estimate)
-    errors, angles = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E))
-    return AteResult(*_statistics(errors), *_statistics(angles), len(stamps), stamps, errors, angles, T, alignment)
+    return AteResult.of(stamps, E, T, alignment)
 
 
 def rpe(
@@ -205,10 +210,6 @@ def rpe(
         delta: The interval; a whole number for ``frames``.
         unit: ``s``, ``m`` or ``frames``.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, fewer than three pairs, or no two poses are ``delta`` apart.
-        ConfigError: ``delta`` or ``unit`` is not acceptable.
     """
     if unit not in get_args(Unit):
         raise ConfigError(f"the unit of delta is {unit!r}; expected one of {', '.join(get_args(Unit))}")
@@ -229,8 +230,7 @@ def rpe(
     motion_reference = se3.inverse(Ts_reference[i]) @ Ts_reference[j]
     motion_estimate = se3.inverse(Ts_estimate[i]) @ Ts_estimate[j]
     E = se3.inverse(motion_reference) @ motion_estimate
-    errors, angles = np.linalg.norm(E[:, :3, 3], axis=1), np.degrees(rotation_angles(E))
-    return RpeResult(*_statistics(errors), *_statistics(angles), len(i), delta, unit, stamps[i], errors, angles)
+    return RpeResult.of(stamps[i], E, delta, unit)
 
 
 def trajectory_figures(
@@ -247,16 +247,12 @@ def trajectory_figures(
         reference: True poses, camera to world.
         align: Alignment of the ATE, see ``ate``.
         max_difference: Largest difference of the timestamps of a pair of poses, seconds.
-
-    Raises:
-        DatasetError: No overlap in time, or fewer than three pairs.
-        ConfigError: ``align`` is not acceptable.
     """
     absolute = ate(estimate, reference, align, max_difference)
     from_start = ate(estimate, reference, "origin", max_difference)
     out: dict[str, float | int | str | None] = {"pairs": absolute.num_pairs, "alignment": absolute.alignment}
     out |= absolute.figures()
-    out |= {"drift_rmse_m": from_start.rmse, "rotation_rmse_deg": from_start.rot_rmse_deg}
+    out |= {"drift_rmse_m": from_start.rmse, "rotation_rmse_deg": from_start.rot_deg.rmse}
     units: tuple[Unit, ...] = ("s", "m")
     for unit in units:
         try:
@@ -266,6 +262,13 @@ def trajectory_figures(
             out |= dict.fromkeys(f"rpe_rot_{key}_deg_per_{unit}" for key in STATISTICS)
             out[f"rpe_per_{unit}_missing"] = str(error)
     return out
+
+
+def path_figures(estimate: Trajectory) -> dict[str, float]:
+    """Number of poses, duration and path length of a trajectory, for tables and JSON."""
+    steps = np.linalg.norm(np.diff(estimate.Ts_world_camera[:, :3, 3], axis=0), axis=1)
+    duration = float(estimate.timestamps[-1] - estimate.timestamps[0])
+    return {"poses": len(estimate), "duration_s": round(duration, 6), "path_length_m": round(float(steps.sum()), 6)}
 
 
 RUN_FIGURES = "ate_rmse_m", "ate_rot_rmse_deg", "rpe_trans_rmse_m_per_s", "rpe_rot_rmse_deg_per_s"
@@ -326,12 +329,6 @@ def rotation_angles(Ts: Numbers) -> Numbers:
     """
     chord = np.linalg.norm(Ts[:, :3, :3] - np.eye(3), axis=(1, 2)) / np.sqrt(8.0)
     return 2.0 * np.arcsin(np.clip(chord, 0.0, 1.0))
-
-
-def _statistics(errors: Numbers) -> tuple[float, float, float, float]:
-    """Root mean square, mean, median and maximum."""
-    rmse = float(np.sqrt(np.mean(errors**2)))
-    return rmse, float(errors.mean()), float(np.median(errors)), float(errors.max())
 
 
 def _span(trajectory: Trajectory) -> str:

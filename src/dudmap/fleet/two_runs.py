@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.pipeline.environment import machine, versions
-from dudmap.app.pipeline.run_folder import prepare_run_folder
+from dudmap.app.pipeline.run_folder import locked, prepare_run_folder
 from dudmap.atomic_file import write_bytes, write_text
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
@@ -57,29 +57,30 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
     if pair.T_a_b is None:
         raise MapError(f"{a} and {b} are not merged: {pair.reason}")
     merged = merged_map(*maps, pair.T_a_b)
-    prepare_run_folder(out, None, save_masks=False)
-    of_a, of_b = save_trajectories(out, [(a, np.eye(4)), (b, pair.T_a_b)])
-    merged.volume.save(out / MAP_FILE)
-    merged.save_keyframes(out / KEYFRAME_FILE)
-    mesh = merged.volume.extract_mesh()
-    mesh.save(out / "mesh.ply")
-    if (a / "config.toml").is_file():
-        write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
-    tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": of_a + of_b} | pair.tree()
-    sizes = {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
-    sizes |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
-    finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
-    tree |= sizes | {"finer_blocks_left_out": sum(finer)}
-    poses = sum(len(Trajectory.load(out / name)) for name in tree["trajectories"])
-    metrics: dict[str, Any] = {
-        "sequence": f"{a.name} and {b.name}",
-        "complete": True,
-        "frames": poses,
-        "tracked": poses,
-    }
-    metrics |= sizes | {"camera": asdict(merged.volume.camera), "versions": versions(), "machine": machine()}
-    write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
-    write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
+    with locked(out):
+        prepare_run_folder(out, None, save_masks=False)
+        of_a, of_b = save_trajectories(out, [(a, np.eye(4)), (b, pair.T_a_b)])
+        merged.volume.save(out / MAP_FILE)
+        merged.save_keyframes(out / KEYFRAME_FILE)
+        mesh = merged.volume.extract_mesh()
+        mesh.save(out / "mesh.ply")
+        if (a / "config.toml").is_file():
+            write_bytes(out / "config.toml", read_bytes(a / "config.toml"))
+        tree: dict[str, Any] = {"runs": [str(a), str(b)], "trajectories": of_a + of_b} | pair.tree()
+        sizes = {"map_blocks": merged.volume.num_blocks, "map_bytes": merged.volume.num_bytes}
+        sizes |= {"mesh_vertices": len(mesh.vertices), "mesh_triangles": len(mesh.faces)}
+        finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
+        tree |= sizes | {"finer_blocks_left_out": sum(finer)}
+        poses = sum(len(Trajectory.load(out / name)) for name in tree["trajectories"])
+        metrics: dict[str, Any] = {
+            "sequence": f"{a.name} and {b.name}",
+            "complete": True,
+            "frames": poses,
+            "tracked": poses,
+        }
+        metrics |= sizes | {"camera": asdict(merged.volume.camera), "versions": versions(), "machine": machine()}
+        write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
+        write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
     return MergeReport(out, pair, tree)
 
 

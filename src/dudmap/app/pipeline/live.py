@@ -1,7 +1,7 @@
 """A live run: frames of a camera are processed as they arrive; those dropped are counted, all may be recorded."""
 
 from collections.abc import Callable, Generator
-from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -11,17 +11,17 @@ from dudmap.app.pipeline.frame_source import SourceFrame, prepared
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.replay import arrivals
-from dudmap.app.pipeline.run import process_source
-from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, write_run_folder
+from dudmap.app.pipeline.run import Job
+from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder
+from dudmap.app.pipeline.storing import RunOptions, RunState
 from dudmap.config import Config
-from dudmap.errors import CameraError, DudmapError, FrameError
+from dudmap.errors import FrameError
 from dudmap.io.cameras import LiveCamera
 from dudmap.io.cameras.recorder import Recorder
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.geometry.calibration import Calibration
-    from dudmap.core.slam import Slam
 
 PREVIEW = 3
 """Frames with which the kernels are compiled or loaded before the stream begins."""
@@ -60,58 +60,27 @@ def run_live(
         CameraError: The camera stopped to deliver frames, after writing; or the recording cannot be written.
         DudmapError: Another process writes into the folder, it cannot be written, or no frame could be tracked.
     """
-    from dudmap.core.slam import Slam
-
     out, calibration = Path(out), calibration or camera.calibration
-    metrics = RunRecord(dropped=0)
-    slam = Slam(camera.camera, config, calibration=calibration, timed=camera.timed)
-    stopped, defect = "", False
-    with locked(out), RunProgress(max_frames or camera.length, bar=progress) as display:
+    options = RunOptions(config=config, max_frames=max_frames, save_masks=save_masks, save_map=save_map, live=True)
+    with locked(out):
         prepare_run_folder(out, None, save_masks=save_masks)
         recorder = None if record is None else Recorder(Path(record), camera.camera, camera.calibration)
+        display = RunProgress(max_frames or camera.length, bar=progress)
+        arriving = partial(_arriving_frames, camera, recorder)
+        job = Job(camera, out, options, display, observers=observers, arriving=arriving)
         try:
-            display.working("loading kernels")
-            first = Slam(camera.camera, config, calibration=calibration, timed=camera.timed)
-            for frame in camera.preview(PREVIEW):
-                first.process(frame)
-            for observer in observers:
-                observer.start(slam, out, None)
-            with closing(_arriving_frames(camera, recorder, slam, metrics.catch_up)) as frames:
-                for source in frames:
-                    process_source(source, slam, metrics, display, out if save_masks else None, None, observers)
-                    if max_frames is not None and len(metrics.rows) >= max_frames:
-                        break
-        except KeyboardInterrupt:
-            display.note(f"stopped by Ctrl-C after {len(metrics.rows)} frames")
-        except DudmapError as error:
-            stopped = str(error)
-            raise type(error)(f"{stopped}; the trajectory and the map up to there are in {out}") from error
-        except BaseException as error:
-            stopped, defect = repr(error), not isinstance(error, OSError)
-            raise
+            system = job.system(calibration=calibration)
+            return job.carry_out(RunState(system, RunRecord(dropped=0), calibration))
         finally:
-            try:
-                camera.close()
-                display.working("writing")
-                report = write_run_folder(out, slam, metrics, camera, config, stopped, save_map=save_map, defect=defect)
-                for observer in observers:
-                    observer.finish(out)
-            finally:
-                _finish(recorder, display)
-    if metrics.dropped:
-        display.note(f"live: {metrics.dropped} of {metrics.dropped + len(metrics.rows)} frames were dropped")
-    if not metrics.rows:
-        raise CameraError(f"no frame of the camera {camera.name} was processed")
-    if not len(report.trajectory):
-        raise DudmapError(f"none of the frames could be tracked; the first: {metrics.lost[0]['reason']}")
-    return report
+            camera.close()
+            _finish(recorder, display)
 
 
 def _arriving_frames(
-    camera: LiveCamera, recorder: Recorder | None, slam: "Slam", idle: Callable[[], bool]
+    camera: LiveCamera, recorder: Recorder | None, job: Job, state: RunState
 ) -> Generator[SourceFrame]:
-    """Frames of the camera, prepared by the thread that takes them; all that arrive are recorded, those for which there
-    is no time are dropped. For ``idle`` see ``replay.arrivals``."""
+    """Frames of the camera after the kernels are loaded, prepared by the thread that takes them; all that arrive are
+    recorded, those for which there is no time are dropped."""
 
     def deliver(put: Callable[[SourceFrame], None], wait: Callable[[float], bool]) -> None:
         start, latest = None, -np.inf
@@ -123,9 +92,13 @@ def _arriving_frames(
                 latest = arrived.frame.timestamp
                 if recorder is not None:
                     recorder.put(arrived.frame)
-            put(SourceFrame(arrived.number - start, prepared(arrived.frame, slam), arrival=arrived.time))
+            put(SourceFrame(arrived.number - start, prepared(arrived.frame, state.slam), arrival=arrived.time))
 
-    return arrivals(deliver, camera.close, idle)
+    job.display.working("loading kernels")
+    first = job.system(calibration=state.calibration)
+    for frame in camera.preview(PREVIEW):
+        first.process(frame)
+    yield from arrivals(deliver, camera.close, state.record.catch_up)
 
 
 def _finish(recorder: Recorder | None, display: RunProgress) -> None:

@@ -62,16 +62,17 @@ class RunRecord:
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
-    _wall_start: float = field(default_factory=time.perf_counter)
-    _cpu_start: float = field(default_factory=time.process_time)
+    _spent: tuple[float, float] = (0.0, 0.0)
+    _since: tuple[float, float] = field(default_factory=lambda: (time.perf_counter(), time.process_time()))
 
     def elapsed(self) -> tuple[float, float]:
-        """Seconds, and seconds of processor time, since the run began."""
-        return time.perf_counter() - self._wall_start, time.process_time() - self._cpu_start
+        """Seconds, and seconds of processor time, since the run began, without those between two processes of it."""
+        (wall, cpu), (wall_since, cpu_since) = self._spent, self._since
+        return wall + time.perf_counter() - wall_since, cpu + time.process_time() - cpu_since
 
-    def continue_from(self, wall_s: float, cpu_s: float) -> None:
-        """Count the time on from that of a process that ended."""
-        self._wall_start, self._cpu_start = time.perf_counter() - wall_s, time.process_time() - cpu_s
+    def settle(self) -> None:
+        """Note the time so far, from which a continued run goes on."""
+        self._spent, self._since = self.elapsed(), (time.perf_counter(), time.process_time())
 
     def add(
         self,

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 
 from dudmap.app.pipeline.frame_source import FrameRead, SourceFrame
 
-PATIENCE = 0.1
+MAX_WAIT = 0.1
 """Time for which a frame may wait for its processing, seconds: at 30 Hz one that takes three times as long as usual
 delays the next ones and drops none, and nothing is processed that is much older."""
 
 
-class WaitingRoom:
-    """Thread-safe queue between a sensor and its consumer: of the newest item and those at most ``PATIENCE`` older."""
+class FrameQueue:
+    """Thread-safe queue between a sensor and its consumer: of the newest item and those at most ``MAX_WAIT`` older."""
 
     def __init__(self) -> None:
         self._changed = threading.Condition()
@@ -31,7 +31,7 @@ class WaitingRoom:
     def put(self, item: SourceFrame) -> None:
         """Store a newer item; never blocks."""
         with self._changed:
-            self._held = [held for held in self._held if item.arrival - held.arrival <= PATIENCE] + [item]
+            self._held = [held for held in self._held if item.arrival - held.arrival <= MAX_WAIT] + [item]
             self._changed.notify()
 
     def take(self) -> SourceFrame | None:
@@ -56,7 +56,7 @@ def replay(
 ) -> None:
     """Deliver the frames of a recording in real time: the first one now, the others at their timestamps.
 
-    Of the frames that become due while an earlier one is read, the latest and those due since ``PATIENCE`` are read;
+    Of the frames that become due while an earlier one is read, the latest and those due since ``MAX_WAIT`` are read;
     the others are dropped.
 
     Args:
@@ -74,7 +74,7 @@ def replay(
                 return
         elapsed = now() - start
         latest = int(np.searchsorted(timestamps, elapsed, side="right")) - 1
-        index = max(index, min(latest, int(np.searchsorted(timestamps, elapsed - PATIENCE))))
+        index = max(index, min(latest, int(np.searchsorted(timestamps, elapsed - MAX_WAIT))))
         put(SourceFrame(index, read(index), arrival=start + timestamps[index]))
         index += 1
 
@@ -95,7 +95,7 @@ def arrivals(
     stop: Callable[[], None] | None = None,
     idle: Callable[[], bool] = lambda: False,
 ) -> Generator[SourceFrame]:
-    """Items that a sensor delivers; those for which the consumer leaves no room (``WaitingRoom``) are dropped.
+    """Items that a sensor delivers; those for which the consumer leaves no room (``FrameQueue``) are dropped.
 
     Args:
         deliver: Runs in a thread of its own and passes every item to its first argument. Its second argument waits for
@@ -103,22 +103,22 @@ def arrivals(
         stop: Called when the consumer stops, so that ``deliver`` does not wait for another item.
         idle: Called while no item waits; does a few milliseconds of other work and returns True, or has none.
     """
-    waiting: WaitingRoom = WaitingRoom()
+    queue: FrameQueue = FrameQueue()
     stopping, last = threading.Event(), -1
 
     def sensor() -> None:
         try:
-            deliver(waiting.put, stopping.wait)
+            deliver(queue.put, stopping.wait)
         finally:
-            waiting.close()
+            queue.close()
 
     with ThreadPoolExecutor(1, thread_name_prefix="dudmap-sensor") as thread:
         future = thread.submit(sensor)
         try:
             while True:
-                while waiting.is_empty and idle():
+                while queue.is_empty and idle():
                     pass
-                if (frame := waiting.take()) is None:
+                if (frame := queue.take()) is None:
                     break
                 yield frame._replace(dropped=frame.number - last - 1)
                 last = frame.number

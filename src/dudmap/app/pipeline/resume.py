@@ -55,7 +55,7 @@ def resume(
         with closing(reader):
             options, storing = stored.options, stored.options.storing
             with damaged(StateError, reader.path):
-                if storing is None:
+                if storing is None or options.max_frames is None:
                     raise ValueError("it does not say of which recording it is")
                 sequence = open_sequence(**storing.recording) if sequence is None else sequence
                 options = options.model_copy(update={"config": on_device(options.config, device)})
@@ -63,7 +63,7 @@ def resume(
             if stored.number is not None:
                 display = RunProgress(options.max_frames * options.passes, bar=progress)
                 masks = open_masks(options.masks, sequence)
-                job = Job(sequence, out, options, display, masks, observers=observers)
+                job = Job(sequence, out, options, display, masks, observers)
                 try:
                     store = RunStore(out, storing.every, display.note)
                     state = job.restored(reader, store)

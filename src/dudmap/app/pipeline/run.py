@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from dudmap.app.pipeline.frame_source import AHEAD, FrameRead, SourceFrame, in_order, load_kernels, read_frame
+from dudmap.app.pipeline.frame_source import AHEAD, SourceFrame, in_order, load_kernels, read_frame
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.progress import RunProgress
 from dudmap.app.pipeline.replay import in_real_time
@@ -15,14 +15,14 @@ from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
 from dudmap.app.state.database import StateReader
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
+from dudmap.io.cameras import LiveCamera
 from dudmap.io.sequences import is_timed
 
 if TYPE_CHECKING:
     from dudmap.app.pipeline.observer import RunObserver
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.places.saved_map import SavedMap
-    from dudmap.core.result import FrameResult
     from dudmap.core.slam import Slam
     from dudmap.io.sequences import Sequence
     from dudmap.io.sequences.masks import MaskFolder
@@ -41,13 +41,11 @@ def run(
     ahead: int = AHEAD,
     live: bool = False,
     passes: int = 1,
-    depth_model: str | Path | None = None,
     calibration: "Calibration | None" = None,
     calibrate: bool = False,
     saved_map: "SavedMap | None" = None,
     localize: bool = False,
     max_memory: int | None = None,
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None,
     observers: "tuple[RunObserver, ...]" = (),
     storing: Storing | None = None,
     warnings: Iterable[str] = (),
@@ -82,14 +80,12 @@ def run(
         passes: 2 processes the recording twice: in the second pass every frame is compared with the final map of the
             first, so that objects that were in view from the start also leave the map. The last complete pass is
             written.
-        depth_model: ``depth_model.npz`` of an earlier run with the same camera, applied to the depth of every frame.
         calibration: Of the colour camera; None takes that of the recording.
         calibrate: Estimate the calibration from the start of the recording first.
         saved_map: Map of an earlier run to go on in, which is taken over; all poses are given in its world frame.
         localize: Only find the camera in ``saved_map``; no map and no mesh is written.
         max_memory: Largest resident memory of the process, bytes; the parts of the map that are far from the camera
             wait on disk. None keeps the whole map in memory. It changes no result.
-        observe: Called after each processed frame with its number, what was read, and the result.
         observers: Told when a pass begins, of each processed frame of every pass, and when the run folder is written.
         storing: Store the state of the run while it goes on; None does not. A live replay cannot be stored.
         warnings: Sentences on what looks wrong in the recording (``pipeline.inspection``), for metrics.json.
@@ -102,7 +98,6 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.app.pipeline.calibration import calibrate_start
-    from dudmap.core.calibration.depth_model import DepthModel
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -125,13 +120,12 @@ def run(
     map_folder = None if saved_map is None else saved_map.folder
     options = RunOptions(
         config=config, max_frames=count, save_masks=save_masks, save_map=save_map, masks=_resolved(masks), ahead=ahead,
-        live=live, passes=passes, depth_model=_resolved(depth_model), saved_map=_resolved(map_folder),
+        live=live, passes=passes, saved_map=_resolved(map_folder),
         localize=localize, max_memory=max_memory, storing=storing,
     )  # fmt: skip
     with locked(out):
         display = RunProgress(count * passes, bar=progress)
-        job = Job(sequence, out, options, display, open_masks(masks, sequence), observe, observers)
-        model = None if depth_model is None else DepthModel.load(Path(depth_model))
+        job = Job(sequence, out, options, display, open_masks(masks, sequence), observers)
         prepare_run_folder(out, masks, save_masks=save_masks)
         store = None
         if storing is not None:
@@ -140,9 +134,9 @@ def run(
         if calibrate:
             calibration = calibrate_start(sequence, config, count, display.note if progress else None)
         calibration = calibration or sequence.calibration
-        slam = job.system(depth_model=model, calibration=calibration, live=live, saved_map=saved_map, localize=localize)
+        slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
         record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
-        state = RunState(slam, record, calibration, model)
+        state = RunState(slam, record, calibration)
         if store is not None:
             store.begin(state)
         return job.carry_out(state, store)
@@ -150,15 +144,15 @@ def run(
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A run as it was ordered; for the attributes see ``run``."""
+    """A run as it was ordered; for the attributes see ``run``. The frames of a camera are what ``arriving`` gives."""
 
-    sequence: "Sequence"
+    sequence: "Sequence | LiveCamera"
     out: Path
     options: RunOptions
     display: RunProgress
     masks: "MaskFolder | None" = None
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None" = None
     observers: "tuple[RunObserver, ...]" = ()
+    arriving: "Callable[[Job, RunState], Generator[SourceFrame]] | None" = None
 
     def system(self, **given: Any) -> "Slam":  # noqa: ANN401 - arguments of Slam
         """A new system for this recording."""
@@ -178,9 +172,6 @@ class Job:
         out, display, stopped, defect = self.out, self.display, "", False
         with ExitStack() as files, display:
             try:
-                if self.options.live:
-                    display.working("loading kernels")
-                    load_kernels(self._next_system(state), self.sequence, self.options.max_frames)
                 try:
                     self._process(state, store)
                 except DeviceError as error:
@@ -195,22 +186,28 @@ class Job:
                     display.note(_repeats(state.record))
                 if degenerate := state.record.counts["degenerate"]:
                     display.note(f"{degenerate} frames do not show all directions of motion: not fused")
-                if state.record.dropped:
-                    display.note(f"live: {state.record.dropped} of {self.options.max_frames} frames were dropped")
+                if dropped := state.record.dropped:
+                    total = dropped + len(state.record.rows) + len(state.record.unreadable)
+                    display.note(f"live: {dropped} of {total} frames were dropped")
             except KeyboardInterrupt:
-                stopped = f"interrupted after {len(state.record.rows)} frames{_of_second(state.finished)}"
-                raise KeyboardInterrupt(f"{stopped}; {_saved(state.finished)} in {out}") from None
+                count, of_pass = len(state.record.rows), " of the second pass" if state.first_slam else ""
+                if self.arriving is None:
+                    stopped = f"interrupted after {count} frames{of_pass}"
+                    raise KeyboardInterrupt(f"{stopped}; {_saved(state.first_slam)} in {out}") from None
+                display.note(f"stopped by Ctrl-C after {count} frames")  # as a stream without an end is
             except DudmapError as error:
                 stopped = str(error)
-                raise type(error)(f"{stopped}; {_saved(state.finished)} in {out}") from error
+                raise type(error)(f"{stopped}; {_saved(state.first_slam)} in {out}") from error
             except BaseException as error:
                 stopped, defect = repr(error), not isinstance(error, OSError | MemoryError)
                 raise
             finally:
                 report = self._finish(state, store, stopped, defect=defect)
-        record, count = state.record, self.options.max_frames
+        record, count = state.record, self.options.max_frames or len(state.record.rows)
         if record.rows and not len(report.trajectory):
             raise DudmapError(f"none of the {count} frames could be tracked; the first: {record.lost[0]['reason']}")
+        if not record.rows and self.arriving is not None:
+            raise CameraError(f"no frame of the camera {self.sequence.name} was processed")
         if not record.rows:
             raise DatasetError(f"none of the {count} frames could be read; the first: {record.unreadable[0]}")
         return report
@@ -220,41 +217,45 @@ class Job:
         options = self.options
         for number in range(state.number, options.passes):
             if number > state.number:
-                state.finished = state.slam, state.record
+                state.first_slam, state.first_record = state.slam, state.record
                 masked = state.record.masked and 0
                 state.slam = self._next_system(state, first_pass=state.slam)
                 state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
                 state.number, state.next = number, 0
-            last = number == options.passes - 1
             for observer in self.observers:
                 if state.next:
                     observer.resume(state.slam, self.out, options.max_frames, state.next)
                 else:
                     observer.start(state.slam, self.out, options.max_frames)
-            mask_folder = self.out if options.save_masks and last else None
+            mask_folder = self.out if options.save_masks and number == options.passes - 1 else None
             with closing(self._frames(state)) as frames:
                 for frame in frames:
-                    process_source(
-                        frame, state.slam, state.record, self.display, mask_folder, self.observe if last else None,
-                        self.observers,
-                    )  # fmt: skip
+                    process_source(frame, state.slam, state.record, self.display, mask_folder, self.observers)
                     state.next = frame.number + 1
                     if store is not None:
                         store.frame(state, frame.read.frame)
+                    if len(state.record.rows) == options.max_frames:
+                        break
         if store is not None:
             store.end(state)
 
     def _frames(self, state: RunState) -> Generator[SourceFrame]:
         """The frames of a pass that are left."""
+        if self.arriving is not None:
+            return self.arriving(self, state)
         count, sequence, slam = self.options.max_frames, self.sequence, state.slam
+        assert count is not None
+        assert not isinstance(sequence, LiveCamera)
         if self.options.live:
+            self.display.working("loading kernels")
+            load_kernels(self._next_system(state), sequence, count)
             times, idle = sequence.timestamps[:count], state.record.catch_up
             return in_real_time(times, lambda index: read_frame(sequence, index, self.masks, slam), idle)
         return in_order(sequence, count, self.options.ahead, self.masks, slam, state.next)
 
     def _next_system(self, state: RunState, first_pass: "Slam | None" = None) -> "Slam":
         """A new system with what is known of the camera; for a second pass with the first."""
-        return self.system(first_pass=first_pass, depth_model=state.model, calibration=state.calibration)
+        return self.system(first_pass=first_pass, calibration=state.calibration)
 
     @contextmanager
     def _from_checkpoint(self, state: RunState, store: RunStore) -> Iterator[tuple[RunState, RunStore]]:
@@ -270,8 +271,8 @@ class Job:
         """Write the run folder; what is stored of a run that was not stopped is then no longer needed."""
         self.display.working("writing")
         slam, record = state.slam, state.record
-        if stopped and state.finished is not None:  # the first pass is complete, the second is not
-            slam, record = state.finished
+        if stopped and state.first_slam is not None:  # the first pass is complete, the second is not
+            slam, record = state.first_slam, state.first_record or record
         complete = False
         try:
             config, save_map = self.options.config, self.options.save_map
@@ -305,13 +306,8 @@ def _repeats(record: RunRecord) -> str:
     return f"of {len(record.rows)} frames, some repeat images of the frame before: {counts}"
 
 
-def _of_second(finished: object) -> str:
-    return " of the second pass" if finished else ""
-
-
-def _saved(finished: object) -> str:
-    whole = "the trajectory and the map of the first pass are"
-    return whole if finished else "the trajectory and the map up to there are"
+def _saved(first_pass: object) -> str:
+    return f"the trajectory and the map {'of the first pass' if first_pass else 'up to there'} are"
 
 
 def open_masks(folder: str | Path | None, sequence: "Sequence") -> "MaskFolder | None":
@@ -331,7 +327,6 @@ def process_source(
     record: RunRecord,
     display: RunProgress,
     mask_folder: Path | None,
-    observe: "Callable[[int, FrameRead, FrameResult], None] | None",
     observers: "tuple[RunObserver, ...]" = (),
 ) -> None:
     """Process one frame, count it, save its mask, and report it."""
@@ -344,11 +339,10 @@ def process_source(
         for observer in observers:
             observer.event("unreadable", frame=index, reason=str(read.frame))
         return
-    true_mask = read.true_mask
+    true_mask, given_mask = read.true_mask, read.given_mask
     if isinstance(true_mask, FrameError):
         display.note(f"frame {index}: the true mask is not scored, {true_mask}")
         true_mask = None
-    given_mask = read.given_mask
     if isinstance(given_mask, FrameError):
         display.note(f"frame {index}: the given mask is ignored, {given_mask}")
         given_mask = None
@@ -370,8 +364,6 @@ def process_source(
             save_mask(mask_folder / "masks" / f"{result.timestamp:.6f}.png", result.dynamic_mask)
         except OSError as error:
             display.once(f"masks cannot be written: {error}; make room on the disk of the run folder")
-    if observe is not None:
-        observe(index, read, result)
     for observer in observers:
         try:
             observer.frame(index, read, result, 1000 * (end - start))

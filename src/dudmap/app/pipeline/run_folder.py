@@ -1,7 +1,6 @@
 """The run folder: creation, cleaning and writing of all result files."""
 
 import json
-import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.app.pipeline.environment import machine, versions
+from dudmap.app.pipeline.environment import machine, peak_rss_mb, versions
 from dudmap.app.pipeline.metrics import RunRecord
 from dudmap.app.pipeline.storing import FILES as STATE_FILES
 from dudmap.app.state.run_lock import RunLock
@@ -24,7 +23,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DudmapError, MapError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import is_recording
-from dudmap.own_folder import OwnFolder, make_folder, remove_files
+from dudmap.own_folder import make_folder, remove_files
 
 if TYPE_CHECKING:
     from dudmap.core.objects.object_map import RigidObject
@@ -34,11 +33,9 @@ if TYPE_CHECKING:
 
 FILES = (
     "trajectory.txt", "groundtruth.txt", "mesh.ply", "map.npz", "config.toml", "metrics.json", "timings.csv",
-    "checks.csv", "residuals.npz", "movers.jsonl", "depth_model.npz", "calibration.toml", "keyframes.npz",
+    "checks.csv", "residuals.npz", "movers.jsonl", "calibration.toml", "keyframes.npz",
     "merge.json", "report.html",
 )  # fmt: skip
-PROBE = ".dudmap-probe"
-"""File that is made and removed to see whether the folder can be written."""
 SCORES = (
     "evaluation.json", "mesh.evaluation.json", "masks.evaluation.json", "trajectory.png", "error.png", "rpe.png",
     "residuals.png", "mesh_error.ply", "mesh_error.png", "masks.png",
@@ -107,22 +104,18 @@ def _writing_into(out: Path) -> Iterator[None]:
 
 
 def prepare_run_folder(out: Path, masks: str | Path | None, *, save_masks: bool) -> None:
-    """Create the run folder, check that it is writable, and remove the results of an earlier run.
+    """Remove the results of an earlier run from the run folder, which is ``locked``.
 
     Raises:
-        DudmapError: The folder cannot be created or written, or holds a recording or the masks to be read.
+        DudmapError: The folder cannot be written, or holds a recording or the masks to be read.
     """
-    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or (out.is_dir() and is_recording(out)):
+    if (out / "rgb.txt").exists() or (out / "depth.txt").exists() or is_recording(out):
         raise DudmapError(
             f"{out} holds a recording, whose ground truth and masks a run would overwrite; name another folder"
         )
     if masks is not None and (out / "masks").resolve() == Path(masks).resolve():
         raise DudmapError(f"the masks to be read lie in the run folder {out}, which is emptied; name another folder")
     with _writing_into(out):
-        out.mkdir(parents=True, exist_ok=True)
-        with OwnFolder(out, linked=True) as folder:
-            os.close(folder.create(PROBE))
-            folder.remove(PROBE)
         remove_files(out, WRITTEN)
         if save_masks:
             make_folder(out / "masks")
@@ -151,12 +144,11 @@ def write_run_folder(
     (trajectory, volume), *others = slam.maps
     metrics: dict[str, Any] = {"sequence": sequence.name, "complete": not stopped, "stopped_by": stopped or None}
     metrics |= {"recording": getattr(sequence, "opened", None), "sources": getattr(sequence, "sources", {})}
-    metrics |= record.metrics()
-    sizes = {"map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes}
-    metrics |= sizes | {"mesh_vertices": 0, "mesh_triangles": 0}
-    metrics["maps"] = len(others) + 1
     calibration = slam.calibration
-    metrics["calibration"] = calibration.tree()
+    metrics |= record.metrics() | {
+        "map_blocks": volume.num_blocks, "map_bytes": volume.num_bytes, "mesh_vertices": 0, "mesh_triangles": 0,
+        "maps": len(others) + 1, "calibration": calibration.tree(),
+    }  # fmt: skip
 
     def save_mesh() -> None:
         if volume.pager is not None:  # the mesh may not fit into the memory either
@@ -170,9 +162,8 @@ def write_run_folder(
     def save_metrics() -> None:
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
-        metrics.update(camera=asdict(sequence.camera), versions=versions(), machine=machine())
-        metrics["device"] = slam.device
-        metrics["peak_rss_mb"] = record.metrics()["peak_rss_mb"]
+        about = {"versions": versions(), "machine": machine(), "device": slam.device, "peak_rss_mb": peak_rss_mb()}
+        metrics.update(camera=asdict(sequence.camera), **about)
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 
     steps: list[Callable[[], None]] = [
@@ -197,10 +188,6 @@ def write_run_folder(
             partial(path.save, out / f"trajectory-{number}.txt"),
             lambda part=part, number=number: part.extract_mesh().save(out / f"mesh-{number}.ply"),
         ]
-    if config.sensor.distortion:
-        model = slam.learnt_depth_model()
-        metrics["depth_distortion"] = {"views": model.views, "largest": round(model.largest(sequence.camera), 6)}
-        steps.append(lambda: model.save(out / "depth_model.npz"))
     if config.movers.meshes:
         steps.append(lambda: metrics.update(bodies=_save_objects(out / "movers", slam.rigid_objects)))
     problems = []

@@ -12,20 +12,18 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from dudmap.app.pipeline.environment import versions
 from dudmap.app.pipeline.frame_source import AHEAD
 from dudmap.app.pipeline.metrics import RunRecord
-from dudmap.app.state import schema
 from dudmap.app.state.checkpoints import Checkpoints
 from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.identity import code_fingerprint, frame_fingerprint, images_fingerprint, recording_fingerprint
 from dudmap.app.state.system import check_code, restore
 from dudmap.config import Config
 from dudmap.errors import DudmapError, StateError
-from dudmap.input_files import DAMAGE, damaged, read_json
+from dudmap.input_files import DAMAGE, read_json
 from dudmap.own_folder import remove_files
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from dudmap.core.calibration.depth_model import DepthModel
     from dudmap.core.frames.frame import Frame
     from dudmap.core.geometry.calibration import Calibration
     from dudmap.core.slam import Slam
@@ -56,14 +54,13 @@ class RunOptions(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     config: Config
-    max_frames: int
+    max_frames: int | None
     save_masks: bool = False
     save_map: bool = True
     masks: Path | None = None
     ahead: int = AHEAD
     live: bool = False
     passes: int = 1
-    depth_model: Path | None = None
     saved_map: Path | None = None
     localize: bool = False
     max_memory: int | None = None
@@ -93,38 +90,19 @@ class RunState:
 
     Attributes:
         slam, record: The system and the metrics of the pass that goes on.
-        calibration, model: Of the camera, as given.
+        calibration: Of the camera, as given.
         number: Number of the pass, from 0.
         next: Number of the frame that comes next.
-        finished: System and metrics of the first pass, during the second.
+        first_slam, first_record: System and metrics of the first pass, during the second.
     """
 
     slam: "Slam"
     record: RunRecord
     calibration: "Calibration | None" = None
-    model: "DepthModel | None" = None
     number: int = 0
     next: int = 0
-    finished: "tuple[Slam, RunRecord] | None" = None
-
-    def tree(self) -> dict[str, Any]:
-        """What is stored of it."""
-        slam, record = self.finished or (None, None)
-        return {
-            "slam": self.slam, "record": self.record, "calibration": self.calibration, "model": self.model,
-            "number": self.number, "next": self.next, "finished_slam": slam, "finished_record": record,
-            "clocks": [list(one.elapsed()) for one in (self.record, record) if one is not None],
-        }  # fmt: skip
-
-    @classmethod
-    def of_tree(cls, tree: dict[str, Any]) -> "RunState":
-        """The state that ``tree`` described."""
-        slam, record = tree["finished_slam"], tree["finished_record"]
-        for one, clock in zip([tree["record"], record], tree["clocks"], strict=False):
-            one.continue_from(*clock)
-        finished = None if slam is None else (slam, record)
-        calibration, model = tree["calibration"], tree["model"]
-        return cls(tree["slam"], tree["record"], calibration, model, tree["number"], tree["next"], finished)
+    first_slam: "Slam | None" = None
+    first_record: RunRecord | None = None
 
 
 class RunStore:
@@ -162,19 +140,26 @@ class RunStore:
 
     def begin(self, state: RunState) -> None:
         """Store the state before the first frame."""
-        self.checkpoints.take(state.tree(), {"pass": 0, "next": 0, "frame": ""}, wait=True)
+        self._take(state, "", wait=True)
 
     def frame(self, state: RunState, frame: "Frame | Exception") -> None:
         """A frame was processed; take a checkpoint if one is due."""
         if not isinstance(frame, Exception):
             self.checkpoints.add_file(self._out / "masks" / f"{frame.timestamp:.6f}.png")
         if self.checkpoints.is_due:
-            self.checkpoints.take(state.tree(), _position(state, frame))
+            self._take(state, images_fingerprint(frame))
 
     def end(self, state: RunState) -> None:
         """All frames are processed, and the results will be written: store the last state unless the run was short."""
         if not self.checkpoints.is_short:
-            self.checkpoints.take(state.tree(), {"pass": state.number, "next": state.next, "frame": ""}, wait=True)
+            self._take(state, "", wait=True)
+
+    def _take(self, state: RunState, frame: str, *, wait: bool = False) -> None:
+        for record in filter(None, (state.record, state.first_record)):
+            record.settle()
+        updated = datetime.now().isoformat(" ", "seconds")
+        place = {"pass": state.number, "next": state.next, "frame": frame, "updated": updated}
+        self.checkpoints.take(state, place, wait=wait)
 
     def reopened(self) -> "RunStore":
         """The same after ``close``, to go on from what is stored."""
@@ -233,19 +218,8 @@ def restored(reader: StateReader, store: RunStore, slam: "Slam", other: "Slam") 
     Raises:
         StateError: The database is damaged.
     """
-    current = {"slam": slam, "record": RunRecord(), "finished_slam": other, "finished_record": RunRecord()}
-    tree = restore(reader, current, store.database, slam.device)
-    with damaged(StateError, reader.path):
-        state = RunState.of_tree(tree)
-        if not schema.fits_fields(state):
-            raise ValueError(f"it is no state of a run: {sorted(tree)}")
-        return state
-
-
-def _position(state: RunState, frame: "Frame | Exception") -> dict[str, Any]:
-    """Where a run stands, for everyone who reads the database."""
-    return {"pass": state.number, "next": state.next, "frame": images_fingerprint(frame),
-            "updated": datetime.now().isoformat(" ", "seconds")}  # fmt: skip
+    current = RunState(slam, RunRecord(), first_slam=other, first_record=RunRecord())
+    return restore(reader, current, store.database, slam.device)
 
 
 def _why_nothing(out: Path) -> str:

@@ -199,7 +199,8 @@ class StateReader:
         path: The file.
 
     Raises:
-        StateError: There is none, or it is no database of this version.
+        StateError: There is none, or it is no database of this version; by all methods: it is damaged, or what they
+            read is missing.
     """
 
     def __init__(self, path: Path) -> None:
@@ -230,22 +231,14 @@ class StateReader:
             raise StateError(f"{path} is damaged or not of this program: its tables are not those of a state")
 
     def meta(self) -> dict[str, Any]:
-        """What describes the run, by name.
-
-        Raises:
-            StateError: The database is damaged.
-        """
+        """What describes the run, by name."""
         try:
             return {key: parse_json(value, exact=True) for key, value in self._rows("SELECT key, value FROM meta")}
         except (ValueError, TypeError, AttributeError) as error:
             raise self._damaged(error) from error
 
     def state(self) -> tuple[Any, list[NDArray], list[list[Any]]] | None:
-        """Tree, arrays and records of the checkpoint; None if there is none yet.
-
-        Raises:
-            StateError: The database is damaged.
-        """
+        """Tree, arrays and records of the checkpoint; None if there is none yet."""
         rows = list(self._rows("SELECT crc, tree FROM state"))
         if not rows:
             return None
@@ -267,11 +260,7 @@ class StateReader:
             raise self._damaged(error) from error
 
     def blocks(self, map_number: int) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int32]]:
-        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of the blocks of a map, by slot.
-
-        Raises:
-            StateError: The database is damaged.
-        """
+        """Slots (n,), block coordinates (n, 3) and voxels (n, VOXELS) of the blocks of a map, by slot."""
         select = "SELECT slot, x, y, z, crc, voxels FROM blocks WHERE map = ? ORDER BY slot"
         rows = list(self._rows(select, map_number))
         for *place, crc, content in rows:
@@ -286,11 +275,7 @@ class StateReader:
         return places[:, 0], places[:, 1:], voxels
 
     def region(self, map_number: int, region: Region) -> BlockRecords:
-        """Blocks of a region of a map that had left the memory.
-
-        Raises:
-            StateError: They are missing, or the database is damaged.
-        """
+        """Blocks of a region of a map that had left the memory."""
         columns, where = ", ".join(COLUMNS), "map = ? AND x = ? AND y = ? AND z = ?"
         select = f"SELECT level, crc, {columns} FROM regions WHERE {where} ORDER BY level"
         rows = list(self._rows(select, map_number, *region))
@@ -302,11 +287,7 @@ class StateReader:
             raise self._damaged(f"region {region}: {error}") from error
 
     def frame(self, store: int, serial: int) -> EncodedFrame:
-        """A stored frame by its serial: depth, colour and mask as files.
-
-        Raises:
-            StateError: It is missing, or the database is damaged.
-        """
+        """A stored frame by its serial: depth, colour and mask as files."""
         select = "SELECT depth, color, mask FROM frames WHERE store = ? AND number = ?"
         rows = list(self._rows(select, store, serial))
         if not rows or not all(isinstance(content, bytes) for content in rows[0]):

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin
 import numpy as np
 
 CLASSES = """
-app.pipeline.metrics:RunRecord
+app.pipeline.metrics:RunRecord app.pipeline.storing:RunState
 config:ConfigSection,SensorConfig,PreprocessConfig,SimilarityConfig,VolumeConfig,TrackerConfig,DynamicsConfig,RelocalizationConfig,LoopsConfig,SubmapsConfig,MoversConfig,Config
 core.backends.cpu.consensus:ConsensusParams,LinearizedMotions,Correspondences
 core.backends.cpu.evidence:ResidualCounts,EvidenceParameters,NoiseParameters,ReadingNoise
@@ -24,15 +24,14 @@ core.backends.cpu.reprojection:ReprojectionTarget,Reprojection core.backends.cpu
 core.backends.cpu.splatting:PointImage core.backends.descent:DescentRules,Descent core.backends.mirror:Mirror
 core.backends.parameters:SensorNoise,TruncationBand,FusionParameters,RegistrationParameters,ColorProjection,RaycastParameters,MeshParameters,FilterParameters,VoxelGrid,DepthTiles,DepthView,FusedBlocks,NormalEquations,MapSample,RaycastResult,MeshArrays
 core.bootstrap:StartFrame,Bootstrap core.calibration.adjustment:Fit,_PairSystems,_System,Adjustment
-core.calibration.collector:KeyframeCollector core.calibration.depth_estimator:DepthView
-core.calibration.depth_model:DepthModel core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
+core.calibration.collector:KeyframeCollector core.calibration.estimator:Estimate,_Trial,CalibrationEstimator
 core.calibration.keyframes:ColorKeyframe core.calibration.pairs:Pair,PairSet
 core.calibration.self_calibration:SelfCalibration core.color_calibration:ColorCalibration
 core.dynamics.background_model:BackgroundModel
 core.dynamics.detector:_Comparison,DynamicDetector core.dynamics.dominant_motion:LabelledCorners,DominantMotion
 core.dynamics.ego_motion:OlderImage,SlowMotion,EgoMotionSegmenter core.dynamics.masks:Labels
 core.dynamics.mixture:Mixture core.dynamics.segments:Segmentation,SegmentEvidence
-core.dynamics.temporal_memory:RememberedFrame,TemporalMemory core.frames.depth_correction:DepthCorrection
+core.dynamics.temporal_memory:RememberedFrame,TemporalMemory
 core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level core.frames.preprocess:Preprocessor
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
@@ -47,8 +46,8 @@ core.objects.object_map:RigidObject,ObjectVolume,ObjectTrack
 core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker core.objects.object_view:ObjectView
 core.objects.regions:MovingPixels,Region core.objects.scene_flow:InstanceFrame core.places.atlas:TimedPose,Atlas
 core.places.features:ImageFeatures,SiftExtractor core.places.frame_file:FilePlace,FrameFile
-core.places.frame_store:StoredFrame,RemovedFrames,FrameStore core.places.frame_thinning:FrameThinning
-core.places.glimpse:Glimpse,Visibility core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
+core.places.frame_store:StoredFrame,FrameStore core.places.frame_thinning:FrameThinning
+core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
 core.places.loop_correction:LoopCorrector core.places.loop_verification:LoopQuery,LoopVerifier
 core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge
@@ -68,9 +67,10 @@ NOT_STORED = {
     "BlockPager": (
         "_store", "_executor", "_away", "_writing", "_reading", "_unchanged_since", "_serial", "_archived", "_archive",
     ),
-    "FrameStore": ("registered", "_places", "_glimpses", "_file", "_encoder", "_pending", "archived"),
+    "FrameStore": ("registered", "_places", "_file", "_encoder", "_pending", "archived"),
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
+    "RunRecord": ("_since",),
     "Observation": ("_halvings", "_recorded_halvings"),
     "SimilarityTest": ("_sift",),
     "Slam": ("device",),
@@ -192,11 +192,6 @@ def check_value(cls: type, name: str, value: object, like: object) -> None:
     if not (is_alike(value, like) if hint is Any else fits(value, hint)):
         expected = type(like).__name__ if hint is Any else getattr(hint, "__name__", hint)
         raise ValueError(f"found {type(value).__name__}; expected {expected}")
-
-
-def fits_fields(value: object) -> bool:
-    """Whether the attributes of a dataclass are what their annotations say."""
-    return all(fits(getattr(value, name), hint) for name, hint in _hints(type(value)).items())
 
 
 def is_alike(value: object, like: object) -> bool:

@@ -5,15 +5,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from dudmap.app.pipeline.environment import versions
-from dudmap.app.state.blocks import restore_map
 from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.identity import code_fingerprint
 from dudmap.app.state.tree import Snapshot, TreeReader, TreeWriter
 from dudmap.config import Config
-from dudmap.core.backends.device import make_backend
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import StateError
 from dudmap.input_files import damaged
 
@@ -47,25 +43,7 @@ def restore(reader: StateReader, current: object, database: StateDatabase | None
     Raises:
         StateError: The database is damaged or of another version, or holds no state yet.
     """
-    stored = reader.state()
-    if stored is None:
-        raise StateError(f"{reader.path} holds no checkpoint yet")
-    tree, arrays, records = stored
-
-    def load_map(volume: TsdfVolume, number: int, index: dict[str, Any]) -> None:
-        restore_map(volume, index, *reader.blocks(number), lambda region: reader.region(number, region))
-        if database is not None:
-            database.maps.add(volume, number)
-
-    def load_frames(store: FrameStore, number: int) -> None:
-        if reader.frames(number) != store.serials:
-            raise StateError(f"the state of the run in {reader.path} is damaged: stored frames are missing")
-        store.continue_from(lambda serial: reader.frame(number, serial))
-        if database is not None:
-            database.frames.add(store, number)
-
-    reading = TreeReader(arrays, records, load_map, load_frames, lambda: make_backend(device))
-    value = reading.restore(tree, current)
+    value = TreeReader(reader, database, device).restore(current)
     reader.release()
     return value
 

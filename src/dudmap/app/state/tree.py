@@ -9,7 +9,6 @@ A node is a number, a text, None, or an object with one key that names its kind.
 """
 
 from collections import deque
-from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field, is_dataclass
 from typing import TYPE_CHECKING, Any
@@ -19,8 +18,8 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from dudmap.app.state import schema
-from dudmap.core.backends.cpu.backend import CpuBackend
-from dudmap.core.backends.spec import Backend
+from dudmap.app.state.blocks import MapSnapshot, StoredMaps, restore_map
+from dudmap.core.backends.device import make_backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.frame_file import FrameFile
@@ -29,7 +28,7 @@ from dudmap.errors import DatasetError, StateError
 from dudmap.input_files import DAMAGE
 
 if TYPE_CHECKING:
-    from dudmap.app.state.blocks import MapSnapshot, StoredMaps
+    from dudmap.app.state.database import StateDatabase, StateReader
     from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 
 Node = Any
@@ -54,7 +53,7 @@ class Snapshot:
     arrays: list[NDArray] = field(default_factory=list)
     records: list[list[Any]] = field(default_factory=list)
     constant: set[int] = field(default_factory=set)
-    maps: "list[MapSnapshot]" = field(default_factory=list)
+    maps: list[MapSnapshot] = field(default_factory=list)
     frames: "list[FrameSnapshot]" = field(default_factory=list)
 
 
@@ -70,7 +69,7 @@ class TreeWriter:
         wait: Wait for what is being computed in the background; else that raises ``NotSettledError``.
     """
 
-    def __init__(self, maps: "StoredMaps", frames: "StoredFrames", *, wait: bool) -> None:
+    def __init__(self, maps: StoredMaps, frames: "StoredFrames", *, wait: bool) -> None:
         self.snapshot = Snapshot()
         self._maps, self._frames, self._wait = maps, frames, wait
         self._seen: dict[int, tuple[int, object]] = {}  # number and value by identity, which the value keeps alive
@@ -179,43 +178,39 @@ class TreeWriter:
 
 
 class TreeReader:
-    """Gives a system the state of a tree.
+    """Gives a system the state that a database holds.
 
     Args:
-        arrays: Arrays by number, which become part of the system.
-        records: Lists of plain values by number.
-        load_map: Fills a map, given its number in the database and what the tree says of its blocks.
-        load_frames: Connects a frame store with the stored frames of a number.
-        make_backend: Makes a back end where the given system has none in that place.
+        reader: The database.
+        database: Takes note of what it holds already, where the run goes on in the same database.
+        device: Device of the back ends that are made where the given system has none in that place.
+
+    Raises:
+        StateError: The database is damaged, or holds no state yet.
     """
 
-    def __init__(
-        self,
-        arrays: Sequence[NDArray],
-        records: Sequence[list[Any]],
-        load_map: Callable[[TsdfVolume, int, dict[str, Any]], None],
-        load_frames: Callable[[FrameStore, int], None],
-        make_backend: Callable[[], Backend] = CpuBackend,
-    ) -> None:
-        self._arrays, self._records = arrays, records
-        self._load_map, self._load_frames, self._make_backend = load_map, load_frames, make_backend
+    def __init__(self, reader: "StateReader", database: "StateDatabase | None" = None, device: str = "cpu") -> None:
+        self._reader, self._database, self._device = reader, database, device
+        stored = reader.state()
+        if stored is None:
+            raise StateError(f"{reader.path} holds no checkpoint yet")
+        self._tree, self._arrays, self._records = stored
         self._made: dict[int, Any] = {}
         self._at: list[str] = []  # where the tree is being read, which an error names
         self._new: dict[type, dict[str, Any]] = {}  # attributes of a new object by class
         self._taken: set[int] = set()  # identities of the objects of the given system that are in use
 
-    def restore(self, node: Node, current: object) -> Any:  # noqa: ANN401
-        """The value of a tree.
+    def restore(self, current: object) -> Any:  # noqa: ANN401
+        """The value that was stored last.
 
         Args:
-            node: The tree.
             current: A new value of the same kind, whose objects are used, so that they stay connected.
 
         Raises:
-            StateError: The tree is damaged or of another version.
+            StateError: The state is damaged or of another version.
         """
         try:
-            value = self._value(node, current)
+            value = self._value(self._tree, current)
             if not schema.is_alike(value, current):
                 raise ValueError(f"found {type(value).__name__}; expected {type(current).__name__}")
             return value
@@ -232,7 +227,7 @@ class TreeReader:
                 return self._made[number]
             case {"backend": number}:
                 usable = type(current).__name__ in schema.BACKENDS and id(current) not in self._taken
-                return self._use(number, current if usable else self._make_backend())
+                return self._use(number, current if usable else make_backend(self._device))
             case {"scalar": name, "value": value}:
                 kind = np.dtype(name)
                 if kind.kind not in "biuf" or not isinstance(value, bool | int | float):
@@ -326,7 +321,7 @@ class TreeReader:
 
     def _object(self, node: dict[str, Node], current: Any) -> Any:  # noqa: ANN401
         cls = schema.class_of(node["object"])
-        frozen = is_dataclass(cls) and cls.__dataclass_params__.frozen  # pyright: ignore[reportAttributeAccessIssue]
+        frozen = is_dataclass(cls) and getattr(cls, "__dataclass_params__").frozen  # noqa: B009 - not in the stubs
         usable = type(current) is cls and id(current) not in self._taken and not frozen
         if issubclass(cls, BaseModel | tuple) or not hasattr(cls, "__dict__"):
             raise ValueError(f"{cls.__name__} is no class of plain objects")
@@ -345,10 +340,24 @@ class TreeReader:
         if cls is Camera:
             value.__post_init__()  # its size decides how much memory is taken
         if "map" in node:
-            self._load_map(value, node["map"], self._value(node["blocks"]))
+            self._fill_map(value, node["map"], self._value(node["blocks"]))
         if "store" in node:
-            self._load_frames(value, node["store"])
+            self._connect_frames(value, node["store"])
         return value
+
+    def _fill_map(self, volume: TsdfVolume, number: int, index: dict[str, Any]) -> None:
+        reader = self._reader
+        restore_map(volume, index, *reader.blocks(number), lambda region: reader.region(number, region))
+        if self._database is not None:
+            self._database.maps.add(volume, number)
+
+    def _connect_frames(self, store: FrameStore, number: int) -> None:
+        reader = self._reader
+        if reader.frames(number) != store.serials:
+            raise StateError(f"the state of the run in {reader.path} is damaged: stored frames are missing")
+        store.continue_from(lambda serial: reader.frame(number, serial))
+        if self._database is not None:
+            self._database.frames.add(store, number)
 
 
 def _defaults(cls: type) -> dict[str, Any]:
@@ -357,6 +366,7 @@ def _defaults(cls: type) -> dict[str, Any]:
         "BlockPager": {"_store": None, "_executor": None},
         "FrameStore": {"registered": None, "_file": FrameFile(), "_encoder": None, "_pending": deque()},
         "LoopCloser": {"_executor": None},
+        "RunRecord": {"_since": (0.0, 0.0)},
         "Observation": {"_halvings": [], "_recorded_halvings": []},
     }  # fmt: skip
     return {name: value for base in cls.__mro__ for name, value in made.get(base.__name__, {}).items()}

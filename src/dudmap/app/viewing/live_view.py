@@ -75,14 +75,22 @@ class LiveView(RunObserver):
         assert self._slam is not None
         images = None if isinstance(read.frame, FrameError) else FrameImages.of(read.frame, result)
         self._feed.offer(self._slam.atlas.volume)
-        self._put(FrameFigures.of(result, ms), images, self._poses() if result.corrected else None)
+        figures = FrameFigures.of(result, ms)
+        with self._changed:
+            self._news.figures.append(figures)
+            self._news.images = images or self._news.images
+            if result.corrected:
+                self._news.poses = self._poses()
+            self._changed.notify()
         self.costs.append(1000 * (time.perf_counter() - start))
 
     def finish(self, out: Path) -> None:
         """Show the final trajectory and mesh."""
         if self._slam is not None and self._error is None:
             self._feed.offer(self._slam.atlas.volume, now=True)
-            self._put(None, None, self._poses())
+            with self._changed:
+                self._news.poses = self._poses()
+                self._changed.notify()
 
     def close(self) -> None:
         """End the thread once all is shown.
@@ -102,17 +110,6 @@ class LiveView(RunObserver):
         assert self._slam is not None
         path = self._slam.trajectory
         return dict(zip(path.timestamps.tolist(), path.Ts_world_camera, strict=True))
-
-    def _put(
-        self, figures: FrameFigures | None, images: FrameImages | None, poses: "dict[float, NDArray] | None"
-    ) -> None:
-        with self._changed:
-            news = self._news
-            if figures is not None:
-                news.figures.append(figures)
-            news.images = images or news.images
-            news.poses = poses if poses is not None else news.poses
-            self._changed.notify()
 
     def _take(self) -> _News | None:
         """All news; waits for some. None once the run is over and all is shown."""
@@ -134,7 +131,7 @@ class LiveView(RunObserver):
                 self._window.show_mesh(self._feed.take())
                 self._window.add_frames(news.figures, news.poses)
                 if news.images is not None and news.figures:
-                    self._window.add_images(news.figures[-1].timestamp, news.images.pictures())
+                    self._window.add_images(news.figures[-1].timestamp, news.images.files())
                 time.sleep(PERIOD)
         except Exception as error:  # handed to the thread of the run, which raises it in close
             self._error = error

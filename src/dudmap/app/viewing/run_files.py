@@ -57,26 +57,21 @@ class RunFiles:
         Raises:
             DudmapError: The folder is none of a run, was written by a newer version, or a file in it is damaged.
         """
+        folder = Path(folder)
         with damaged(DudmapError, f"the run folder {folder}"):
-            return cls._load(Path(folder))
-
-    @classmethod
-    def _load(cls, folder: Path) -> "RunFiles":
-        metrics = _metrics(folder)
-        path = folder / "trajectory.txt"
-        tracked = metrics.get("tracked") and path.is_file()
-        mesh = folder / "mesh.ply"
-        config = folder / "config.toml"
-        return cls(
-            folder=folder,
-            metrics=metrics,
-            config=read_text(config) if config.is_file() else "",
-            trajectory=Trajectory.load(path) if tracked else Trajectory.from_poses([]),
-            mesh=_mesh(mesh) if mesh.is_file() and metrics.get("mesh_triangles") else None,
-            frames=_frames(folder / "timings.csv"),
-            movers=_movers(folder / "movers.jsonl"),
-            thumbnails=_thumbnails(folder / FOLDER),
-        )
+            metrics, path = _metrics(folder), folder / "trajectory.txt"
+            tracked = metrics.get("tracked") and path.is_file()
+            mesh, config = folder / "mesh.ply", folder / "config.toml"
+            return cls(
+                folder,
+                metrics,
+                config=read_text(config) if config.is_file() else "",
+                trajectory=Trajectory.load(path) if tracked else Trajectory.from_poses([]),
+                mesh=_mesh(mesh) if mesh.is_file() and metrics.get("mesh_triangles") else None,
+                frames=_frames(folder / "timings.csv"),
+                movers=_movers(folder / "movers.jsonl"),
+                thumbnails=_thumbnails(folder / FOLDER),
+            )
 
     @property
     def stages(self) -> list[str]:

@@ -100,6 +100,10 @@ class FrameImages:
             "residuals": residual_colors(self.residuals),
         }
 
+    def files(self) -> dict[str, bytes]:
+        """JPEG files of the ``pictures``."""
+        return {kind: jpeg(picture) for kind, picture in self.pictures().items()}
+
 
 def depth_colors(depth: NDArray[np.floating], far: float = DEPTH_RANGE) -> NDArray[np.uint8]:
     """Depth (h, w) in the colours of the turbo scale (h, w, 3) up to ``far``, dark where there is no reading."""

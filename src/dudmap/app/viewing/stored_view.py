@@ -40,7 +40,7 @@ def show_run(window: Window, run: RunFiles) -> None:
     window.stay()
     window.add_frames(frames_of(run))
     for stamp, images in run.thumbnails.items():
-        window.add_files(float(stamp), images)
+        window.add_images(float(stamp), images)
     window.show_frame(0)
 
 

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run_folder import WRITTEN
-from dudmap.app.viewing.snapshot import FrameImages, jpeg
+from dudmap.app.viewing.snapshot import FrameImages
 from dudmap.atomic_file import write_bytes
 from dudmap.errors import FrameError
 from dudmap.own_folder import OwnFolder, make_folder, remove_files
@@ -48,9 +48,9 @@ class Thumbnails(RunObserver):
         if index < self._next or isinstance(read.frame, FrameError):
             return
         paths = []
-        for kind, image in FrameImages.of(read.frame, result).pictures().items():
+        for kind, file in FrameImages.of(read.frame, result).files().items():
             paths.append(self._out / f"{result.timestamp:.6f}.{kind}.jpg")
-            write_bytes(paths[-1], jpeg(image), sync=False, own=True)
+            write_bytes(paths[-1], file, sync=False, own=True)
         self._kept.append(paths)
         if self._count is None:
             self._thin()

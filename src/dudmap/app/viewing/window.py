@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.app.viewing.mesh_feed import MeshChanges
 from dudmap.app.viewing.page_access import PageAccess, port_problem
 from dudmap.app.viewing.picking import first_hit
-from dudmap.app.viewing.snapshot import KINDS, FrameFigures, jpeg
+from dudmap.app.viewing.snapshot import KINDS, FrameFigures
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.map.incremental_mesh import Chunk
@@ -115,7 +115,10 @@ class Window:
         with self._lock:
             self._frames += frames
             if poses is not None:
-                self._frames = [_moved(frame, poses) for frame in self._frames]
+                self._frames = [
+                    replace(frame, T_world_camera=poses.get(frame.timestamp, frame.T_world_camera))
+                    for frame in self._frames
+                ]
             if not self._frames:
                 return
             self._slider.max = max(len(self._frames) - 1, 1)
@@ -124,12 +127,8 @@ class Window:
             if self._follow.value:
                 self.show_frame(len(self._frames) - 1)
 
-    def add_images(self, timestamp: float, pictures: dict[str, NDArray[np.uint8]]) -> None:
-        """Images (h, w, 3) of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
-        self.add_files(timestamp, {kind: jpeg(picture) for kind, picture in pictures.items()})
-
-    def add_files(self, timestamp: float, files: dict[str, bytes]) -> None:
-        """JPEG files of a frame by the names of ``KINDS``."""
+    def add_images(self, timestamp: float, files: dict[str, bytes]) -> None:
+        """JPEG files of a frame by the names of ``KINDS``; shown at once while the page follows the run."""
         with self._lock:
             self._images[timestamp] = files
             if len(self._images) > MAX_IMAGES:
@@ -282,8 +281,3 @@ def _mesh_name(key: Chunk) -> str:
 
 def _series(label: str) -> Any:  # noqa: ANN401 - viser's type of it is known where viser is installed
     return {"label": label, "stroke": "#c2410c", "width": 1.5}
-
-
-def _moved(frame: FrameFigures, poses: dict[float, NDArray]) -> FrameFigures:
-    """The frame with the corrected pose of its time, if there is one."""
-    return replace(frame, T_world_camera=poses.get(frame.timestamp, frame.T_world_camera))

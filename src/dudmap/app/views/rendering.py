@@ -11,8 +11,6 @@ from dudmap.app.views.video import CODECS, VideoWriter
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.io.exporting.gravity import up_of
-from dudmap.io.exporting.options import ExportOptions
 from dudmap.io.exporting.run_content import RunContent
 
 EMPTY = 32
@@ -119,8 +117,3 @@ def _view(run: RunContent, T: NDArray[np.float64], camera: Camera) -> tuple[NDAr
     """Colour (H, W, 3) and depth (H, W) in metres of the map."""
     seen = run.volume.raycast(T, camera)
     return np.where(seen.depth[..., None] > 0, seen.color, np.uint8(EMPTY)), seen.depth
-
-
-def up_for_orbit(run: RunContent, up: tuple[float, float, float] | None) -> NDArray[np.float64]:
-    """Unit vector (3,) against gravity, given or found in the map."""
-    return up_of(run, ExportOptions(up=up))

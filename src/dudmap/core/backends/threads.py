@@ -23,7 +23,9 @@ _OPTIONS: dict[str, Any] = {
 }
 kernel = njit(**_OPTIONS)
 scalar = njit(**_OPTIONS, forceinline=True)
-"""Compiles scalar mathematics: always inlined, since a call ends the vectorisation of the loop around it."""
+"""Compiles what kernels call: always inlined, since a call ends the vectorisation of the loop around it, and since a
+function that is not would exist twice, optimised on its own and with its caller, which differ in their roundings: which
+of the two is called depends on whether the caller was compiled in this process or loaded from the cache."""
 written_out = njit(**_OPTIONS, inline="always")
 """Compiles scalar mathematics as if it were written out where it is called, so that the compiler orders its sums and
 products together with those around it; takes longer to compile than ``scalar``."""

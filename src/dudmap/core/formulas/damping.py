@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import scalar
 from dudmap.core.geometry.se3 import rodrigues
 
 FLOOR = 1e-9
@@ -13,10 +13,10 @@ SHORT_STEP = 4.0
 """A step shorter than this multiple of the stop tolerance ends a coarse level if the cost hardly changes, and is taken
 on the finest level whatever it costs."""
 
-_rotation = kernel(rodrigues)
+_rotation = scalar(rodrigues)
 
 
-@kernel
+@scalar
 def damped_step(H, b, basis, damping):
     """Solution (6,) of ``(H + damping diag(H)) step = -b`` along the directions of a basis (6, m).
 
@@ -57,7 +57,7 @@ def damped_step(H, b, basis, damping):
     return step
 
 
-@kernel
+@scalar
 def moved(T_world_camera, step):
     """Pose (4, 4) after a twist (v, omega) about the camera's centre, world axes."""
     R = _rotation(step[3], step[4], step[5])
@@ -71,7 +71,7 @@ def moved(T_world_camera, step):
     return out
 
 
-@kernel
+@scalar
 def judged(cost, trial, length, damping, rules):
     """Whether a trial step is accepted, the next damping, and whether it is the last step.
 

@@ -19,7 +19,6 @@ from dudmap.core.objects.regions import (
     MIN_SHARE,
     MovingPixels,
     Region,
-    boxes_overlap,
     connected_regions,
     is_fully_visible,
     split_between,
@@ -197,8 +196,7 @@ class ObjectTracker:
         regions.sort(key=lambda region: -region.area)
         groups: list[list[Region]] = []
         for region in regions:
-            same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
-            fitting = next((group for group in same + groups if self._is_fragment(region, group)), None)
+            fitting = next((group for group in self._candidates(region, groups) if self._is_near(region, group)), None)
             groups.append([region]) if fitting is None else fitting.append(region)
         return [
             np.concatenate([region.indices for region in group])
@@ -219,14 +217,16 @@ class ObjectTracker:
         ]
         return [indices] if len(ids) < 2 else split_between(pixels, indices, ids)
 
-    def _is_fragment(self, region: Region, group: list[Region]) -> bool:
-        """Whether a region belongs to an object: close to it, and predicted to be the same or much smaller."""
-        if region.predicted_id == 0 or region.predicted_id != group[0].predicted_id:
-            other = next((track for track in self._tracks if track.id == region.predicted_id), None)
-            if region.area >= 0.5 * sum(part.area for part in group):
-                return False
-            if other and self._is_established(other, region.area):
-                return False
+    def _candidates(self, region: Region, groups: list[list[Region]]) -> list[list[Region]]:
+        """Objects that a region may be a fragment of: it is predicted to be the same, or it is much smaller."""
+        same = [group for group in groups if region.predicted_id and group[0].predicted_id == region.predicted_id]
+        track = next((track for track in self._tracks if track.id == region.predicted_id), None)
+        if track and self._is_established(track, region.area):
+            return same
+        return same + [group for group in groups if region.area < 0.5 * sum(part.area for part in group)]
+
+    def _is_near(self, region: Region, group: list[Region]) -> bool:
+        """Whether a region is closer to an object than ``merge_distance``."""
         return any(region.is_near(part, self.config.merge_distance) for part in group)
 
     def _is_established(self, track: _Track, area: float) -> bool:
@@ -247,15 +247,18 @@ class ObjectTracker:
         Only pairs are considered that share more than 0.3 of the pixels, lie closer than ``max_jump`` or have
         overlapping boxes. An object without a track begins a new one.
         """
-        candidates = []
-        for i, (indices, centroid, box) in enumerate(zip(objects, centroids, boxes, strict=True)):
-            counts = np.bincount(predicted_id[indices], minlength=self._next_id)
-            for j, track in enumerate(self._tracks):
-                shift = track.velocity * (timestamp - track.last_seen)
-                distance = float(np.linalg.norm(track.centroid + shift - centroid))
-                shared = counts[track.id] / len(indices)
-                if shared > 0.3 or distance < self.config.max_jump or boxes_overlap(track.box + shift, box):
-                    candidates.append((distance - self.config.max_jump * shared, i, j))
+        candidates, max_jump = [], self.config.max_jump
+        if self._tracks:
+            ids = [track.id for track in self._tracks]
+            shifts = np.array([track.velocity * (timestamp - track.last_seen) for track in self._tracks])
+            expected = np.array([track.centroid for track in self._tracks]) + shifts
+            expected_boxes = np.array([track.box for track in self._tracks]) + shifts[:, None]
+            for i, (indices, centroid, box) in enumerate(zip(objects, centroids, boxes, strict=True)):
+                shared = np.bincount(predicted_id[indices], minlength=self._next_id)[ids] / len(indices)
+                distances = np.linalg.norm(expected - centroid, axis=1)
+                overlapping = np.all((expected_boxes[:, 0] <= box[1]) & (box[0] <= expected_boxes[:, 1]), axis=1)
+                possible = np.flatnonzero((shared > 0.3) | (distances < max_jump) | overlapping)
+                candidates += [(distances[j] - max_jump * shared[j], i, int(j)) for j in possible]
         tracks: dict[int, _Track] = {}
         assigned: set[int] = set()
         for _, i, j in sorted(candidates):

@@ -49,28 +49,29 @@ class Region:
         area: Visible surface, square metres.
         predicted_id: Most frequent predicted number, 0 = none.
         sample: (m, 3) float32, some of its points, metres, world frame.
-        box: (2, 3) smallest and largest coordinates of the sample.
+        box: Smallest and largest coordinates of the sample, three of each.
     """
 
     indices: NDArray[np.int64]
     area: float
     predicted_id: int
     sample: NDArray[np.float32]
-    box: NDArray[np.float32]
+    box: list[list[float]]
 
     @classmethod
     def of(cls, pixels: MovingPixels, indices: NDArray[np.int64]) -> "Region":
         """Summary of the given pixels (k,)."""
         predicted_id = int(np.argmax(np.bincount(pixels.predicted_id[indices])))
         sample = pixels.points[indices[:: max(1, len(indices) // SAMPLES)]]
-        box = np.stack([sample.min(axis=0), sample.max(axis=0)])
+        box = [sample.min(axis=0).tolist(), sample.max(axis=0).tolist()]
         return cls(indices, float(pixels.area[indices].sum()), predicted_id, sample, box)
 
     def is_near(self, other: "Region", distance: float) -> bool:
         """Whether some points of the two regions are closer to each other than a distance, metres."""
-        if max((self.box[0] - other.box[1]).max(), (other.box[0] - self.box[1]).max()) > distance:
-            return False
-        p, q = self.sample - self.box[0], other.sample - self.box[0]
+        for low, high, other_low, other_high in zip(*self.box, *other.box, strict=True):
+            if low - other_high > distance or other_low - high > distance:
+                return False
+        p, q = self.sample - np.float32(self.box[0]), other.sample - np.float32(self.box[0])
         squared = np.einsum("ij,ij->i", p, p)[:, None] + np.einsum("ij,ij->i", q, q) - 2 * p @ q.T
         return float(squared.min()) < distance**2
 
@@ -147,11 +148,6 @@ def trimmed_box(points: NDArray[np.float32]) -> NDArray[np.float64]:
     cut = len(points) // 100
     order = np.partition(points, (cut, len(points) - 1 - cut), axis=0)
     return np.stack([order[cut], order[-1 - cut]]).astype(np.float64)
-
-
-def boxes_overlap(a: NDArray[np.float64], b: NDArray[np.float64]) -> bool:
-    """Whether two axis-aligned boxes (2, 3) have a point in common."""
-    return bool(np.all(a[0] <= b[1]) and np.all(b[0] <= a[1]))
 
 
 def is_fully_visible(mask: NDArray[np.bool_], depth: NDArray[np.float32]) -> bool:

@@ -46,7 +46,7 @@ class LoopCorrector:
     def measured_edge(
         self, keyframe: Keyframe, T_tracked: NDArray[np.float64], T_measured: NDArray[np.float64]
     ) -> Edge | None:
-        """Motion to the newest stored frame from the one nearest in time to a keyframe, or what stands for that now.
+        """Motion to the newest stored frame from the one nearest in time to a keyframe, or what replaces that.
 
         Args:
             keyframe: Keyframe of the current submap that was recognised.
@@ -100,24 +100,24 @@ class LoopCorrector:
         self.edges.append(loop)
         return self.atlas.correct(nodes, Ts_new, volume, [nodes[i] for i in (*old, *new)])
 
-    def move_edges(self, number: int, heir: int) -> None:
+    def move_edges(self, number: int, replacement: int) -> None:
         """Let the measured motions that begin or end at a stored frame, which is about to be removed, do so at the one
-        that shows its place now.
+        that replaces it.
 
         Both are registered to the same map, so that the motion between them has the noise of one measured at a loop.
         Of two motions between the same frames the more precise one is kept. Numbers above the frame's fall by one.
         """
         assert self.atlas.history is not None
         Ts = self.atlas.history.Ts_world_camera
-        T_heir_frame = se3.inverse(Ts[heir]) @ Ts[number]
+        T_new_old = se3.inverse(Ts[replacement]) @ Ts[number]
         best: dict[tuple[int, int], Edge] = {}
         for edge in self.edges:
             if number in (edge.a, edge.b):
                 sigmas = np.hypot((edge.sigma_distance, edge.sigma_angle), LOOP_NOISE).tolist()
                 if edge.a == number:
-                    edge = Edge(heir, edge.b, T_heir_frame @ edge.T_a_b, *sigmas)
+                    edge = Edge(replacement, edge.b, T_new_old @ edge.T_a_b, *sigmas)
                 else:
-                    edge = Edge(edge.a, heir, edge.T_a_b @ se3.inverse(T_heir_frame), *sigmas)
+                    edge = Edge(edge.a, replacement, edge.T_a_b @ se3.inverse(T_new_old), *sigmas)
                 if edge.a == edge.b:
                     continue
             edge = replace(edge, a=edge.a - (edge.a > number), b=edge.b - (edge.b > number))

@@ -1,4 +1,7 @@
-"""Where up is in a map, and at which height its floor lies."""
+"""Where up is in a map, and at which height its floor lies.
+
+A direction without length, and a map without a floor where one is needed, are a ``ConfigError``.
+"""
 
 from typing import NamedTuple
 
@@ -41,23 +44,25 @@ def up_of(run: RunContent, options: ExportOptions) -> NDArray[np.float64]:
     """Unit vector (3,) against gravity: the given one, else the normal of level surfaces, else what cameras held up."""
     if options.up is not None:
         return _unit(options.up)
-    held = mean_camera_up(run)
-    found = level_normal(run.surface, held)
-    height = None if found is None else floor_height(run.surface, found)
-    return held if found is None or height is None else fitted(run.surface, Floor(found, height)).up
+    floor = _level_floor(run)
+    return mean_camera_up(run) if floor is None else floor.up
 
 
 def find_floor(run: RunContent, options: ExportOptions) -> Floor:
-    """The floor of a map.
-
-    Raises:
-        ConfigError: No level surface was seen.
-    """
-    up = _unit(options.up) if options.up is not None else level_normal(run.surface, mean_camera_up(run))
+    """The floor of a map."""
+    up = None if options.up is None else _unit(options.up)
     height = None if up is None else floor_height(run.surface, up)
-    if up is None or height is None:
+    floor = _level_floor(run) if up is None else None if height is None else Floor(up, height)
+    if floor is None:
         raise ConfigError(f"no floor was found in the mesh of {run.folder}; give the direction against gravity by --up")
-    return Floor(up, height) if options.up is not None else fitted(run.surface, Floor(up, height))
+    return floor
+
+
+def _level_floor(run: RunContent) -> Floor | None:
+    """The floor by level surfaces; None if there are none."""
+    up = level_normal(run.surface, mean_camera_up(run))
+    height = None if up is None else floor_height(run.surface, up)
+    return None if up is None or height is None else fitted(run.surface, Floor(up, height))
 
 
 def mean_camera_up(run: RunContent) -> NDArray[np.float64]:

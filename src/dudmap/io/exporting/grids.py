@@ -1,19 +1,31 @@
-"""Grids for robots: occupancy and distances in space, and a 2D map for ROS' nav2."""
+"""Grids for robots: occupied, free and unknown space and distances to the surface, z up, and a 2D map for nav2."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from dudmap.atomic_file import atomic_file
+from dudmap.atomic_file import atomic_file, write_bytes, write_text
+from dudmap.core.backends.cpu import hashing
+from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import ConfigError
 from dudmap.io.exporting.gravity import find_floor, z_up
 from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.options import ExportOptions
 from dudmap.io.exporting.run_content import RunContent
-from dudmap.io.exporting.space import FREE, OCCUPIED, UNKNOWN, SpaceGrid
 
+OCCUPIED, FREE, UNKNOWN = 100, 0, -1
+"""Values of cells, those of ROS' ``nav_msgs/OccupancyGrid``."""
+LARGEST = 20_000_000
+"""Largest number of cells: distances then take about a minute and 1 GB."""
+BORDER = 2
+"""Cells around the surface on every side."""
+CHUNK = 1_000_000
+"""Cells that are looked up at once, to bound memory."""
 FORMAT = "dudmap grid 1"
 PIXELS = {OCCUPIED: 0, FREE: 254, UNKNOWN: 205}
 """Grey values of the cells, those of nav2's map saver."""
@@ -21,6 +33,110 @@ FLOOR_LAYER = 0.1
 """A surface within this height of the floor is floor, metres."""
 SEEN_SHARE = 0.5
 """Without a floor in view a column is free if at least this share of its cells is."""
+
+
+@dataclass(frozen=True, eq=False)
+class SpaceGrid:
+    """Cells of equal size in axes of their own, z up.
+
+    Attributes:
+        occupancy: (X, Y, Z) int8, ``OCCUPIED``, ``FREE`` or ``UNKNOWN``.
+        behind: (X, Y, Z) bool, whether the centre of a cell lies behind a seen surface.
+        origin: (3,) lower corner of the first cell, metres, in the axes of the grid.
+        resolution: Edge of a cell, metres.
+        T_grid_map: (4, 4) motion from the world of the map to the axes of the grid.
+    """
+
+    occupancy: NDArray[np.int8]
+    behind: NDArray[np.bool_]
+    origin: NDArray[np.float64]
+    resolution: float
+    T_grid_map: NDArray[np.float64]
+
+    @classmethod
+    def of(cls, volume: TsdfVolume, mesh: Mesh, T_grid_map: NDArray[np.float64], resolution: float) -> "SpaceGrid":
+        """Grid around a surface.
+
+        A cell is occupied if the surface passes through it (one of its vertices lies inside), else free if its centre
+        was observed in front of a surface or in known free space, else unknown.
+
+        Args:
+            volume: The map.
+            mesh: Its surface; vertices closer together than a cell.
+            T_grid_map: (4, 4) axes of the grid.
+            resolution: Edge of a cell, metres.
+
+        Raises:
+            ConfigError: The cells are smaller than a voxel, or too many.
+        """
+        if resolution < volume.voxel_size:
+            raise ConfigError(
+                f"found --resolution {resolution:g}; expected at least the voxel size, {volume.voxel_size:g} m"
+            )
+        points = mesh.vertices @ T_grid_map[:3, :3].T + T_grid_map[:3, 3]
+        first = np.floor(points.min(axis=0) / resolution).astype(int) - BORDER
+        shape = np.floor(points.max(axis=0) / resolution).astype(int) + BORDER + 1 - first
+        if np.prod(shape.astype(float)) > LARGEST:
+            size = " x ".join(f"{number * resolution:.0f}" for number in shape)
+            raise ConfigError(
+                f"cells of {resolution:g} m in {size} m would be more than {LARGEST:,}; give a larger --resolution, or "
+                "a part of the map by --crop or --drop-pieces-below"
+            )
+        grid = cls(np.full(shape, UNKNOWN, np.int8), np.zeros(shape, bool), first * resolution, resolution, T_grid_map)
+        grid._observe(volume)
+        grid.occupancy[tuple((np.floor(points / resolution).astype(int) - first).T)] = OCCUPIED
+        return grid
+
+    def _observe(self, volume: TsdfVolume) -> None:
+        """Mark what was seen to be free, and what lies behind a surface."""
+        T_map_grid = se3.inverse(self.T_grid_map)
+        occupancy, behind = self.occupancy.reshape(-1), self.behind.reshape(-1)
+        for start in range(0, len(occupancy), CHUNK):
+            cells = np.arange(start, min(start + CHUNK, len(occupancy)))
+            points = self.centres(cells) @ T_map_grid[:3, :3].T + T_map_grid[:3, 3]
+            sdf, free = look_up(volume, points)
+            occupancy[cells[free | (sdf > 0)]] = FREE
+            behind[cells] = sdf < 0
+
+    def centres(self, cells: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Centres (n, 3), metres, axes of the grid, of cells numbered in C order."""
+        numbers = np.stack(np.unravel_index(cells, self.occupancy.shape), axis=1)
+        return self.origin + (numbers + 0.5) * self.resolution
+
+    def distances(self, mesh: Mesh) -> NDArray[np.float32]:
+        """Euclidean signed distance (X, Y, Z) of each centre to the nearest vertex of the surface, metres; negative
+        behind a seen surface.
+
+        The vertices are at most a voxel v apart, so a distance d is at most v^2 / (4 d) too large.
+        """
+        from scipy.spatial import KDTree
+
+        tree = KDTree(mesh.vertices @ self.T_grid_map[:3, :3].T + self.T_grid_map[:3, 3])
+        out = np.empty(self.occupancy.size, np.float32)
+        for start in range(0, len(out), CHUNK):
+            cells = np.arange(start, min(start + CHUNK, len(out)))
+            out[cells] = tree.query(self.centres(cells))[0]
+        out = out.reshape(self.occupancy.shape)
+        return np.where(self.behind, -out, out)
+
+
+def look_up(volume: TsdfVolume, points: NDArray[np.float64]) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
+    """What a map knows of points (n, 3) in its world frame.
+
+    Returns:
+        sdf: (n,) float32 signed distance of the nearest voxel, metres, NaN where none was observed.
+        free: (n,) bool, whether the point lies in a block of known free space.
+    """
+    blocks = volume.blocks
+    voxels = np.rint(points / volume.voxel_size).astype(np.int32)
+    entries = hashing.find_all(blocks.table, blocks.coords, voxels // BLOCK)
+    known = np.maximum(entries, 0)
+    slots = np.where(entries >= 0, blocks.slot_of[known], -1)
+    free = (entries >= 0) & (slots < 0) & (blocks.free_count[known] >= volume.config.free_after)
+    local = voxels % BLOCK
+    words = blocks.geometry[np.maximum(slots, 0), (local[:, 0] * BLOCK + local[:, 1]) * BLOCK + local[:, 2]]
+    observed = (slots >= 0) & (((words >> 8) & 0xFF) > 0)
+    return np.where(observed, (words >> 16) * np.float32(volume.sdf_unit), np.nan).astype(np.float32), free
 
 
 def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
@@ -33,14 +149,9 @@ def write_npz(run: RunContent, path: Path, options: ExportOptions) -> None:
     grid, mesh = _grid(run, options)
     with atomic_file(path) as file:
         np.savez_compressed(
-            file,
-            format=FORMAT,
-            occupancy=grid.occupancy,
-            esdf=grid.distances(mesh),
-            origin=grid.origin,
-            resolution=grid.resolution,
-            T_grid_map=grid.T_grid_map,
-        )
+            file, format=FORMAT, occupancy=grid.occupancy, esdf=grid.distances(mesh), origin=grid.origin,
+            resolution=grid.resolution, T_grid_map=grid.T_grid_map,
+        )  # fmt: skip
 
 
 def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
@@ -52,8 +163,8 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
     image = np.select([cells == OCCUPIED, cells == FREE], [PIXELS[OCCUPIED], PIXELS[FREE]], PIXELS[UNKNOWN])
     picture = path.with_suffix(".pgm")
     rows = np.flipud(image.T).astype(np.uint8)  # the first row of the picture has the largest y
-    with atomic_file(picture) as file:
-        file.write(f"P5\n# {run.folder.name}\n{rows.shape[1]} {rows.shape[0]}\n255\n".encode() + rows.tobytes())
+    header = f"P5\n# {run.folder.name}\n{rows.shape[1]} {rows.shape[0]}\n255\n"
+    write_bytes(picture, header.encode() + rows.tobytes())
     numbers = " ".join(f"{number:.6f}" for number in grid.T_grid_map.reshape(-1))
     lines = [
         f"# heights {options.heights[0]:g} to {options.heights[1]:g} m above the floor",
@@ -66,8 +177,7 @@ def write_nav2(run: RunContent, path: Path, options: ExportOptions) -> None:
         "occupied_thresh: 0.65",
         "free_thresh: 0.25",
     ]
-    with atomic_file(path) as file:
-        file.write(("\n".join(lines) + "\n").encode())
+    write_text(path, "\n".join(lines) + "\n")
 
 
 def flat(grid: SpaceGrid, heights: tuple[float, float]) -> NDArray[np.int8]:

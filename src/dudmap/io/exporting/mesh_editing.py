@@ -1,4 +1,7 @@
-"""Parts of a mesh, closed holes and fewer triangles, for exports."""
+"""Parts of a mesh, closed holes and fewer triangles, for exports.
+
+An option with an impossible value is a ``ConfigError``, and a mesh of which nothing is left a ``MapError``.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -19,12 +22,7 @@ def write(run: RunContent, path: Path, options: ExportOptions) -> None:
 
 
 def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
-    """Mesh after all options that change it: crop, pieces, holes, triangles, in this order.
-
-    Raises:
-        ConfigError: An option has an impossible value, or fast-simplification is not installed.
-        MapError: No triangle is left.
-    """
+    """Mesh after all options that change it: crop, pieces, holes, triangles, in this order."""
     if options.crop is not None:
         mesh = cropped(mesh, options.crop)
     if options.drop_pieces_below is not None:
@@ -39,11 +37,7 @@ def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
 
 
 def cropped(mesh: Mesh, box: Box) -> Mesh:
-    """The triangles whose three corners lie in a box.
-
-    Raises:
-        ConfigError: The box is empty.
-    """
+    """The triangles whose three corners lie in a box."""
     low, high = np.array(box[:3]), np.array(box[3:])
     if not np.all(low < high):
         raise ConfigError(f"the box of --crop is empty: {box}; expected x0,y0,z0,x1,y1,z1 with x0 < x1 and so on")
@@ -115,9 +109,6 @@ def decimated(mesh: Mesh, max_triangles: int) -> Mesh:
     """Mesh with at most so many triangles, by quadric edge collapse (Garland and Heckbert 1997).
 
     Vertices take colour and normal of the nearest vertex of the given mesh.
-
-    Raises:
-        MissingExtraError: fast-simplification is not installed.
     """
     if len(mesh.faces) <= max_triangles:
         return mesh

@@ -2,6 +2,8 @@
 
 Frames follow REP 105 with the optical camera axes of REP 103: ``map`` is the world of the map and ``camera`` has x
 right, y down and z forward.
+
+A message that cannot be understood is a ``DatasetError``.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -225,11 +227,7 @@ def seconds_of(message: Any) -> float:  # noqa: ANN401
 
 
 def camera_of(message: Any) -> Camera:  # noqa: ANN401
-    """Camera of a ``sensor_msgs/CameraInfo``.
-
-    Raises:
-        DatasetError: It is not calibrated, or its distortion model is unknown.
-    """
+    """Camera of a ``sensor_msgs/CameraInfo``."""
     k = [float(value) for value in message.k]
     d = tuple(float(value) for value in message.d)
     if k[0] <= 0 or k[4] <= 0:

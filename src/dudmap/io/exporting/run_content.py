@@ -1,4 +1,7 @@
-"""The results in a run folder, as exporters take them."""
+"""The results in a run folder, as exporters take them.
+
+What is missing, damaged or of a newer version is a ``DatasetError``, and a ``MapError`` if it is the mesh or the map.
+"""
 
 import re
 from dataclasses import dataclass
@@ -32,11 +35,7 @@ class RunContent:
 
     @classmethod
     def load(cls, folder: str | Path) -> "RunContent":
-        """Open a run folder.
-
-        Raises:
-            DatasetError: The folder is no run folder, or was written by a newer version of dudmap.
-        """
+        """Open a run folder."""
         folder = Path(folder)
         if not (folder / "trajectory.txt").is_file():
             raise DatasetError(f"{folder} holds no trajectory.txt; name a run folder, as dudmap run writes it")
@@ -54,30 +53,18 @@ class RunContent:
 
     @cached_property
     def trajectory(self) -> Trajectory:
-        """Poses of the tracked frames.
-
-        Raises:
-            DatasetError: The file is damaged.
-        """
+        """Poses of the tracked frames."""
         return Trajectory.load(self.folder / "trajectory.txt")
 
     @cached_property
     def mesh(self) -> Mesh | None:
-        """The static surface, None if there is none (a run that only localised).
-
-        Raises:
-            MapError: The file is damaged.
-        """
+        """The static surface, None if there is none (a run that only localised)."""
         path = self.folder / "mesh.ply"
         return Mesh.load(path) if path.is_file() else None
 
     @property
     def surface(self) -> Mesh:
-        """The static surface.
-
-        Raises:
-            MapError: There is none, or it has no triangles.
-        """
+        """The static surface."""
         if self.mesh is None:
             raise MapError(f"{self.folder} holds no mesh.ply (a run that only localised, or that was cut off)")
         if len(self.mesh.faces) == 0:
@@ -86,11 +73,7 @@ class RunContent:
 
     @cached_property
     def volume(self) -> "TsdfVolume":
-        """The map.
-
-        Raises:
-            MapError: The file is missing, damaged or of a newer version.
-        """
+        """The map."""
         from dudmap.core.map.volume import TsdfVolume
 
         if not (self.folder / "map.npz").is_file():
@@ -99,11 +82,7 @@ class RunContent:
 
     @cached_property
     def movers(self) -> list[dict[str, Any]]:
-        """Moving objects by frame, as in movers.jsonl; none if there is no file.
-
-        Raises:
-            DatasetError: The file is damaged.
-        """
+        """Moving objects by frame, as in movers.jsonl; none if there is no file."""
         path = self.folder / "movers.jsonl"
         if not path.is_file():
             return []
@@ -114,11 +93,7 @@ class RunContent:
 
     @cached_property
     def calibration(self) -> Calibration | None:
-        """Calibration of the colour camera that the run used, None if the folder holds none.
-
-        Raises:
-            DatasetError: The file is damaged.
-        """
+        """Calibration of the colour camera that the run used, None if the folder holds none."""
         path = self.folder / "calibration.toml"
         return Calibration.load(path) if path.is_file() else None
 
@@ -131,11 +106,7 @@ class RunContent:
         return T if calibration is None else T @ np.linalg.inv(calibration.T_color_depth)
 
     def mask_files(self) -> dict[float, Path]:
-        """Masks of what moves by time stamp of the depth image.
-
-        Raises:
-            DatasetError: The run saved no masks.
-        """
+        """Masks of what moves by time stamp of the depth image."""
         from dudmap.io.sequences.masks import stamped_masks
 
         folder = self.folder / "masks"

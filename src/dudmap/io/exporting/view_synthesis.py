@@ -21,14 +21,14 @@ from dudmap.io.exporting.mesh_editing import edited
 from dudmap.io.exporting.options import ExportOptions
 from dudmap.io.exporting.run_content import RunContent
 from dudmap.io.sequences.images import read_mask
+from dudmap.io.sequences.intrinsics import DISTORTION_KEYS
+from dudmap.io.sequences.poses import OPENGL_AXES
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 NEAR = 0.001
 """Largest difference between the time stamp of a frame and those of its pose and mask, seconds."""
-CV_GL = np.diag([1.0, -1.0, -1.0, 1.0])
-"""From OpenGL's camera axes (x right, y up, z back) to OpenCV's (x right, y down, z forward)."""
 PIXEL = 0.5
 """These programs put the corner of the first pixel at the origin, dudmap its centre."""
 
@@ -55,11 +55,9 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
     """Write ``transforms.json`` and beside it images/, depth/ (16 bit, millimetres), masks/ (0 = moves, left out of
     training) and the seed points points.ply. Poses are camera to world with OpenGL's camera axes.
     """
-    sequence, seeds = _open(run, options), _seeds(run, options)
-    folders = [path.parent / name for name in ("images", "depth", "masks")]
-    for folder in folders:
-        folder.mkdir(exist_ok=True)
-    seeds.save(path.parent / "points.ply")
+    sequence = _open(run, options)
+    _seeds(run, options).save(path.parent / "points.ply")
+    folders = _folders(path.parent, "images", "depth", "masks")
     frames = []
     for view in _views(run, sequence, options.every):
         name = f"{view.name}.png"
@@ -70,11 +68,11 @@ def write_nerfstudio(run: RunContent, path: Path, options: ExportOptions) -> Non
         frames.append(
             {
                 "file_path": f"images/{name}", "depth_file_path": f"depth/{name}", "mask_path": f"masks/{name}",
-                "transform_matrix": (view.T_world_color @ CV_GL).tolist(),
+                "transform_matrix": (view.T_world_color @ OPENGL_AXES).tolist(),
             }
         )  # fmt: skip
     camera = _color_camera(run, sequence)
-    lens = dict(zip(("k1", "k2", "p1", "p2", "k3"), (*camera.distortion, *(0.0,) * 5), strict=False))
+    lens = dict(zip(DISTORTION_KEYS, (*camera.distortion, *(0.0,) * 5), strict=False))
     tree = {
         "camera_model": "OPENCV", "fl_x": camera.fx, "fl_y": camera.fy, "cx": camera.cx + PIXEL,
         "cy": camera.cy + PIXEL, "w": camera.width, "h": camera.height, **lens, "depth_unit_scale_factor": 0.001,
@@ -88,24 +86,30 @@ def write_colmap(run: RunContent, path: Path, options: ExportOptions) -> None:
     masks/ (``NAME.png.png``, 0 = moves, as COLMAP's ``ImageReader.mask_path`` wants them).
     """
     sequence, seeds = _open(run, options), _seeds(run, options)
-    folder, camera = path.parent, _color_camera(run, sequence)
-    for name in ("images", "masks"):
-        (folder / name).mkdir(exist_ok=True)
-    images = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
+    images, masks = _folders(path.parent, "images", "masks")
+    lines = ["# IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, then its 2D points"]
     for number, view in enumerate(_views(run, sequence, options.every), start=1):
         name = f"{view.name}.png"
-        _save(folder / "images" / name, view.color)
-        _save(folder / "masks" / f"{name}.png", _kept(view))
+        _save(images / name, view.color)
+        _save(masks / f"{name}.png", _kept(view))
         T = se3.inverse(view.T_world_color)
         x, y, z, w = se3.rotation_to_quat_xyzw(T[:3, :3])
         numbers = " ".join(f"{value:.9f}" for value in (w, x, y, z, *T[:3, 3]))
-        images += [f"{number} {numbers} 1 {name}", ""]
-    write_text(folder / "images.txt", "\n".join(images) + "\n")
-    points = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
+        lines += [f"{number} {numbers} 1 {name}", ""]
+    write_text(path.parent / "images.txt", "\n".join(lines) + "\n")
+    lines = ["# POINT3D_ID X Y Z R G B ERROR TRACK[]"]
     for number, (xyz, rgb) in enumerate(zip(seeds.vertices.tolist(), seeds.colors.tolist(), strict=True), start=1):
-        points.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
-    write_text(folder / "points3D.txt", "\n".join(points) + "\n")
-    write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {_colmap_camera(camera)}\n")
+        lines.append(f"{number} {xyz[0]:.5f} {xyz[1]:.5f} {xyz[2]:.5f} {rgb[0]} {rgb[1]} {rgb[2]} 0")
+    write_text(path.parent / "points3D.txt", "\n".join(lines) + "\n")
+    camera = _colmap_camera(_color_camera(run, sequence))
+    write_text(path, f"# CAMERA_ID MODEL WIDTH HEIGHT PARAMS\n1 {camera}\n")
+
+
+def _folders(parent: Path, *names: str) -> list[Path]:
+    """Folders of images, made where they are missing."""
+    for name in names:
+        (parent / name).mkdir(exist_ok=True)
+    return [parent / name for name in names]
 
 
 def _colmap_camera(camera: Camera) -> str:

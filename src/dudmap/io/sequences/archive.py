@@ -15,7 +15,7 @@ from collections.abc import Callable, Generator
 from contextlib import closing
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import IO, NamedTuple, cast
+from typing import IO, cast
 
 from dudmap.errors import DatasetError
 from dudmap.input_files import DAMAGE, LARGEST_RATIO, RATIO_FREE_BYTES, damaged, open_plain, read_bytes
@@ -34,12 +34,8 @@ ORIGIN = "origin.txt"
 """File beside the unpacked folder that names the archive."""
 
 
-class Member(NamedTuple):
-    """Member of an archive: its name, what it is, and how it is opened."""
-
-    name: str
-    kind: str
-    open: Callable[[], IO[bytes] | None]
+Member = tuple[str, str, Callable[[], IO[bytes] | None]]
+"""Name of a member of an archive, whether it is a file, a folder or something else, and what opens it."""
 
 
 def is_archive(path: Path) -> bool:
@@ -84,21 +80,16 @@ def unpack(path: Path) -> Path:
             content = Path(unfinished) / "place" / stem(path)
             _unpack_into(path, content, status.st_size)
             (content.parent / ORIGIN).write_bytes(os.fsencode(path.resolve()))
-            _publish(content.parent, place)
+            try:
+                content.parent.rename(place)
+            except OSError:
+                if not place.is_dir():  # another process has unpacked it in the meantime
+                    raise
     except (zipfile.BadZipFile, tarfile.TarError, RuntimeError, *DAMAGE) as error:
         if isinstance(error, OSError) and error.errno == errno.ENOSPC:
             raise OSError(error.errno, error.strerror, str(cache_folder())) from error
         raise DatasetError(f"cannot unpack {path}: {error}") from error
     return folder
-
-
-def _publish(finished: Path, place: Path) -> None:
-    """Give an unpacked archive its place, unless another process did so in the meantime."""
-    try:
-        finished.rename(place)
-    except OSError:
-        if not place.is_dir():
-            raise
 
 
 def origin(path: Path) -> Path | None:
@@ -120,50 +111,40 @@ def _unpack_into(path: Path, folder: Path, packed: int) -> None:
     folder.mkdir(parents=True)
     limit = min(LARGEST_BYTES, max(RATIO_FREE_BYTES, LARGEST_RATIO * packed), shutil.disk_usage(folder).free)
     written = 0
-    with closing(_members(path)) as members:
-        for count, member in enumerate(members, start=1):
+    with closing(_zip_members(path) if path.name.lower().endswith(".zip") else _tar_members(path)) as members:
+        for count, (name, kind, opened) in enumerate(members, start=1):
             if count > LARGEST_COUNT:
                 raise DatasetError(f"{path} has more than {LARGEST_COUNT} members; expected a recording")
-            target = folder.joinpath(*_inside(path, member).parts)
-            if member.kind == "folder":
+            target = folder.joinpath(*_inside(path, name, kind).parts)
+            if kind == "folder":
                 target.mkdir(parents=True, exist_ok=True)
                 continue
             target.parent.mkdir(parents=True, exist_ok=True)
-            source = None if target.exists() else member.open()
+            source = None if target.exists() else opened()
             if source is None:
-                raise DatasetError(f"{path} holds {member.name} twice; expected every file once")
+                raise DatasetError(f"{path} holds {name} twice; expected every file once")
             with source, target.open("wb") as out:
                 while chunk := source.read(CHUNK):
                     written += len(chunk)
                     if written > limit:
-                        raise DatasetError(_too_large(path, packed, limit))
+                        raise DatasetError(
+                            f"{path} ({packed / 1e6:.1f} MB) unpacks to more than {limit / 1e6:.0f} MB, the least of "
+                            f"{LARGEST_RATIO} times its size, {LARGEST_BYTES / 2**30:.0f} GiB and the free space of "
+                            f"{cache_folder()}; unpack it by hand if you trust it, or name another folder with "
+                            "DUDMAP_CACHE"
+                        )
                     out.write(chunk)
 
 
-def _too_large(path: Path, packed: int, limit: int) -> str:
-    return (
-        f"{path} ({packed / 1e6:.1f} MB) unpacks to more than {limit / 1e6:.0f} MB, the least of {LARGEST_RATIO} times "
-        f"its size, {LARGEST_BYTES / 2**30:.0f} GiB and the free space of {cache_folder()}; unpack it by hand if you "
-        "trust it, or name another folder with DUDMAP_CACHE"
-    )
-
-
-def _inside(path: Path, member: Member) -> PurePosixPath:
-    """Relative path of a member that is a plain file or folder."""
-    if member.kind not in ("file", "folder"):
-        raise DatasetError(f"{path} holds {member.name}, a {member.kind}; an archive of a recording has files only")
-    name = member.name.replace("\\", "/")
+def _inside(path: Path, member: str, kind: str) -> PurePosixPath:
+    """Relative path of a member that is a plain file or folder and does not lead out of the archive."""
+    if kind not in ("file", "folder"):
+        raise DatasetError(f"{path} holds {member}, a {kind}; an archive of a recording has files only")
+    name = member.replace("\\", "/")
     parts = PurePosixPath(name)
     if parts.is_absolute() or ".." in parts.parts or ":" in name or "\0" in name:
-        raise DatasetError(f"{path} holds {member.name!r}, a path that leads out of the archive; it was not unpacked")
+        raise DatasetError(f"{path} holds {member!r}, a path that leads out of the archive; it was not unpacked")
     return parts
-
-
-def _members(path: Path) -> "Generator[Member]":
-    if path.name.lower().endswith(".zip"):
-        yield from _zip_members(path)
-    else:
-        yield from _tar_members(path)
 
 
 def _zip_members(path: Path) -> "Generator[Member]":
@@ -171,7 +152,7 @@ def _zip_members(path: Path) -> "Generator[Member]":
         for info in archive.infolist():
             mode = stat.S_IFMT(info.external_attr >> 16)
             kind = "folder" if info.is_dir() else "file" if mode in (0, stat.S_IFREG) else "link or device"
-            yield Member(info.filename, kind, partial(archive.open, info))
+            yield info.filename, kind, partial(archive.open, info)
 
 
 def _tar_members(path: Path) -> "Generator[Member]":
@@ -181,7 +162,7 @@ def _tar_members(path: Path) -> "Generator[Member]":
             while (info := archive.next()) is not None:
                 kind = "folder" if info.isdir() else "file" if info.isreg() else "link or device"
                 bounded.left = info.size + LARGEST_HEADER
-                yield Member(info.name, kind, partial(archive.extractfile, info))
+                yield info.name, kind, partial(archive.extractfile, info)
                 bounded.left = LARGEST_HEADER
 
 

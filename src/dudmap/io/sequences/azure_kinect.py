@@ -46,14 +46,6 @@ class AzureKinectRecording(Recording):
     Layout: https://learn.microsoft.com/previous-versions/azure/kinect-dk/record-file-format. Depth is in millimetres
     and seen from its own camera. Both lenses are removed when a frame is read. Opening reads the file once, as times
     stand between the images.
-
-    Args:
-        path: The file.
-        camera: Intrinsics of the depth images that replace those of the file; its lens stays.
-
-    Raises:
-        MissingExtraError: The package av is missing.
-        DatasetError: The file is damaged, another video, or in an unknown mode.
     """
 
     format = "Azure Kinect .mkv"
@@ -162,11 +154,7 @@ def _nanoseconds(packet: Any) -> int:  # noqa: ANN401
 def _lens(tree: dict[str, Any], size: tuple[int, int], whole: tuple[float, float], cut: tuple[float, float]) -> Lens:
     """Lens of a camera in calibration.json, whose numbers are parts of the width and height of the sensor's image.
 
-    Args:
-        tree: The camera.
-        size: Width and height of the images.
-        whole: Those of the sensor's image at this resolution.
-        cut: Column and row of it where the images begin.
+    ``size`` is that of the images, ``whole`` that of the sensor's image, in which they begin at ``cut``.
     """
     model = tree["Intrinsics"]["ModelType"]
     if model != "CALIBRATION_LensDistortionModelBrownConrady":

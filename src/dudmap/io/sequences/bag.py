@@ -51,11 +51,6 @@ class RosBag(Recording):
         path: A .bag, .db3 or .mcap file, or the folder of a ROS 2 bag with metadata.yaml.
         camera: Intrinsics of the depth images that replace those of the bag.
         topics: ``color=/a,depth=/b,color_info=/c,depth_info=/d,world=map``, each optional.
-
-    Raises:
-        MissingExtraError: The package rosbags is missing.
-        DatasetError: The bag is damaged, topics are missing, or the intrinsics or the
-            place of the colour camera are not known.
     """
 
     format = "ROS bag"

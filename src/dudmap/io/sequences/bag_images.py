@@ -1,4 +1,7 @@
-"""Images of ROS messages: sensor_msgs/Image and CompressedImage."""
+"""Images of ROS messages: sensor_msgs/Image and CompressedImage.
+
+An encoding that is not known, and data that are damaged or too short, are a ``FrameError``.
+"""
 
 import struct
 from typing import Any
@@ -26,11 +29,7 @@ compressed_depth_image_transport)."""
 
 
 def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - the type is made from the bag
-    """Colour image (H, W, 3), RGB, of an Image or CompressedImage; ``name`` is used in messages.
-
-    Raises:
-        FrameError: The encoding is not supported, or the data are damaged.
-    """
+    """Colour image (H, W, 3), RGB, of an Image or CompressedImage; ``name`` is used in messages."""
     import cv2
 
     if hasattr(message, "format"):
@@ -47,11 +46,7 @@ def color_of(message: Any, name: str) -> NDArray[np.uint8]:  # noqa: ANN401 - th
 
 
 def depth_of(message: Any, depth_scale: float, name: str) -> NDArray[np.float32]:  # noqa: ANN401
-    """Depth image (H, W), metres, 0 = no reading, of an Image or CompressedImage; ``name`` is used in messages.
-
-    Raises:
-        FrameError: The encoding is not supported, or the data are damaged.
-    """
+    """Depth image (H, W), metres, 0 = no reading, of an Image or CompressedImage; ``name`` is used in messages."""
     if hasattr(message, "format"):
         return _compressed_depth(message, depth_scale, name)
     if message.encoding not in DEPTH_ENCODINGS:

@@ -1,4 +1,7 @@
-"""Recognition of the colour, depth and calibration topics of a bag by their types and names."""
+"""Recognition of the colour, depth and calibration topics of a bag by their types and names.
+
+Topics that are missing or not to be told apart are a ``DatasetError``, whose sentence lists those that are there.
+"""
 
 import re
 from collections.abc import Iterable, Sequence
@@ -37,11 +40,7 @@ class Topics(NamedTuple):
 
 
 def parse(text: str | None) -> dict[str, str]:
-    """The chosen topics ``color=/a,depth=/b`` by key.
-
-    Raises:
-        DatasetError: A part has no ``=``, or an unknown key.
-    """
+    """The chosen topics ``color=/a,depth=/b`` by key."""
     chosen = {}
     for part in (text or "").split(","):
         key, found, value = (piece.strip() for piece in part.partition("="))
@@ -56,11 +55,7 @@ def parse(text: str | None) -> dict[str, str]:
 
 
 def find(connections: "Sequence[Connection]", chosen: dict[str, str], bag: str) -> Topics:
-    """Topics that are chosen, and for the rest those that are recognised.
-
-    Raises:
-        DatasetError: A chosen topic is missing, none or several are recognised; the message lists those that are there.
-    """
+    """Topics that are chosen, and for the rest those that are recognised."""
     filled = [connection for connection in connections if connection.msgcount > 0]
     images = [connection for connection in filled if connection.msgtype in IMAGES]
     depths = [_named(images, chosen["depth"], bag)] if "depth" in chosen else [c for c in images if _is_depth(c)]
@@ -91,9 +86,9 @@ def base(topic: str) -> str:
 def _best(
     pairs: "list[tuple[Connection, Connection]]", images: "Sequence[Connection]", bag: str
 ) -> "tuple[Connection, Connection]":
-    """The pair of one camera, registered rather than not, rectified rather than raw, raw data rather than compressed."""
+    """The pair of one camera, rather registered than not, rectified than raw, and raw data than compressed."""
 
-    def merit(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
+    def score(pair: "tuple[Connection, Connection]") -> tuple[int, ...]:
         color, depth = pair
         left, right = base(color.topic).split("/"), base(depth.topic).split("/")
         shared = next((k for k, (a, b) in enumerate(zip(left, right, strict=False)) if a != b), len(left))
@@ -108,10 +103,10 @@ def _best(
             base(color.topic) == color.topic,
         )
 
-    ranked = sorted(pairs, key=merit, reverse=True)
+    ranked = sorted(pairs, key=score, reverse=True)
     if not ranked:
         raise DatasetError(f"{bag} holds depth but no colour images beside them: {_listed(images)}")
-    if len(ranked) > 1 and merit(ranked[0]) == merit(ranked[1]):
+    if len(ranked) > 1 and score(ranked[0]) == score(ranked[1]):
         raise DatasetError(
             f"several topics of {bag} fit equally: {_listed(images)}; choose with --topics color=/...,depth=/..."
         )

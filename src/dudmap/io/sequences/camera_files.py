@@ -1,4 +1,7 @@
-"""Intrinsics in files: where they may lie, and JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS and Kalibr."""
+"""Intrinsics in files: where they lie, and JSON and YAML of Open3D, NICE-SLAM, librealsense, ZED, ROS and Kalibr.
+
+A file that cannot be read or understood, or that tells of too many cameras, is a ``DatasetError``.
+"""
 
 import math
 import re
@@ -24,13 +27,13 @@ FILES = (
 TREES = ("camera_info.yaml", "calibration.yaml", "cam_params.json", "camera_intrinsic.json", "intrinsic.json")
 """Files of one or two cameras; in the folder itself any JSON or YAML file that is named like one (``NAMED``)."""
 NAMED = r".*(cam|intrin|calib).*\.(json|ya?ml)"
-SHOWN = 10
+LARGEST_LIST = 10
 """Kinds of files that a message lists."""
 IMAGES = (".png", ".jpg", ".jpeg", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
 NAMES = {
     "fx": ("fx", "fl_x", "focal_x"), "fy": ("fy", "fl_y", "focal_y"), "cx": ("cx", "ppx", "principal_x"),
-    "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"), "height": ("height", "h", "image_height"),
-    **{key: (key,) for key in DISTORTION_KEYS},
+    "cy": ("cy", "ppy", "principal_y"), "width": ("width", "w", "image_width"),
+    "height": ("height", "h", "image_height"), **{key: (key,) for key in DISTORTION_KEYS},
 }  # fmt: skip
 """Our key and the names it has in JSON and YAML files."""
 SCALES = ("depth_scale", "scale", "png_depth_scale", "depth_map_factor")
@@ -43,11 +46,7 @@ MOTIONS = ("T_color_depth", "depth_to_color", "extrinsics_depth_to_color")
 
 
 def find(folder: Path) -> Intrinsics | None:
-    """Intrinsics that lie in a folder or in the one above it; None without a file of a known name.
-
-    Raises:
-        DatasetError: The file cannot be understood.
-    """
+    """Intrinsics that lie in a folder or in the one above it; None without a file of a known name."""
     for place in (folder, folder.resolve().parent):
         for file in (place / name for name in FILES):
             if file.is_file():
@@ -72,8 +71,8 @@ def unknown(folder: Path, why: str = "") -> DatasetError:
 def seen(folder: Path) -> str:
     """What lies in a folder: names with their numbers replaced by N, and how many there are of each."""
     kinds = Counter(re.sub(r"\d+", "N", path.name) + "/" * path.is_dir() for path in sorted(folder.iterdir()))
-    shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:SHOWN]]
-    return ", ".join(shown) + (" ..." if len(kinds) > SHOWN else "") if shown else "nothing"
+    shown = [f"{count} x {name}" if count > 1 else name for name, count in list(kinds.items())[:LARGEST_LIST]]
+    return ", ".join(shown) + (" ..." if len(kinds) > LARGEST_LIST else "") if shown else "nothing"
 
 
 def load(paths: Iterable[Path]) -> Intrinsics:
@@ -84,9 +83,6 @@ def load(paths: Iterable[Path]) -> Intrinsics:
 
     Args:
         paths: The files.
-
-    Raises:
-        DatasetError: A file cannot be read, or there is no camera or more than one of a kind.
     """
     cameras: list[tuple[str, dict[str, float]]] = []
     scale, motion, files = {}, np.eye(4), list(paths)
@@ -115,9 +111,6 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
     """Numbers by our keys of one JSON object; None if it is no camera.
 
     A matrix has 9 numbers row by row, or column by column (Open3D), or 3 rows of 3; its last row is 0 0 1.
-
-    Raises:
-        DatasetError: The lens model is another one than Brown and Conrady's with up to five coefficients.
     """
     values = {}
     for key, names in NAMES.items():
@@ -145,11 +138,7 @@ def values_of(tree: dict[str, Any]) -> dict[str, float] | None:
 
 
 def read_yaml(path: Path) -> dict[str, Any]:
-    """Nested dictionaries and lists of a YAML file; OpenCV's header and type names are left out.
-
-    Raises:
-        DatasetError: The file cannot be read, holds no keys, or uses aliases, which could make it endless.
-    """
+    """Nested dictionaries and lists of a YAML file; OpenCV's header and type names are left out."""
     try:
         text = re.sub(r"^%YAML.*\n|!!opencv-\w+", "", read_text(path, LARGEST_TREE))
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, yaml.SafeLoader)):

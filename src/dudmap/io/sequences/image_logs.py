@@ -43,13 +43,6 @@ class SensRecording(Recording):
     Opening walks over the headers of the frames and keeps their offsets; images are read when they are asked for. The
     colour images of ScanNet are larger than the depth images and come from another camera, so that ``calibration``
     holds the colour camera. Frames whose times are all zero or do not increase are taken to be 1/30 s apart.
-
-    Args:
-        path: The file.
-        camera: Intrinsics of the depth images that replace those of the file.
-
-    Raises:
-        DatasetError: The file is damaged, of another version, or compressed in a way that is not supported.
     """
 
     format = "ScanNet .sens"
@@ -60,13 +53,13 @@ class SensRecording(Recording):
         super().__init__(path)
         with open_plain(self.path) as file:
             try:
-                num_frames = self._read_header(file, camera)
-                entries = [self._read_entry(file) for _ in range(num_frames)]
+                num_frames, end = self._read_header(file, camera), self.path.stat().st_size
+                entries = [self._read_entry(file, end) for _ in range(num_frames)]
             except struct.error:
                 raise DatasetError(f"{self.path} is cut off: its frames end before the file says") from None
         self._entries = [entry for entry, _ in entries]
         self.timestamps = 1e-6 * np.array([entry.time for entry in self._entries], dtype=np.float64)
-        self.timed = not np.any(np.diff(self.timestamps) <= 0) and bool(self.timestamps[-1] > 0)
+        self.timed = not np.any(np.diff(self.timestamps) <= 0)
         if not self.timed:
             self.timestamps = PERIOD * np.arange(num_frames, dtype=np.float64)
             self.sources["times"] = "assumed, 30 frames a second"
@@ -105,11 +98,11 @@ class SensRecording(Recording):
         self._set_cameras(own, calibration, "the header of the file", camera)
         return num_frames
 
-    def _read_entry(self, file: IO[bytes]) -> tuple[FrameEntry, list[float]]:
+    def _read_entry(self, file: IO[bytes], end: int) -> tuple[FrameEntry, list[float]]:
         """Place and pose of the next frame, without reading its images."""
         *pose, color_time, depth_time, color_bytes, depth_bytes = _unpack(file, SENS_FRAME.format)
         entry = FrameEntry(file.tell(), (color_bytes, depth_bytes), depth_time, color_time)
-        if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > self.path.stat().st_size:
+        if sum(entry.sizes) > LARGEST_FILE or file.seek(sum(entry.sizes), 1) > end:
             raise struct.error
         return entry, pose
 
@@ -131,13 +124,6 @@ class KlgRecording(Recording):
     Depth is in the millimetres of OpenNI (raw or zlib), colour raw or JPEG. The file gives neither the intrinsics nor
     the image size: the intrinsics must be given, and the size comes from them, else from the first JPEG image, else it
     is 640x480, which the logger always wrote.
-
-    Args:
-        path: The file.
-        camera: Intrinsics.
-
-    Raises:
-        DatasetError: No intrinsics are given, or the file is cut off or holds no frames.
     """
 
     format = "ElasticFusion .klg"

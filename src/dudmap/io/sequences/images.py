@@ -1,4 +1,7 @@
-"""Decoding of colour, depth and mask images, with one clear error for every defect of a file."""
+"""Decoding of colour, depth and mask images, with one clear error for every defect of a file.
+
+A file that is missing, cut off, damaged, too large or no such image is a ``FrameError``.
+"""
 
 import struct
 import zlib
@@ -16,20 +19,12 @@ PNG, JPEG = b"\x89PNG\r\n\x1a\n", b"\xff\xd8"
 
 
 def read_color(path: Path) -> NDArray[np.uint8]:
-    """Colour image (H, W, 3) in RGB order.
-
-    Raises:
-        FrameError: The file is missing, truncated, damaged or not an image.
-    """
+    """Colour image (H, W, 3) in RGB order."""
     return decode_color(_bytes(path), str(path))
 
 
 def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8]:
-    """Colour image (H, W, 3) in RGB order from the content of an image file; ``name`` is used in messages.
-
-    Raises:
-        FrameError: The data are truncated, damaged or not an image.
-    """
+    """Colour image (H, W, 3) in RGB order from the content of an image file; ``name`` is used in messages."""
     import cv2
 
     image = _decoded(data, name, cv2.IMREAD_COLOR)
@@ -37,20 +32,12 @@ def decode_color(data: bytes | NDArray[np.uint8], name: str) -> NDArray[np.uint8
 
 
 def read_depth(path: Path, depth_scale: float) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats.
-
-    Raises:
-        FrameError: The file is missing, truncated, damaged, has several channels, or is neither 16 bit nor float.
-    """
+    """Depth image (H, W) in metres, 0 = no reading: 16-bit values over ``depth_scale``, or metres as floats."""
     return decode_depth(_bytes(path), depth_scale, str(path))
 
 
 def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages.
-
-    Raises:
-        FrameError: The data are truncated, damaged, have several channels, or are neither 16 bit nor float.
-    """
+    """Depth image (H, W) in metres from the content of an image file; ``name`` is used in messages."""
     import cv2
 
     image = _decoded(data, name, cv2.IMREAD_UNCHANGED)
@@ -60,11 +47,7 @@ def decode_depth(data: bytes | NDArray[np.uint8], depth_scale: float, name: str)
 
 
 def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.float32]:
-    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = no reading.
-
-    Raises:
-        FrameError: The values are neither 16 bit nor float.
-    """
+    """Depth (H, W) in metres of 16-bit values over ``depth_scale``, or of metres as floats; 0 = no reading."""
     if image.dtype == np.uint16:
         return image.astype(np.float32) / np.float32(depth_scale)
     if image.dtype.kind == "f":
@@ -75,37 +58,23 @@ def metres(image: NDArray[Any], depth_scale: float, name: str) -> NDArray[np.flo
 
 
 def read_depth_array(path: Path) -> NDArray[np.float32]:
-    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too.
-
-    Raises:
-        FrameError: The file is missing, damaged, or holds something else.
-    """
+    """Depth image (H, W) in metres of a ``.npy`` file of floats; (H, W, 1) is taken, too."""
     try:
-        metres = np.squeeze(load_array(path))
+        depth = np.squeeze(load_array(path))
     except (OSError, ValueError, EOFError) as error:
         raise FrameError(f"cannot read the array {path}: {error}") from error
-    if metres.ndim != 2 or metres.dtype.kind != "f":
-        raise FrameError(f"the array {path} holds {metres.dtype} of shape {metres.shape}; expected floats (H, W)")
-    metres = metres.astype(np.float32)
-    metres[~(np.isfinite(metres) & (metres > 0))] = 0
-    return metres
+    if depth.ndim != 2 or depth.dtype.kind != "f":
+        raise FrameError(f"the array {path} holds {depth.dtype} of shape {depth.shape}; expected floats (H, W)")
+    return metres(depth, 1.0, str(path))
 
 
 def read_mask(path: Path) -> NDArray[np.bool_]:
-    """Mask (H, W) of an 8-bit image; values above 127 are true.
-
-    Raises:
-        FrameError: The file is missing, truncated, damaged or not an image.
-    """
+    """Mask (H, W) of an 8-bit image; values above 127 are true."""
     return read_gray(path) > 127
 
 
 def read_gray(path: Path) -> NDArray[np.uint8]:
-    """8-bit image (H, W) of one channel; colours are converted.
-
-    Raises:
-        FrameError: The file is missing, truncated, damaged or not an image.
-    """
+    """8-bit image (H, W) of one channel; colours are converted."""
     import cv2
 
     return _decoded(_bytes(path), str(path), cv2.IMREAD_GRAYSCALE)

@@ -1,4 +1,7 @@
-"""Intrinsics of a recording: from text, from its own file, or the published ones of its data set."""
+"""Intrinsics of a recording: from text, from its own file, or the published ones of its data set.
+
+Numbers that are missing, invalid or for images of another size are a ``DatasetError``.
+"""
 
 import math
 import re
@@ -43,11 +46,7 @@ class Intrinsics:
     T_depth_color: NDArray[np.float64] = field(default_factory=lambda: np.eye(4))
 
     def calibration(self) -> Calibration | None:
-        """Calibration of the colour camera; None if it is the same as the depth camera.
-
-        Raises:
-            DatasetError: The numbers are invalid.
-        """
+        """Calibration of the colour camera; None if it is the same as the depth camera."""
         if not self.color:
             return None
         return Calibration(_camera(self.color, 1000.0), se3.inverse(self.T_depth_color))
@@ -58,9 +57,6 @@ class Intrinsics:
         Args:
             width, height: Size of the depth images.
             depth_scale: Units per metre where they are not known.
-
-        Raises:
-            DatasetError: The intrinsics belong to another image size, or are invalid.
         """
         expected = (int(self.values.get("width", width)), int(self.values.get("height", height)))
         if expected != (width, height):
@@ -92,11 +88,7 @@ def by_name(name: str, values: dict[str, float]) -> Intrinsics:
 
 
 def given(camera: Camera | str) -> Intrinsics:
-    """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``.
-
-    Raises:
-        DatasetError: The text does not hold 4, 6 or 7 numbers.
-    """
+    """Intrinsics that the user gives: a Camera, or text ``fx,fy,cx,cy[,w,h[,depth_scale]]``."""
     if isinstance(camera, Camera):
         return from_camera(camera)
     try:
@@ -115,11 +107,7 @@ def from_camera(camera: Camera) -> Intrinsics:
 
 
 def from_file(path: Path) -> Intrinsics:
-    """Parse a text file: ``key value`` lines, a matrix of 9 or 16 numbers, or ``fx fy cx cy [w h [depth_scale]]``.
-
-    Raises:
-        DatasetError: The file has none of these forms, or a key is unknown or missing.
-    """
+    """Parse a text file: ``key value`` lines, a matrix of 9 or 16 numbers, or ``fx fy cx cy [w h [depth_scale]]``."""
     try:
         lines = read_text(path).splitlines()
     except (OSError, UnicodeDecodeError) as error:
@@ -144,11 +132,7 @@ def from_file(path: Path) -> Intrinsics:
 
 
 def from_matrix(numbers: NDArray[np.float64], path: Path) -> Intrinsics:
-    """Intrinsics of the numbers of a file: a 3x3 or 4x4 matrix row by row, or ``fx fy cx cy [w h [depth_scale]]``.
-
-    Raises:
-        DatasetError: They are of another count, or no intrinsic matrix.
-    """
+    """Intrinsics of the numbers of a file: a 3x3 or 4x4 matrix row by row, or ``fx fy cx cy [w h [depth_scale]]``."""
     source = str(path)
     if numbers.size in (4, 6, 7):
         return Intrinsics(camera_values(*numbers.tolist()), source)

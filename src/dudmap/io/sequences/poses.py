@@ -1,4 +1,7 @@
-"""Files of camera poses as 4x4 matrices: one per file, one per line, or Redwood's ``.log``."""
+"""Files of camera poses as 4x4 matrices: one per file, one per line, or Redwood's ``.log``.
+
+A file that cannot be read or holds something else is a ``DatasetError``.
+"""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -16,11 +19,7 @@ OPENGL_AXES = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float64]:
-    """Matrix (rows, columns) of a text file; commas count as blanks. Numbers need not be finite.
-
-    Raises:
-        DatasetError: The file cannot be read or holds other numbers.
-    """
+    """Matrix (rows, columns) of a text file; commas count as blanks. Numbers need not be finite."""
     numbers = _numbers(path)
     if numbers.size != rows * columns:
         raise DatasetError(f"{path} holds {numbers.size} numbers; expected a {rows}x{columns} matrix")
@@ -28,11 +27,7 @@ def read_matrix(path: Path, rows: int = 4, columns: int = 4) -> NDArray[np.float
 
 
 def read_matrices(path: Path) -> NDArray[np.float64]:
-    """Matrices (N, 4, 4) of a text file with 16 numbers a pose, row by row, or 12 a line, without the last row 0 0 0 1.
-
-    Raises:
-        DatasetError: The file cannot be read, or a line has another count of numbers than 4, 12 or 16.
-    """
+    """Matrices (N, 4, 4) of a text file with 16 numbers a pose, row by row, or 12 a line, without the row 0 0 0 1."""
     numbers = _numbers(path)
     counts = [(n, len(line.replace(",", " ").split())) for n, line in enumerate(read_text(path).splitlines(), start=1)]
     counts = [(line, count) for line, count in counts if count]
@@ -56,9 +51,6 @@ def read_log(path: Path) -> dict[int, NDArray[np.float64]]:
 
     The format is that of the Redwood data sets and of Open3D's reconstruction system. The first integer is the number
     of the frame.
-
-    Raises:
-        DatasetError: The file cannot be read or has not 19 numbers for every pose.
     """
     numbers = _numbers(path)
     if numbers.size == 0 or numbers.size % 19:

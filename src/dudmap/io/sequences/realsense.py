@@ -33,11 +33,6 @@ class RealSenseRecording(RosBag):
 
     The frames' times are those of the camera: in the metadata of every frame (``.db3``, whose headers hold the times of
     recording) or in the headers (``.bag``). The depth unit is the camera's option of that name.
-
-    Args:
-        path: The file.
-        camera: Intrinsics of the depth images that replace those of the file.
-        topics: As for ``RosBag``.
     """
 
     format = "RealSense recording"

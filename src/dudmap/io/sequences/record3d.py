@@ -27,13 +27,6 @@ class Record3DRecording(Recording):
     The depth (256x192 of a LiDAR, 640x480 of the front camera) is smaller than the colour and seen from the same
     place, so that the depth camera is the colour camera resized, and ``calibration`` holds the colour camera. Readings
     of confidence 0 are left out. The poses in the file are estimates of ARKit and therefore no ground truth.
-
-    Args:
-        path: The file.
-        camera: Intrinsics of the depth images that replace those of the file.
-
-    Raises:
-        DatasetError: The file is damaged or lacks its metadata, or the package lzfse is missing.
     """
 
     format = "Record3D .r3d"

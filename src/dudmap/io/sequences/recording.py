@@ -20,9 +20,12 @@ class Recording(ABC):
     """A sequence on disk: recognises its format, opens a folder or file of it, and reads a frame when it is asked for.
 
     A format sets the times, the cameras and their sources in its constructor, and reads a frame in ``_frame``.
+    Constructors take the options of the format, too; they raise a ``DatasetError`` for a recording that is damaged or
+    of another kind, and a ``MissingExtraError`` where a package is missing.
 
     Args:
         path: The folder or file.
+        camera: Intrinsics of the depth images that replace those of the recording.
 
     Attributes:
         format: Name of the format, for people.

@@ -151,15 +151,17 @@ FIRST_POSE = """
 import os, sys
 from pathlib import Path
 from dudmap.config import Config
+from dudmap.app.pipeline.observer import RunObserver
 from dudmap.app.pipeline.run import run
 from dudmap.io.sequences import open_sequence
 
-def first(index, reading, result):
-    if index == 1:
-        print("pose", flush=True)
-        os._exit(0)
+class First(RunObserver):
+    def frame(self, index, read, result, ms):
+        if index == 1:
+            print("pose", flush=True)
+            os._exit(0)
 
-run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False, observe=first)
+run(open_sequence(sys.argv[1]), Config(), Path(sys.argv[1]) / "run", max_frames=3, progress=False, observers=(First(),))
 """
 """Program that ends at the first computed pose, that of the second frame; the first one is the identity."""
 

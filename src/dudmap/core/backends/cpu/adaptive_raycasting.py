@@ -19,7 +19,7 @@ from dudmap.core.backends.cpu.raycasting import (
     to_block_boundary,
 )
 from dudmap.core.backends.parameters import RaycastParameters, RaycastResult, VoxelGrid
-from dudmap.core.backends.threads import bands, kernel, run_bands
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.pixel import ray
 from dudmap.core.formulas.residual import trilinear
 from dudmap.core.formulas.voxel import sdf_steps
@@ -45,7 +45,7 @@ class FinerLevels(NamedTuple):
     colors2: NDArray[np.int32]
 
 
-@kernel
+@scalar
 def _value(window, shape, tree, voxels, x, y, z, least, corners):
     """Signed distance in stored steps at a lattice point by the finest voxels that are known, and their level; NaN
     where none are."""
@@ -66,7 +66,7 @@ def _value(window, shape, tree, voxels, x, y, z, least, corners):
     return f32(np.nan), 0
 
 
-@kernel
+@scalar
 def _trace(window, shape, tree, voxels, o, d, t, end, unit, least, corners):
     """First crossing from outside to inside along lattice ray ``o + t d``; -1 = none. See ``raycasting.py``."""
     zero, half, one = f32(0), f32(0.5), f32(1)

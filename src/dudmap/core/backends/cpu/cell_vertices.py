@@ -12,7 +12,7 @@ lattice steps along its edges.
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 
 f32 = np.float32
 SMOOTH = f32(0.966)
@@ -30,7 +30,7 @@ FIXED = f32(1e3)
 """Weight that holds a coordinate of a vertex on a face of its cell, relative to that of the planes."""
 
 
-@kernel
+@scalar
 def _gradient(field, size, n, step, out):
     """Gradient, times the lattice spacing, at point ``n``: central differences, one-sided beside unknown points."""
     here = field[n]
@@ -49,7 +49,7 @@ def _gradient(field, size, n, step, out):
     return np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2])
 
 
-@kernel
+@scalar
 def _plane(field, size, a, b, t, step, ga, gb, normal):
     """Normal between points ``a`` and ``b``, and the cosine between the gradients there; 0 without a gradient."""
     la, lb = _gradient(field, size, a, step, ga), _gradient(field, size, b, step, gb)
@@ -66,7 +66,7 @@ def _plane(field, size, a, b, t, step, ga, gb, normal):
     return max(agreement, f32(1e-6))
 
 
-@kernel
+@scalar
 def _solve(A, b, damping, out):
     """Solution of (A + damping I) x = b for a symmetric A = (xx, xy, xz, yy, yz, zz)."""
     a00, a01, a02, a11, a12, a22 = A[0] + damping, A[1], A[2], A[3] + damping, A[4], A[5] + damping
@@ -79,7 +79,7 @@ def _solve(A, b, damping, out):
     out[2] = (c02 * b[0] + c12 * b[1] + c22 * b[2]) * by
 
 
-@kernel
+@scalar
 def _add_plane(A, b, weight, normal, offset):
     """Add weight (n . x - offset)^2 to a quadratic form."""
     k = 0
@@ -111,7 +111,7 @@ def _known_leaf(field, levels, size, x, y, z, top, jump):
     return is_known(field, size, x, y, z, edge, jump / f32(1 << level))
 
 
-@kernel
+@scalar
 def is_trusted(field, levels, size, x, y, z, axis, top, jump):
     """Whether two of the four cells around the lattice edge from (x, y, z) along an axis are known.
 
@@ -127,7 +127,7 @@ def is_trusted(field, levels, size, x, y, z, axis, top, jump):
     return known > 1
 
 
-@kernel
+@scalar
 def _own_crossings(field, levels, size, x, y, z, edge, border, top, jump, work):
     """Crossings on the surface of a cell, with their normals, into the rows of ``work``: point, normal, and cosine
     between the gradients at the ends of the edge.
@@ -181,7 +181,7 @@ def _own_crossings(field, levels, size, x, y, z, edge, border, top, jump, work):
     return count
 
 
-@kernel
+@scalar
 def _near_planes(field, size, x, y, z, edge, middle, planes):
     """Planes of crossings up to two cells away: normal, offset from ``middle``, and weight, into rows of ``planes``.
 
@@ -229,7 +229,7 @@ def _near_planes(field, size, x, y, z, edge, middle, planes):
     return count
 
 
-@kernel
+@scalar
 def _meet(planes, count, scale, held, at, A, b, out):
     """Where planes meet, relative to the point of their offsets; those farther than ``scale`` from ``out`` count less.
 
@@ -262,7 +262,7 @@ def _meet(planes, count, scale, held, at, A, b, out):
     return total
 
 
-@kernel
+@scalar
 def _feature(field, size, x, y, z, edge, middle, planes, out):
     """Place of a vertex where the planes around meet, relative to the cell; False if there are too few.
 
@@ -322,7 +322,7 @@ def _is_empty(field, size, x, y, z, edge, place):
     return negative == 0 or negative == 8
 
 
-@kernel
+@scalar
 def place_vertex(field, levels, size, x, y, z, edge, border, top, jump, work, planes, out):
     """Vertex of a cell: place relative to its first point in lattice steps, and normal, into ``out`` (6,).
 

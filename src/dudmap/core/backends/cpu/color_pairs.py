@@ -133,7 +133,7 @@ def _across_surface(D, tangents, T):
     )  # fmt: skip
 
 
-@kernel
+@scalar
 def _product(a, b, count):
     """Sum of the products of the first ``count`` elements."""
     total = f32(0)
@@ -142,7 +142,7 @@ def _product(a, b, count):
     return total
 
 
-@kernel
+@scalar
 def linearize_pair(
     points, tangents, T, depth, depth_intrinsics, first, second, first_twist, second_twist, first_offset, second_offset,
     place, intrinsics, lens, scale, readout, gain, bias, step, noise, by_color, by_depth, huber, begin, residuals, H, b,

@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.pixel import elements, project, ray, transform
 
 NEAREST = np.float32(0.05)
 """Depth in the colour camera below which a point is projected as if it were at this depth, metres."""
 
 
-@kernel
+@scalar
 def _filled(source, fallback, target):
     """Depths of a row with gaps filled by the last reading before them, at its start by the first after them."""
     first = fallback

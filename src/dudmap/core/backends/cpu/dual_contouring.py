@@ -10,7 +10,7 @@ import numpy as np
 
 from dudmap.core.backends.cpu.cell_vertices import is_known, is_trusted, place_vertex
 from dudmap.core.backends.cpu.octree_field import PAD, SPAN, fill, finest_level, may_hold_surface
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 
 f32 = np.float32
 CELL_BITS = 18
@@ -31,7 +31,7 @@ def _cell_key(x, y, z, top, rows):
     return (np.int64(row) << CELL_BITS) | (((i << finer) << 12) | ((j << finer) << 6) | (k << finer))
 
 
-@kernel
+@scalar
 def _mixed_color(near, children1, children2, colors0, colors1, colors2, top, x, y, z, edge, place, out):
     """Colour (3,) uint8 at a place of a cell: mean of the corners that have one, weighed trilinearly."""
     total = f32(0)
@@ -97,7 +97,7 @@ def _may_cross(field, size, p, stride, top):
     return crosses
 
 
-@kernel
+@scalar
 def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, work, keys, places, colors, count):
     """Vertices of the cells of a block; the new number of vertices. See ``contour_blocks``."""
     children1, children2, colors0, colors1, colors2 = tree
@@ -130,7 +130,7 @@ def _block_vertices(field, levels, near, row, top, jump, tree, coords, spacing, 
     return count
 
 
-@kernel
+@scalar
 def _block_polygons(field, levels, rows, top, jump, polygons, count):
     """Polygons around the edges that begin in a block; the new number of polygons. See ``contour_blocks``."""
     cells, size, pad, width = SPAN << top, (SPAN << top) + 1, PAD << top, 8 << top
@@ -260,7 +260,7 @@ def contour_blocks(
     )  # fmt: skip
 
 
-@kernel
+@scalar
 def _longer(array, used, more):
     """Copy of an array with room for ``more`` rows after those in use."""
     out = np.empty((2 * (used + more), *array.shape[1:]), array.dtype)

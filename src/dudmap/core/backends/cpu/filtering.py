@@ -156,7 +156,7 @@ def range_weight(difference, inverse):
     return w * w
 
 
-@kernel
+@scalar
 def _accumulate(middle, before, after, inverse, spatial, numerator, denominator):
     """Add one tap on each side of every pixel of a line to the sums of the filter, none where one lies outside.
 
@@ -172,7 +172,7 @@ def _accumulate(middle, before, after, inverse, spatial, numerator, denominator)
         denominator[u] += s + t
 
 
-@kernel
+@scalar
 def _start(middle, alpha, inverse, numerator, denominator):
     """Sums of the filter with the centre tap alone, and 1 / (16 sigma_c^2) of each pixel."""
     for u in range(middle.size):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from dudmap.core.backends.cpu.links import links
 from dudmap.core.backends.cpu.tables import TRIANGLE_COUNT, TRIANGLES
 from dudmap.core.backends.parameters import MeshArrays, MeshParameters
-from dudmap.core.backends.threads import bands, kernel, run_bands
+from dudmap.core.backends.threads import bands, kernel, run_bands, scalar
 from dudmap.core.formulas.surface import crossing, mixed_channel, slope
 
 BAND = 256
@@ -179,7 +179,7 @@ def _surrounded_words(geometry, slots, near, behind, row_of, row, words):
                     target[:] = geometry[slots[other], first : first + nz]
 
 
-@kernel
+@scalar
 def _slope(words, n, step):
     """Derivative of sdf at voxel ``n`` of flat ``words``: see ``slope``."""
     return slope(words[n], words[n + step], words[n - step])

@@ -7,7 +7,7 @@ point see the same value, on whatever level they are.
 
 import numpy as np
 
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 
 PAD = 3
 """Coarsest voxels around a block that the lattice reaches."""
@@ -70,7 +70,7 @@ def _put(geometry, slot, x, y, z, size, least, unit, field):
                     field[((x + i) * size + y + j) * size + z + k] = np.float32(word >> 16) * unit
 
 
-@kernel
+@scalar
 def _upsample(coarse, size, fine):
     """Field on a lattice of half the spacing, by linear interpolation; NaN where a point around is not known."""
     double = 2 * size - 1

@@ -84,7 +84,7 @@ def step_length(distance):
     return ahead if distance > np.float32(0) else back
 
 
-@kernel
+@scalar
 def _blend(values, ax, ay, az):
     """Trilinear interpolation of eight corner values."""
     value, _, _, _ = trilinear(
@@ -93,7 +93,7 @@ def _blend(values, ax, ay, az):
     return value
 
 
-@kernel
+@scalar
 def _sample(window, geometry, shape, x, y, z, least, corners, values):
     """Signed distance in stored steps at lattice point (x, y, z) inside the window; NaN where it is not known."""
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)
@@ -108,7 +108,7 @@ def _sample(window, geometry, shape, x, y, z, least, corners, values):
     return _blend(values, x - lx, y - ly, z - lz)
 
 
-@kernel
+@scalar
 def to_block_boundary(p, d, inverse):
     """Ray parameter from ``p`` to the boundary of its block along one axis."""
     block = np.floor(p * np.float32(0.125)) * np.float32(8)
@@ -142,7 +142,7 @@ def corner_gradient(s0, s1, s2, s3, s4, s5, s6, s7, fx, fy, fz):
     return gx, gy, gz
 
 
-@kernel
+@scalar
 def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, values):
     """First crossing from outside to inside along lattice ray ``o + t d`` between ``t`` and ``end``; -1 = none.
 
@@ -202,7 +202,7 @@ def _trace_ray(window, shape, geometry, o, d, t, end, unit, least, corners, valu
     return -one
 
 
-@kernel
+@scalar
 def _refine(window, shape, geometry, o, d, a, at_a, b, at_b, unit, least, corners, values):
     """Zero between depths ``a`` (outside) and ``b`` (inside) by false position (Illinois variant)."""
     side = 0
@@ -226,7 +226,7 @@ def _refine(window, shape, geometry, o, d, a, at_a, b, at_b, unit, least, corner
     return t
 
 
-@kernel
+@scalar
 def _shade(window, shape, geometry, colors, x, y, z, corners, values, color, normal):
     """Colour (3,) uint8 and normal (3,) float32 at a lattice point on the surface; normal 0 where it has no slope."""
     lx, ly, lz = np.floor(x), np.floor(y), np.floor(z)

@@ -63,7 +63,7 @@ def mean_color(red, green, blue, count):
     return np.int32(word) if count > 0 else np.int32(0)
 
 
-@kernel
+@scalar
 def padded(voxels, near, words):
     """Words (SIZE, SIZE, SIZE) of a block and of the two voxels around it; 0 where there is no block.
 
@@ -146,7 +146,7 @@ def examine_range(start, stop, geometry, near, by_voxel, saturated, bend, textur
             surface[row, octant] = inside and outside
 
 
-@kernel
+@scalar
 def _channel(value):
     return np.float32(value & 1023)
 

@@ -13,7 +13,7 @@ from dudmap.core.backends.cpu.neighbors import last_corner, load_row, locate
 from dudmap.core.backends.cpu.teams import NO_BAND, announce, done, finish, take, wait_for_all, wait_for_work
 from dudmap.core.backends.cpu.vectors import wide_vectors
 from dudmap.core.backends.parameters import ImageStack, NormalEquations, to_lattice
-from dudmap.core.backends.threads import kernel
+from dudmap.core.backends.threads import kernel, scalar
 from dudmap.core.formulas.damping import damped_step, judged, moved
 from dudmap.core.formulas.pixel import elements, rotate
 from dudmap.core.formulas.residual import normal_terms, trilinear, weigh
@@ -30,10 +30,10 @@ SYMMETRIC[np.triu_indices(6)] = SYMMETRIC.T[np.triu_indices(6)] = np.arange(21)
 COST = 27
 """Index of the cost among the sums."""
 
-_to_lattice = kernel(to_lattice)
+_to_lattice = scalar(to_lattice)
 
 
-@kernel
+@scalar
 def linearize_rows(
     row_start, row_stop, depth, intensity, weights, intrinsics, T, window, shape, geometry, voxel_size, sdf_unit,
     parameters, residuals, sums,
@@ -222,6 +222,7 @@ def descend(
         The last accepted pose (4, 4), its sums (NUM_SUMS,), the buffer of its residuals, -1 for those at the first
         pose that were known, the number of linearisations, and whether a stop criterion was met.
     """
+    wide_vectors()
     num_bands, height = sums.shape[1], depth.shape[0]
     unit, step_size = np.float32(voxel_size), np.float32(sdf_unit)
     T, accepted, T_trial = T_first, first, T_first

@@ -107,7 +107,7 @@ def segment_sums(
     return SegmentSums(*out.T)
 
 
-@kernel
+@scalar
 def surface_end(depth, tolerance, v, u, dv, du, reach):
     """Pixels (0 to ``reach``) that one can go in a direction without leaving the surface."""
     z = depth[v, u]
@@ -149,7 +149,7 @@ def plane_distance(nx, ny, nz, ex, ey, ez):
     return abs(nx * ex + ny * ey + nz * ez)
 
 
-@kernel
+@scalar
 def plane_step(depth, intrinsics, normals, v, u, vn, un):
     """Smaller one of the distances of two neighbouring pixels' points from each other's plane, metres."""
     z, zn = depth[v, u], depth[vn, un]

@@ -1,0 +1,56 @@
+"""The first run, which compiles the kernels, gives what later ones give, which load them."""
+
+import ast
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+import dudmap
+
+PROGRAM = """
+import sys
+from dudmap import Config, run, synthetic
+from dudmap.core.geometry.camera import Camera
+from dudmap.lab.synthetic.sensors import SensorFaults
+
+camera = Camera(262.0, 262.0, 159.5, 119.5, 320, 240)
+faults = SensorFaults(color_delay=0.02, color_distortion=(0.1, -0.1, 0.0, 0.0))
+recording = synthetic.sequence(frames=100, camera=camera, camera_path="handheld", faults=faults)
+run(recording, Config().override(["volume.voxel_size=0.02"]), sys.argv[1], calibrate=True, progress=False)
+"""
+INTEGERS = {
+    "_cell", "_cell_key", "_changes_sign", "_corner_words", "_is_empty", "_known_leaf", "_mark", "_may_cross", "_put",
+    "_slot_at", "_step_block", "_surrounded_words", "_voxel", "_yield_core", "announce", "corners_at", "done", "fill",
+    "find", "finest_at", "finest_level", "finish", "half_word", "inside_window", "is_known", "least_weight",
+    "load_corners", "load_row", "may_hold_surface", "quarter_word", "take", "wait_for_all", "wait_for_work",
+}  # fmt: skip
+"""Kernels without arithmetic on fractions, which have no roundings."""
+
+
+@pytest.mark.slow
+def test_an_empty_and_a_filled_kernel_cache_give_equal_results(tmp_path):
+    results = []
+    for name in ("cold", "warm"):
+        out = tmp_path / name
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+        subprocess.run([sys.executable, "-c", PROGRAM, str(out)], check=True, env=environment, capture_output=True)
+        results.append({file: (out / file).read_bytes() for file in ("trajectory.txt", "calibration.toml", "mesh.ply")})
+    assert results[0] == results[1]
+
+
+def test_what_kernels_call_is_inlined():
+    """A function that is not exists twice, with other roundings, and it depends on the cache which one is called."""
+    kinds, calls = {}, set()
+    for path in sorted(Path(dudmap.__file__).parent.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.FunctionDef):
+                kind = {one.id for one in node.decorator_list if isinstance(one, ast.Name)}
+                if kind & {"kernel", "scalar", "written_out"}:
+                    kinds[node.name] = kind
+                    called = (one.func for one in ast.walk(node) if isinstance(one, ast.Call))
+                    calls |= {one.id for one in called if isinstance(one, ast.Name)}
+    assert "linearize_pair" in calls
+    assert {name for name in calls if "kernel" in kinds.get(name, ())} == INTEGERS
