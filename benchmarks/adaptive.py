@@ -31,6 +31,7 @@ from dudmap.evaluation.reconstruction import compare_surfaces
 from dudmap.evaluation.surface import Surface, moved
 from dudmap.evaluation.trajectory import ate
 from dudmap.io.sequences import open_sequence
+from dudmap.lab.benchmark.table import grid
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.lab.synthetic.scene import BOX
 from dudmap.lab.synthetic.setup import sequence
@@ -106,10 +107,7 @@ def scores(mesh: Mesh, recording: SyntheticSequence, edges: NDArray[np.float64])
 def table(rows: dict[str, dict[str, float]]) -> str:
     """The rows as a table in Markdown."""
     names = list(next(iter(rows.values())))
-    lines = ["| | " + " | ".join(names) + " |", "|---" * (len(names) + 1) + "|"]
-    for name, row in rows.items():
-        lines.append(f"| {name} | " + " | ".join(f"{row[key]:.2f}" for key in names) + " |")
-    return "\n".join(lines)
+    return grid(["", *names], [[name, *(f"{row[key]:.2f}" for key in names)] for name, row in rows.items()], words=1)
 
 
 def measure(

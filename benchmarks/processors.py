@@ -20,7 +20,6 @@ import subprocess
 import sys
 import time
 import xml.etree.ElementTree as ElementTree
-from collections.abc import Iterable
 from dataclasses import dataclass
 from itertools import combinations
 from pathlib import Path
@@ -28,6 +27,8 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from dudmap.lab.benchmark.table import grid
 
 ROOT = Path(__file__).resolve().parents[1]
 EXCERPT = ROOT / "tests" / "fixtures" / "freiburg1_xyz"
@@ -216,11 +217,6 @@ def differences(a: NDArray[np.float64], b: NDArray[np.float64]) -> tuple[float, 
     return float(distance.max()), float(np.degrees(2 * np.arcsin(np.clip(chord, 0, 1))).max())
 
 
-def table(header: list[str], rows: Iterable[list[str]]) -> str:
-    """A Markdown table."""
-    return "\n".join("| " + " | ".join(cells) + " |" for cells in (header, ["---"] * len(header), *rows))
-
-
 def spread(files: dict[str, Path]) -> str:
     """Least and greatest of each figure with their configurations, and the greatest differences between any two."""
     loaded = {}
@@ -243,10 +239,10 @@ def spread(files: dict[str, Path]) -> str:
         if pairs:
             distances, angles, ious = zip(*pairs, strict=True)
             between.append([recording, f"{max(distances):.3g}", f"{max(angles):.2g}", f"{min(ious):.4f}"])
-    text = table(["recording", "figure", "least", "with", "greatest", "with"], figures)
+    text = grid(["recording", "figure", "least", "with", "greatest", "with"], figures)
     if between:
         header = ["between any two", "position, at most mm", "rotation, at most deg", "IoU of their masks, at least"]
-        text += "\n\n" + table(header, between)
+        text += "\n" + grid(header, between)
     return text
 
 
@@ -288,7 +284,7 @@ def main() -> int:
             rows.append([name, str(count), str(len(failures)), f"{(time.perf_counter() - start) / 60:.1f}"])
             print(f"{name}: {len(failures)} of {count} tests failed", flush=True)
     if rows:
-        print("\n" + table(["configuration", "tests", "failed", "minutes"], rows))
+        print("\n" + grid(["configuration", "tests", "failed", "minutes"], rows))
     for test, messages in failed.items():
         print(f"\n{test}")
         for name, message in messages.items():

@@ -102,14 +102,22 @@ def counted(frames, voxel):
     recording = sequence(movers=("person",), frames=frames)
     slam = Slam(recording.camera, Config().override([f"volume.voxel_size={voxel}"]))
     pixels = Counter()
-    original = slam.tracker.linearize
+    linearize, descend = slam.tracker.linearize, slam.tracker._descend
 
-    def counting(volume, level, *rest, **named):
-        pixels["linearised"] += level.depth.size
-        pixels["iterations"] += 1
-        return original(volume, level, *rest, **named)
+    def count(level, iterations):
+        pixels["linearised"] += iterations * level.depth.size
+        pixels["iterations"] += iterations
 
-    slam.tracker.linearize = counting
+    def linearizing(volume, level, *rest, **named):
+        count(level, 1)
+        return linearize(volume, level, *rest, **named)
+
+    def descending(volume, level, *rest):
+        found = descend(volume, level, *rest)
+        count(level, found.iterations)
+        return found
+
+    slam.tracker.linearize, slam.tracker._descend = linearizing, descending
     rows = []
     for index in range(frames):
         frame = recording[index]

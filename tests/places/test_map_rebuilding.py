@@ -1,5 +1,7 @@
 """A map that is rebuilt over many frames is, once complete, the map that is rebuilt at once."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -174,3 +176,20 @@ def test_maps_that_are_not_the_current_one_leave_the_memory():
         add(each, 101, at(0.15 * 12))
     for number in range(3):
         assert content(atlas.volumes[number]) == content(whole.volumes[number])
+
+
+def test_a_map_is_painted_anew_over_many_frames_as_it_is_at_once():
+    painted = []
+    for gradually in (False, True):
+        atlas, frames = walked(), 0
+        before = content(atlas.volume)
+        atlas.history.registered = lambda frame: replace(frame, color=255 - frame.color)
+        atlas.recolor(gradually=gradually)
+        while atlas.repainting is not None:
+            assert content(atlas.volume) == before
+            atlas.continue_rebuilding()
+            frames += 1
+        assert frames == (COUNT if gradually else 0)
+        painted.append(content(atlas.volume))
+        assert painted[-1] != before
+    assert painted[0] == painted[1]

@@ -36,7 +36,7 @@ class ColorCalibration:
         *,
         live: bool,
     ) -> None:
-        self._camera = camera
+        self._camera, self._live = camera, live
         self._start = start or Calibration.registered(camera)
         self._atlas = atlas
         self._color_motion = color_motion
@@ -77,7 +77,7 @@ class ColorCalibration:
             if found is None:
                 return False
             self._color_motion.calibration = found
-            self._atlas.recolor()
+            self._atlas.recolor(gradually=self._live)
             return True
 
     def interrupt(self) -> None:

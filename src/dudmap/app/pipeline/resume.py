@@ -55,13 +55,14 @@ def resume(
         with closing(reader):
             options, storing = stored.options, stored.options.storing
             with damaged(StateError, reader.path):
-                if storing is None or options.max_frames is None:
+                count = options.max_frames
+                if storing is None or count is None:
                     raise ValueError("it does not say of which recording it is")
                 sequence = open_sequence(**storing.recording) if sequence is None else sequence
                 options = options.model_copy(update={"config": on_device(options.config, device)})
             check_recording(sequence, stored, out)
             if stored.number is not None:
-                display = RunProgress(options.max_frames * options.passes, bar=progress)
+                display = RunProgress(count * options.passes, bar=progress)
                 masks = open_masks(options.masks, sequence)
                 job = Job(sequence, out, options, display, masks, observers)
                 try:

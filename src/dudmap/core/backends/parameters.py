@@ -5,7 +5,7 @@ that the loops calculate with.
 """
 
 from functools import lru_cache
-from typing import NamedTuple, Protocol, TypeVar
+from typing import Any, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,8 @@ Parameters = TypeVar("Parameters", bound=tuple)
 @lru_cache(maxsize=64, typed=True)
 def single(parameters: Parameters) -> Parameters:
     """The same tuple, also of nested ones, with every number as float32; made once for equal ones of one type."""
-    values = [single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters]
-    return type(parameters)(*values)
+    make: Any = type(parameters)
+    return make(*(single(value) if isinstance(value, tuple) else np.float32(value) for value in parameters))
 
 
 class SensorNoise(NamedTuple):

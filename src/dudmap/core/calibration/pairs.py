@@ -96,4 +96,4 @@ def _drawn(
     apart = (angles > MIN_ANGLE) | (shifts > np.sin(MIN_ANGLE) * reach) | (faster > MIN_FASTER)
     found = np.flatnonzero(overlap & apart)
     order = np.random.default_rng(0).permutation(len(found))[:count]
-    return [Pair(keyframes[first[n]], keyframes[second[n]]) for n in found[np.sort(order)]]
+    return [Pair(keyframes[int(first[n])], keyframes[int(second[n])]) for n in found[np.sort(order)].tolist()]

@@ -71,7 +71,8 @@ class Region:
         for low, high, other_low, other_high in zip(*self.box, *other.box, strict=True):
             if low - other_high > distance or other_low - high > distance:
                 return False
-        p, q = self.sample - np.float32(self.box[0]), other.sample - np.float32(self.box[0])
+        corner = np.array(self.box[0], np.float32)
+        p, q = self.sample - corner, other.sample - corner
         squared = np.einsum("ij,ij->i", p, p)[:, None] + np.einsum("ij,ij->i", q, q) - 2 * p @ q.T
         return float(squared.min()) < distance**2
 

@@ -71,6 +71,7 @@ class Atlas:
         self.history = history
         self.volumes = {number: make_volume()}
         self.rebuildings: dict[int, MapRebuilding] = {}
+        self.repainting: MapRebuilding | None = None
         self.current = number
         self.poses: list[TimedPose] = []
         self.saved: int | None = None
@@ -138,20 +139,30 @@ class Atlas:
         if self.history is not None:
             self.history.add(recorded or frame, static_mask, T_world_camera, self.current, exposure)
 
-    def recolor(self) -> None:
+    def recolor(self, *, gradually: bool = False) -> None:
         """Paint all maps anew with the colours that the stored frames have with the calibration now in use.
 
         A saved map keeps its colours: not all its frames are stored.
+
+        Args:
+            gradually: Paint the current map over the frames to come, so that none of them has to wait.
         """
         assert self.history is not None
         self.complete()
-        for number, volume in self.volumes.items():
+        for number in self.volumes:
             if number == self.saved:
                 continue
-            painted = self.make_volume()
-            self.history.reintegrate(painted, self.nodes(number))
-            volume.take_colors(painted)
+            self.repainting = MapRebuilding(self.history, number, self.make_volume(), [], [])
+            if not (gradually and number == self.current):
+                self._complete_repainting()
         self.switch_to(self.current)
+
+    def _complete_repainting(self) -> None:
+        """Complete the map that is being painted anew, if there is one."""
+        repainting, self.repainting = self.repainting, None
+        if repainting is not None:
+            repainting.fuse()
+            self.volumes[repainting.submap].take_colors(repainting.volume)
 
     def velocity_at(self, timestamp: float) -> NDArray[np.float64]:
         """Twist per second (6,), camera axes, of a tracked frame, from the poses before and after it; 0 if unknown."""
@@ -223,7 +234,10 @@ class Atlas:
         return self.volumes[number]
 
     def continue_rebuilding(self) -> None:
-        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames."""
+        """Go on with the map that is being rebuilt, that of the current submap first, by ``PER_FRAME`` frames, or with
+        the one that is painted anew, by one frame."""
+        if self.repainting is not None and self.repainting.fuse(1):
+            self._complete_repainting()
         if not self.rebuildings:
             return
         number = self.current if self.current in self.rebuildings else min(self.rebuildings)
@@ -234,7 +248,8 @@ class Atlas:
             self._take(rebuilding)
 
     def complete(self) -> None:
-        """Complete all maps that are being rebuilt."""
+        """Complete all maps that are being rebuilt or painted anew."""
+        self._complete_repainting()
         for rebuilding in list(self.rebuildings.values()):
             self.volumes[rebuilding.submap].clear()  # makes room
             rebuilding.fuse()
@@ -287,6 +302,7 @@ class Atlas:
             (4, 4) motion of the newest stored frame.
         """
         assert self.history is not None
+        self.repainting = None  # the new map has the new colours
         stamps, positions = self.history.timeline(nodes)
         corrections = np.stack(
             [T @ se3.inverse(self.history.Ts_world_camera[n]) for n, T in zip(nodes, Ts_new, strict=True)]
@@ -307,6 +323,7 @@ class Atlas:
     def join(self, source: int, target: int, T_target_source: NDArray[np.float64]) -> None:
         """Fuse a submap into another, which becomes the current one; ``T_target_source`` (4, 4) maps world to world."""
         assert self.history is not None
+        self._complete_repainting()
         moved_nodes, kept_nodes = self.nodes(source), self.nodes(target)
         for moved in (*self.poses, *self.keyframes.keyframes):
             if moved.submap == source:

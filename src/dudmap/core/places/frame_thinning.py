@@ -48,7 +48,7 @@ class FrameThinning:
         """Test the frames with the view of the newest one if that was stored since the last call; call it with every
         frame."""
         history = self.atlas.history
-        if history is None or len(history) <= MIN_KEPT or self.atlas.rebuildings:
+        if history is None or len(history) <= MIN_KEPT or self.atlas.rebuildings or self.atlas.repainting:
             return
         if history.serials[-1] == self._newest:
             return

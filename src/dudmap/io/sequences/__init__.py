@@ -159,7 +159,8 @@ def open_sequence(
             f"{path} is a recording in the format {reader.format}, which has no {' and no '.join(foreign)}"
         )
     with damaged(DatasetError, f"the recording {place}"):
-        recording: Any = reader(place, camera, **given)
+        make: Any = reader
+        recording = make(place, camera, **given)
         if depth_unit is not None:
             recording.camera = replace(recording.camera, depth_scale=1.0 / depth_unit)
             recording.sources["depth unit"] = f"--depth-unit {depth_unit:g}"

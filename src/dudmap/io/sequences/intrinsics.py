@@ -70,7 +70,8 @@ class Intrinsics:
 def _camera(values: dict[str, float], depth_scale: float) -> Camera:
     distortion = tuple(values.get(key, 0.0) for key in DISTORTION_KEYS)
     size = int(values["width"]), int(values["height"])
-    return Camera(*(values[key] for key in KEYS[:4]), *size, depth_scale, distortion if any(distortion) else ())
+    fx, fy, cx, cy = (values[key] for key in KEYS[:4])
+    return Camera(fx, fy, cx, cy, *size, depth_scale, distortion if any(distortion) else ())
 
 
 def camera_values(*numbers: float) -> dict[str, float]:

@@ -73,8 +73,12 @@ class TumSequence(ImageFolder):
 
     def _published(self) -> intrinsics.Intrinsics | None:
         folder = self.path.resolve().name
-        named = (camera for pattern, *camera in self.cameras if re.search(pattern, folder, re.IGNORECASE))
-        return super()._published() or next((intrinsics.by_name(*camera) for camera in named), None)
+        named = (
+            intrinsics.by_name(name, values)
+            for pattern, name, values in self.cameras
+            if re.search(pattern, folder, re.IGNORECASE)
+        )
+        return super()._published() or next(named, None)
 
     def _find_ground_truth(self) -> Trajectory | None:
         return self._stamped_poses()
@@ -144,8 +148,10 @@ class CorbsSequence(TumSequence):
         return super().recognises(path) and cls.folder.fullmatch(path.resolve().name) is not None
 
     def _find_pairs(self) -> list[tuple[TimedFile, TimedFile]]:
-        pairs = super()._find_pairs()
-        return [tuple(TimedFile(t, Path(str(file).replace("\\", "/"))) for t, file in pair) for pair in pairs]
+        def slashed(file: TimedFile) -> TimedFile:
+            return TimedFile(file[0], Path(str(file[1]).replace("\\", "/")))
+
+        return [(slashed(depth), slashed(color)) for depth, color in super()._find_pairs()]
 
     def _find_ground_truth(self) -> Trajectory | None:
         truth = super()._find_ground_truth()

@@ -106,7 +106,7 @@ def synth_command(world: dict[str, Any]) -> str:
     """The ``dudmap synth`` command that writes a world to a folder; its depth is rounded to 1/5000 m there."""
     words = ["dudmap", "synth", "OUT", "--size", "{}x{}".format(*world["camera"])]
     for key, value in world.items():
-        option = "--" + key.replace("_", "-")
+        option = "--max-frames" if key == "frames" else "--" + key.replace("_", "-")
         if key == "movers":
             words += [option, ",".join(value) or "none"]
         elif key == "faults":

@@ -202,17 +202,25 @@ def method_hash() -> str:
 
 def _options(table: object) -> DesignOptions:
     table = {"kind": table} if isinstance(table, str) else table
-    known = [option.name for option in fields(DesignOptions)]
     if not isinstance(table, dict):
         raise ConfigError(f"design is {table!r}; expected a table with kind, samples, ...")
+    return DesignOptions(**checked_options(table, DesignOptions, "the design"))
+
+
+def checked_options(table: Mapping[str, Any], options: type, what: str) -> dict[str, Any]:
+    """Options of a table of a design file, whose names and types are those of the fields of a class.
+
+    Raises:
+        ConfigError: An option is unknown, has another type, or is a number of samples or trials below 1.
+    """
+    known = {option.name: type(option.default) for option in fields(options)}
     for key, value in table.items():
         if key not in known:
-            raise ConfigError(f"unknown option {key!r} of the design; known are {', '.join(known)}")
-        expected = type(getattr(DesignOptions, key))
-        if type(value) is not expected or (key == "samples" and int(value) < 1):
-            raise ConfigError(f"option {key} of the design is {value!r}; expected a {expected.__name__}")
-    checked: dict[str, Any] = table
-    return DesignOptions(**checked)
+            raise ConfigError(f"unknown option {key!r} of {what}; known are {', '.join(known)}")
+        number = known[key] is float and type(value) is int
+        if (type(value) is not known[key] and not number) or (key in ("samples", "trials") and value < 1):
+            raise ConfigError(f"option {key} of {what} is {value!r}; expected a {known[key].__name__}")
+    return dict(table)
 
 
 def make_entries(tables: object, folder: Path) -> tuple[tuple[str, int, Entry], ...]:

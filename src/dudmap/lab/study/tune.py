@@ -7,7 +7,7 @@ results only, and results are kept: a search that was stopped proposes the same 
 """
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +20,7 @@ from dudmap.lab.study.conduct import Progress, conduct
 from dudmap.lab.study.designs import Point
 from dudmap.lab.study.executor import Executor
 from dudmap.lab.study.factors import Factor, configured
-from dudmap.lab.study.plan import MAX_RUNS, Plan, place_of
+from dudmap.lab.study.plan import MAX_RUNS, Plan, checked_options, place_of
 from dudmap.lab.study.responses import RESPONSES, check_truth
 from dudmap.lab.study.store import StudyFolder
 from dudmap.lab.study.tables import Table
@@ -89,14 +89,9 @@ def tune_options(table: Mapping[str, Any]) -> TuneOptions:
     Raises:
         ConfigError: One is unknown or invalid.
     """
-    known = {option.name for option in fields(TuneOptions)}
-    for key in table:
-        if key not in known:
-            raise ConfigError(f"unknown option {key!r} of tune; known are {', '.join(sorted(known))}")
-    options = TuneOptions(**table)
-    whole = type(options.trials) is int and type(options.seed) is int
-    if not whole or options.trials < 1 or not isinstance(options.early, int | float) or not 0 <= options.early < 1:
-        raise ConfigError(f"tune is {dict(table)}; expected trials of 1 or more, early from 0 to below 1, a whole seed")
+    options = TuneOptions(**checked_options(table, TuneOptions, "tune"))
+    if not 0 <= options.early < 1:
+        raise ConfigError(f"tune has early = {options.early}; expected early from 0 to below 1")
     return options
 
 
