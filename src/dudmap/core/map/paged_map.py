@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import VolumeConfig
-from dudmap.core.backends.spec import Backend
 from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
 from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
-from dudmap.core.map.integrator import Integrator
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
 
 
@@ -19,13 +17,11 @@ class PagedMap:
     """What ``TsdfVolume`` does with its blocks as a whole, wherever they are; its attributes are described there."""
 
     config: VolumeConfig
-    backend: Backend
     levels: Sequence[FineBlocks]
     pager: BlockPager | None
     block_size: float
     blocks: VoxelBlocks
     window: BlockWindow
-    _integrator: Integrator
     _window_cells: int
     _frame_number: int
     _left: NDArray[np.int64] | None  # where the window was when all blocks left the memory
