@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
 from dudmap.cli.benchmark_gpu import gpu
-from dudmap.cli.output import answer, counted
+from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
 
 RUNS = Path("runs/benchmark")
