@@ -14,6 +14,7 @@ from typing import Literal
 
 from dudmap import __version__
 from dudmap.app.kernel_cache import compiled_kernels, kernel_cache
+from dudmap.extras import install
 
 PYTHON = ((3, 11), (3, 14))
 """First version of Python that is supported, and the first that is not."""
@@ -152,7 +153,7 @@ def _extras() -> Iterator[Check]:
             if (found := installed(name)) is None or numbers(found) < numbers(lowest)
         ]  # fmt: skip
         if missing:
-            mend = f"only if you need it: pip install 'dudmap[{extra}]'"
+            mend = f"only if you need it: {install(extra)}"
             yield Check(f"extra {extra}", "note", f"without {', '.join(missing)}", mend)
         else:
             yield Check(f"extra {extra}", "good", ", ".join(f"{name} {installed(name)}" for name, _ in packages))

@@ -67,10 +67,8 @@ def calibrate_start(
     """
     count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
     if config.preset == "thesis" or count < MIN_FRAMES:
-        thesis = "preset thesis takes the images as they are"
-        notice(
-            f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else f'that takes {MIN_FRAMES} frames'}"
-        )
+        thesis, short = "preset thesis takes the images as they are", f"that takes {MIN_FRAMES} frames"
+        notice(f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else short}")
         return None
     notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
     given = sequence.calibration or Calibration.registered(sequence.camera)
