@@ -24,8 +24,8 @@ FIGURES = (
     ("peak memory", "peak_rss_mb", "{:.0f} MB", 1),
     ("map", "map_bytes", "{:.1f} MB", 1e-6),
     ("mesh", "mesh_triangles", "{} triangles", 1),
-    ("ATE RMSE", "ate_rmse_m", "{:.2f} cm", 100),
-    ("RPE RMSE, translation", "rpe_trans_rmse_m_per_s", "{:.2f} cm/s", 100),
+    ("ATE RMSE", "ate_rmse_m", "{:.1f} mm", 1000),
+    ("RPE RMSE, translation", "rpe_trans_rmse_m_per_s", "{:.1f} mm/s", 1000),
     ("RPE RMSE, rotation", "rpe_rot_rmse_deg_per_s", "{:.2f} deg/s", 1),
     ("mask IoU", "mask_iou_mean", "{:.3f}", 1),
 )
