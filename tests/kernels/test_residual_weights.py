@@ -40,11 +40,11 @@ OWNERS = {
     },
     ("sigma_base", "sigma_scale"): {
         "config.py:sigma",
-        "core/map/integrator.py:of",  # hands them on, as do all that follow
+        "core/map/integrator.py:fusion_parameters",  # hands them on, as do all that follow
         "core/tracking/tracker.py:_chi_square",
         "core/dynamics/detector.py:_noise_parameters",
         "core/dynamics/detector.py:distance_sigma",
-        "core/calibration/adjustment.py:_linearize_pairs",
+        "core/calibration/adjustment.py:__init__",
     },
 }
 """Parameters of a formula, and the files or functions that may name them; everybody else calls the formula."""

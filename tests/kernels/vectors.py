@@ -29,7 +29,7 @@ def counts(kernel, signature, source=None):
 
     function = kernel.py_func
     if source is not None:
-        namespace = dict(function.__globals__)
+        namespace = dict(function.__globals__) | {"kernel": lambda plain: plain, "scalar": lambda plain: plain}
         exec(compile(source, "<variant>", "exec"), namespace)
         function = namespace[function.__name__]
     options = {
