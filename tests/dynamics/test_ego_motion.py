@@ -416,3 +416,15 @@ def test_an_empty_room_and_a_crowd_that_is_seen_to_move_are_not_uncertain():
     assert not any(result.uncertain for result in uncertain_frames(room))
     dense = synthetic.sequence("room", coverage=0.7, speed=1.0, start_dynamic=True, frames=4, camera=CAMERA, seed=0)
     assert not any(result.uncertain for result in uncertain_frames(dense))
+
+
+def test_a_new_map_is_not_compared_with_images_of_the_one_before(monkeypatch):
+    compared = []
+    monkeypatch.setattr(ego_motion, "dominant_motion", lambda before, *_: compared.append(before))
+    segmenter = ego_motion.EgoMotionSegmenter(1.0)
+    for start in (0.0, 0.2):  # the second map begins while the images of the first are still young
+        segmenter.start(start)
+        assert segmenter.slow_motion(start + 0.1, np.eye(4), None, None) is None
+        segmenter.update(start, np.eye(4), f"image at {start}", None)
+    segmenter.slow_motion(0.35, np.eye(4), None, None)
+    assert compared == ["image at 0.2"]

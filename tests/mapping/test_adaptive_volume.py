@@ -1,5 +1,7 @@
 """The map with several voxel sizes: where they open and close, what is carved, and what the readers of the map see."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.adaptive_volume import AdaptiveVolume
 from dudmap.core.map.incremental_mesh import IncrementalMesh
+from dudmap.core.map.refinement import MAX_CALM
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.volume_mirror import VolumeMirror
 from dudmap.core.places.saved_map import MAP_FILE
@@ -96,6 +99,21 @@ def test_smaller_voxels_are_dropped_where_the_surface_has_become_flat():
     seen = fine_centres(volume)
     assert np.count_nonzero(seen[:, 2] < 0.84) == 0  # what is left stands behind the wall
     assert_linked(volume)
+
+
+def test_smaller_voxels_are_dropped_after_calm_examinations_in_a_row_only():
+    """A block that is needed every now and then stays; one is dropped with the last of MAX_CALM calm examinations."""
+    dropped, calm = [], np.zeros(2, np.uint8)
+    level = SimpleNamespace(calm=calm, drop=lambda slots: dropped.append(slots.tolist()))
+    refinement = fused([])._refinements[0]
+    children = np.full((2, 8), -1, np.int32)
+    children[:, 3] = 0, 1
+    surface = np.ones((2, 8), bool)
+    for number in range(3 * MAX_CALM):
+        needed = np.zeros((2, 8), np.float32)
+        needed[0, 3] = number % MAX_CALM == MAX_CALM - 1
+        refinement._drop_calm(level, children, surface, needed)
+        assert dropped[-1] == ([1] if number >= MAX_CALM - 1 else [])
 
 
 def test_what_moves_away_leaves_nothing_in_the_smaller_voxels():
@@ -206,6 +224,7 @@ def test_colours_can_be_replaced_where_the_other_map_is_not_refined():
     np.testing.assert_array_equal(volume.levels[0].blocks.colors, painted.levels[0].blocks.colors)
     coarse = fused([ridge(gray=60)] * 2)
     assert coarse.levels[0].blocks.num_voxel_blocks == 0
+    coarse.levels[0].blocks.colors[-1] = 900  # of some block, all slots being in use
     volume.take_colors(coarse)
     blocks = volume.levels[0].blocks
     near = colored & (blocks.geometry != 0)

@@ -11,6 +11,7 @@ from dudmap.core.backends.parameters import SensorNoise
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
+from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.integrator import FRONTAL_WEIGHT
 from dudmap.core.map.volume import FREE, TsdfVolume
 from dudmap.core.map.voxel_blocks import MAX_LOAD
@@ -314,6 +315,22 @@ def test_what_is_seen_to_be_empty_leaves_map_and_mesh():
     seen = volume.sample(box_before_wall().depth, np.zeros(CAMERA.shape, np.float32), CAMERA, np.eye(4))
     empty = (seen.occupancy == FREE) | (seen.distance > 0.8 * volume.truncation)
     assert np.mean(empty[18:32, 24:41]) > 0.9
+
+
+def test_the_window_is_a_copy_of_the_hash_table():
+    """Also of blocks that were seen to be empty, and of those whose surface has come back."""
+    volume = TsdfVolume(CAMERA, CONSTANT.model_copy(update={"carve_rate": 4, "voxel_size": 0.02}), depth_max=4.0)
+    released, before = 0, np.empty(0, np.int32)
+    for frame in (*[box_before_wall()] * 8, *[wall(3.0, bump=0.0)] * 16, *[box_before_wall()] * 3):
+        volume.integrate(frame, np.eye(4))
+        window = volume.window
+        fresh = BlockWindow(volume.block_size, int(window.shape[0]))
+        fresh.fill(window.origin, volume.blocks)
+        np.testing.assert_array_equal(window.cells, fresh.cells)
+        np.testing.assert_array_equal(np.sort(window.near), fresh.near)
+        released += len(np.setdiff1d(before, fresh.near))
+        before = fresh.near
+    assert released > 0
 
 
 def test_blocks_do_not_come_and_go_with_the_noise():

@@ -230,3 +230,16 @@ def test_without_a_common_motion_a_map_is_begun_unless_people_were_in_view(monke
     subject = relocalizer()
     subject.lost(0.0, crowded=crowded)
     assert subject.wants_new_submap(lost_view(10.0)) != crowded
+
+
+def test_lost_images_from_before_the_camera_was_found_are_not_compared(monkeypatch):
+    """Nothing moved since this loss began: what an earlier loss showed does not count."""
+    compared = []
+    monkeypatch.setattr("dudmap.core.places.relocalizer.dominant_motion", lambda *pair: compared.append(pair))
+    subject = relocalizer()
+    subject.lost(0.0)
+    assert not subject.wants_new_submap(lost_view(0.5))
+    subject.found()
+    subject.lost(1.0)
+    assert subject.wants_new_submap(lost_view(10.0))
+    assert not compared

@@ -1,6 +1,7 @@
 """The table of checks: every check fails beyond its limit alone, and what overrules those against the frames before."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -96,3 +97,14 @@ def test_only_the_last_frame_overrules_an_unusual_residual(tracked, monkeypatch,
         slam.monitor.recovering = lost
         assert (slam.monitor.judge(view, unusual, lambda *_: None).reason == "") == accepted
     slam.monitor.recovering = False
+
+
+def test_where_most_of_the_view_moves_the_last_frame_overrules_nothing(tracked, monkeypatch):
+    """The last frame shows the same people, who may have carried the pose along."""
+    slam, _, view, estimate = tracked
+    worse = 1.1 * max(4 * np.median(slam.monitor.history.residuals), CONFIG.sensor.sigma(1.0))
+    monkeypatch.setattr(slam.monitor.images, "compare", lambda *_: ImageComparison(0.4, 0.9, 0.95))
+    for share, accepted in ((0.3, True), (0.7, False)):
+        dynamic = np.indices(view.labelled.depth.shape)[1] < share * view.labelled.camera.width
+        unusual = PoseEstimate(replace(estimate.tracking, residual=worse), SimpleNamespace(dynamic=dynamic))
+        assert (slam.monitor.judge(view, unusual, lambda *_: None).reason == "") == accepted

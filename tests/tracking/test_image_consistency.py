@@ -114,3 +114,5 @@ def test_dynamic_pixels_do_not_count(pair):
     images = consistency(first)
     labels = type("Labels", (), {"dynamic": np.ones(second.labelled.depth.shape, bool)})()
     assert np.isnan(images.compare(second, replace(at(right), labels=labels)).shift)
+    images.update(first, replace(PoseEstimate.at_origin(), labels=labels))  # nor do those of the last frame
+    assert np.isnan(images.compare(second, at(right)).shift)
