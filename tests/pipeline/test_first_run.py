@@ -7,7 +7,7 @@ from rich.console import Console
 
 from dudmap import Config
 from dudmap.app.kernel_cache import COMPILING, compiled_kernels
-from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.progress import RunProgress, summary
 from dudmap.app.pipeline.run import run
 from dudmap.app.terminal import counted
 from dudmap.core.geometry.calibration import Calibration
@@ -44,3 +44,13 @@ def test_the_time_of_a_run_counts_its_calibration(slam, tmp_path, monkeypatch):
     monkeypatch.setattr("dudmap.app.pipeline.calibration.calibrate_start", calibrate)
     done = run(sequence, Config(), tmp_path / "out", progress=False, calibrate=True)
     assert done.metrics["wall_s"] > 1.0
+
+
+def test_the_table_says_why_tracked_frames_were_not_fused():
+    metrics = dict.fromkeys(("repeated", "lost", "unreadable", "skipped_similar", "blind"), 0)
+    metrics |= {"sequence": "kitchen", "frames": 160, "tracked": 160, "fused": 156, "uncertain": 4}
+    console = Console(file=io.StringIO(), width=80)
+    console.print(summary(metrics))
+    text = console.file.getvalue()
+    assert "tracked, not fused" in text
+    assert "4 (4 uncertain pose or labels)" in text

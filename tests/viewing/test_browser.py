@@ -220,7 +220,7 @@ def test_a_live_window_grows(browser, window):
     window.add_frames([FrameFigures(110.0, T, "", (), 33.0, 0.002, 0.5)])
     assert window._shown == 12
     assert window._slider.max == 12
-    assert window._state.content.endswith("50% moves")
+    assert window._state.content.endswith("50% of the readings move")
 
 
 def test_the_window_tells_a_browser_without_webgl(driver, window):

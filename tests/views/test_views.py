@@ -233,6 +233,15 @@ def test_videos_can_be_played(made, run, tmp_path, ending):
     assert np.abs(images[0].astype(int) - images[2]).mean() > 2
 
 
+def test_a_picture_needs_no_trajectory(made, run, tmp_path):
+    path = tmp_path / "map.png"
+    done = call("render", made[0] / "run", "--size", "96x64", "--out", path)
+    assert done.exit_code == 0, done.output
+    picture = cv2.imread(str(path))
+    assert picture.shape == (64, 96, 3)
+    assert np.std(picture) > 10
+
+
 def test_orbit_looks_at_the_scene_upright(run):
     up = np.array([0.0, -1.0, 0.0])
     path = orbit(run, up, 360, 8, 30)

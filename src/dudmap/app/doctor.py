@@ -35,7 +35,7 @@ class Check:
         name: What was checked.
         state: "good"; "note" for what limits a part of the program; "bad" for what stops it.
         found: What was found.
-        mend: What to do, empty if nothing.
+        mend: What to do about it, empty if nothing.
     """
 
     name: str
@@ -117,7 +117,7 @@ def _gpu() -> Check:
         return Check("GPU", "good", "works, and is used unless --device cpu is given")
     if driver_version() is None:
         return Check("GPU", "good", "none of NVIDIA found; none is needed")
-    return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, mend this")
+    return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, correct this")
 
 
 def _kernel_cache() -> Check:

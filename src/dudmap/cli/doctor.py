@@ -35,6 +35,6 @@ def doctor(
             mark, style = MARKS[check.state]
             console.print(Text.assemble((mark, style), "  ", (check.name, "bold"), ": "), end="")
             console.print(check.found + (f" -> {check.mend}" if check.mend else ""))
-        console.print("dudmap works here" if works else "dudmap does not work here before this is mended")
+        console.print("dudmap works here" if works else "dudmap does not work here until this is corrected")
     if not works:
         raise typer.Exit(1)

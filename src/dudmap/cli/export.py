@@ -22,7 +22,12 @@ def export(
         str | None, typer.Option(help="Keep a box of the map, metres.", metavar="X0,Y0,Z0,X1,Y1,Z1")
     ] = None,
     drop_pieces_below: Annotated[
-        float | None, typer.Option(min=0, help="Leave out smaller connected pieces.", metavar="M2")
+        float | None,
+        typer.Option(
+            min=0,
+            help="Leave out smaller connected pieces; default: those less than 2 cm across; 0 keeps all.",
+            metavar="M2",
+        ),
     ] = None,
     fill_holes: Annotated[
         float | None, typer.Option(min=0, help="Close holes with a shorter border.", metavar="METRES")

@@ -16,7 +16,9 @@ app = typer.Typer(add_completion=False)
 @app.command()
 def render(
     run: o.RunArgument,
-    out: Annotated[Path, typer.Option(help="Video (.mp4, .avi), or folder for a recording in TUM layout.")],
+    out: Annotated[
+        Path, typer.Option(help="Picture (.png), video (.mp4, .avi), or folder for a recording in TUM layout.")
+    ],
     trajectory: Annotated[
         Path | None, typer.Option(help="Camera poses in TUM format, in the world of the run.")
     ] = None,
@@ -31,13 +33,17 @@ def render(
     quiet: o.QuietOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
-    """Render the map as a camera would see it: a video, or a recording without anything that moves."""
+    """Render the map as a camera would see it: a picture, a video, or a recording without anything that moves.
+
+    A picture shows the first pose of the trajectory, or without one the map from the middle of the orbit.
+    """
     from dudmap.app.views import rendering
     from dudmap.core.geometry.trajectory import Trajectory
     from dudmap.io.exporting.gravity import up_of
     from dudmap.io.exporting.options import ExportOptions
     from dudmap.io.exporting.run_content import RunContent
 
+    orbit = orbit or (trajectory is None and out.suffix.lower() == rendering.PICTURE)
     if (trajectory is None) == (not orbit):
         raise ConfigError("name either a --trajectory or --orbit")
     content = RunContent.load(run)

@@ -119,7 +119,7 @@ def _checked(a: MapSurface, b: MapSurface, hypothesis: Hypothesis, many: bool) -
     """Refine a relative pose and check what follows from it."""
     aligned = align_maps(a.volume, b.volume, a.points, b.points, hypothesis.T_a_b)
     if not aligned.converged:
-        return MapPair(None, "their surfaces do not settle on each other", hypothesis, aligned)
+        return MapPair(None, "their surfaces cannot be aligned with each other", hypothesis, aligned)
     if aligned.stiffness < MIN_STIFFNESS:
         return MapPair(None, "what they share does not determine their relative pose", hypothesis, aligned)
     correction = se3.inverse(hypothesis.T_a_b) @ aligned.T_a_b

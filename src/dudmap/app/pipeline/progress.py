@@ -31,6 +31,13 @@ FIGURES = (
 )
 """Label, key of metrics.json, format and factor of the figures of a run, printed where the run has them."""
 
+NOT_FUSED = {
+    "skipped_similar": "redundant view",
+    "uncertain": "uncertain pose or labels",
+    "blind": "without usable colour",
+}
+"""Why a tracked frame is not fused, by the key of metrics.json that counts such frames."""
+
 
 class RunProgress:
     """Progress bar on stderr with frame number, frames per second, dynamic share and tracking state.
@@ -118,10 +125,12 @@ def summary(metrics: dict[str, Any]) -> Table:
     table.add_column(style="bold")
     table.add_column(justify="right")
     table.add_row("frames", str(metrics["frames"]))
-    for key in ("tracked", "repeated", "fused", "skipped_similar", "lost", "unreadable"):
-        value = metrics[key]
-        bad = key in ("lost", "unreadable") and value
-        table.add_row(f"  {key.replace('_', ' ')}", Text(str(value), "red" if bad else ""))
+    for key in ("tracked", "repeated", "fused"):
+        table.add_row(f"  {key}", str(metrics[key]))
+    if unused := metrics["tracked"] - metrics["fused"]:
+        table.add_row("  tracked, not fused", f"{unused}{_reasons(metrics)}")
+    for key in ("lost", "unreadable"):
+        table.add_row(f"  {key}", Text(str(metrics[key]), "red" if metrics[key] else ""))
     for label, key, form, factor in FIGURES:
         if key in metrics:
             value = metrics[key]
@@ -130,3 +139,9 @@ def summary(metrics: dict[str, Any]) -> Table:
             rigid = sum(body["rigid"] for body in metrics["bodies"])
             table.add_row("object meshes", f"{rigid} of {len(metrics['bodies'])} moving objects are rigid")
     return table
+
+
+def _reasons(metrics: dict[str, Any]) -> str:
+    """Why tracked frames were not fused, in brackets; a frame may have several reasons, or none in a localisation."""
+    said = [f"{metrics[key]} {why}" for key, why in NOT_FUSED.items() if metrics[key]]
+    return f" ({', '.join(said)})" if said else ""

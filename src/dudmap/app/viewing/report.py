@@ -34,7 +34,7 @@ CARDS = {
     "frames": ("frames", 1, "{:.0f}"),
     "lost": ("lost", 1, "{:.0f}"),
     "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
-    "dynamic_share_mean": ("moves", 100, "{:.1f} %"),
+    "dynamic_share_mean": ("of the readings move", 100, "{:.1f} %"),
     "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
     "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
     "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),

@@ -149,7 +149,7 @@ class Window:
             state = f"lost: {frame.lost_reason}" if frame.T_world_camera is None else "tracked"
             self._state.content = (
                 f"**{frame.timestamp - self._frames[0].timestamp:.2f} s**, {state}, {frame.ms:.0f} ms, "
-                f"{frame.dynamic_share:.0%} moves"
+                f"{frame.dynamic_share:.0%} of the readings move"
             )
             self._draw_camera(frame)
             self._draw_movers(frame)

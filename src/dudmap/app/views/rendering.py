@@ -3,16 +3,20 @@
 from collections.abc import Callable
 from pathlib import Path
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.app.views.tum_folder import TumFolder, depth_units
 from dudmap.app.views.video import CODECS, VideoWriter
+from dudmap.atomic_file import write_bytes
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.io.exporting.run_content import RunContent
 
+PICTURE = ".png"
+"""Ending of a single picture."""
 EMPTY = 32
 """Grey value of pixels that show no surface."""
 
@@ -72,13 +76,14 @@ def render_run(
 ) -> int:
     """Write the map as a camera on a trajectory sees it; returns the number of frames.
 
-    A file name with a known ending gives a video. Anything else is a folder, which receives a recording in TUM layout:
+    A file name ending with .png gives one picture, of the first pose, and one with another known ending a video. A name
+    without an ending is a folder, which receives a recording in TUM layout:
     rgb/, depth/ and their lists, intrinsics.txt and groundtruth.txt.
 
     Args:
         run: The run.
         trajectory: Poses in the world of the run.
-        out: Video or folder.
+        out: Picture, video or folder.
         size: Width and height, pixels; None for those of the recording.
         fps: Of a video.
         progress: Called with the number of finished frames and of all.
@@ -90,6 +95,10 @@ def render_run(
         OSError: A file cannot be written.
     """
     camera = run.volume.camera if size is None else run.volume.camera.resized(*size)
+    if out.suffix.lower() == PICTURE and not out.is_dir():
+        color, _ = _view(run, trajectory.Ts_world_camera[0], camera)
+        write_bytes(out, cv2.imencode(PICTURE, color[..., ::-1])[1].tobytes())
+        return 1
     if out.suffix and not out.is_dir():
         with VideoWriter(out, (camera.width, camera.height), fps) as video:
             for number, T in enumerate(trajectory.Ts_world_camera, start=1):
@@ -99,7 +108,8 @@ def render_run(
         return len(trajectory)
     if out.exists() and (not out.is_dir() or any(out.iterdir())):
         raise DatasetError(
-            f"{out} exists and is not an empty folder; name another one, or a video ({', '.join(CODECS)})"
+            f"{out} exists and is not an empty folder; name another one, a video ({', '.join(CODECS)}) "
+            f"or a picture ({PICTURE})"
         )
     folder = TumFolder(out, f"views of {run.folder.name}", ("rgb", "depth"))
     for number, (stamp, T) in enumerate(zip(trajectory.timestamps, trajectory.Ts_world_camera, strict=True), start=1):

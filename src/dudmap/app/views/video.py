@@ -31,7 +31,8 @@ class VideoWriter:
 
         codec = CODECS.get(path.suffix.lower())
         if codec is None:
-            raise ConfigError(f"cannot write a video as {path.name!r}; the ending must be one of {', '.join(CODECS)}")
+            known = ", ".join(CODECS)
+            raise ConfigError(f"cannot write {path.name!r}; the ending must be one of {known}, or .png for a picture")
         if str(path) != printable(path):  # OpenCV ends the process at a name that is no UTF-8
             raise ConfigError(f"cannot write a video as {path}; expected a name of printable characters")
         self._place = ExitStack()

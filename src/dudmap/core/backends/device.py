@@ -50,7 +50,7 @@ def make_backend(device: str) -> Backend:
     if name == "cpu":
         return CpuBackend()
     if failure := start_failure(name):
-        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or mend this")
+        raise ConfigError(f"device {device} cannot be used: {failure}; take --device cpu, or correct this")
     from dudmap.core.backends.warp.backend import WarpBackend
 
     return WarpBackend(name)
@@ -91,7 +91,7 @@ def _resolved(device: str) -> str:
         raise ConfigError(f"the device is {device!r}; expected auto, cpu, cuda or cuda:N, N counted from 0")
     _need_warp(device)
     if found:
-        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or mend this")
+        raise ConfigError(f"device {device} cannot be used: {found}; take --device cpu, or correct this")
     number = int(device.partition(":")[2] or supported_gpus()[0])
     if number not in supported_gpus():
         known = ", ".join(f"cuda:{n}" for n in supported_gpus())

@@ -15,6 +15,10 @@ from dudmap.extras import extra
 from dudmap.io.exporting.options import Box, ExportOptions
 from dudmap.io.exporting.run_content import RunContent
 
+SPECK = 0.02
+"""Diagonal of a connected piece of the mesh below which it is left out unless an option says otherwise, metres: loose
+pieces of a few voxels are noise of the depth readings."""
+
 
 def write(run: RunContent, path: Path, options: ExportOptions) -> None:
     """Write the mesh in the axes of the map, in the format of the file's ending: PLY, OBJ or STL."""
@@ -25,7 +29,9 @@ def edited(mesh: Mesh, options: ExportOptions) -> Mesh:
     """Mesh after all options that change it: crop, pieces, holes, triangles, in this order."""
     if options.crop is not None:
         mesh = cropped(mesh, options.crop)
-    if options.drop_pieces_below is not None:
+    if options.drop_pieces_below is None:
+        mesh = without_specks(mesh)
+    else:
         mesh = without_small_pieces(mesh, options.drop_pieces_below)
     if options.fill_holes is not None:
         mesh = with_filled_holes(mesh, options.fill_holes)
@@ -47,15 +53,30 @@ def cropped(mesh: Mesh, box: Box) -> Mesh:
 
 def without_small_pieces(mesh: Mesh, area: float) -> Mesh:
     """Mesh without the connected pieces whose surface is smaller than ``area``, square metres."""
+    piece = _pieces(mesh)[mesh.faces[:, 0]]
+    return with_faces(mesh, np.bincount(piece, face_areas(mesh))[piece] >= area)
+
+
+def without_specks(mesh: Mesh) -> Mesh:
+    """Mesh without the connected pieces whose bounding box has a diagonal of less than ``SPECK``."""
+    piece = _pieces(mesh)
+    low = np.full((len(mesh.vertices), 3), np.inf, np.float32)
+    high = -low
+    np.minimum.at(low, piece, mesh.vertices)
+    np.maximum.at(high, piece, mesh.vertices)
+    large = np.linalg.norm(high - low, axis=1) >= SPECK
+    return mesh if large[piece].all() else with_faces(mesh, large[piece[mesh.faces[:, 0]]])
+
+
+def _pieces(mesh: Mesh) -> NDArray[np.int32]:
+    """Number (V,) of the connected piece that each vertex belongs to."""
     from scipy.sparse import coo_array
     from scipy.sparse.csgraph import connected_components
 
     a, b, c = mesh.faces.T
     pairs = np.concatenate([a, b]), np.concatenate([b, c])
     n = len(mesh.vertices)
-    _, piece = connected_components(coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(n, n)), directed=False)
-    areas = np.bincount(piece[a], face_areas(mesh), minlength=n)
-    return with_faces(mesh, areas[piece[a]] >= area)
+    return connected_components(coo_array((np.ones(len(pairs[0]), bool), pairs), shape=(n, n)), directed=False)[1]
 
 
 def with_faces(mesh: Mesh, kept: NDArray[np.bool_]) -> Mesh:

@@ -17,7 +17,8 @@ class ExportOptions:
     Attributes:
         max_triangles: Largest number of triangles.
         crop: Lower and upper corner of the part of the map to keep, metres, world frame.
-        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres.
+        drop_pieces_below: Connected pieces of the mesh with a smaller surface are left out, square metres; None leaves
+            out those less than 2 cm across.
         fill_holes: Holes whose border is at most so long are closed, metres.
         up: Direction against gravity in the world frame; None for the normal of the floor in the map.
         resolution: Edge of the cells of grids, metres.
