@@ -82,7 +82,8 @@ def test_a_missing_library_is_one_sentence_that_names_its_extra(slam, where, mon
     last = done.stderr.strip().splitlines()[-1]
     top = module.partition(".")[0]
     assert re.fullmatch(
-        rf'dudmap: .+ needs the extra {name} \({top} is not installed\); pip install "dudmap\[{name}\]"', last
+        rf'dudmap: .+ needs the extra {name} \({top} is not installed\); pip install "\.\[{name}\]" in the folder .+',
+        last,
     )
     assert not list(where.glob("a.*"))
 

@@ -1,4 +1,4 @@
-"""Optional libraries, which come with the extras of the package: pip install "dudmap[EXTRA]"."""
+"""Optional libraries, which come with the extras of the package."""
 
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -38,5 +38,10 @@ def need(name: str, purpose: str, modules: tuple[str, ...]) -> None:
         raise MissingExtraError(_sentence(name, purpose, ", ".join(missing)))
 
 
+def install(name: str) -> str:
+    """The command that installs an extra: the package is installed from its sources, since no index has it."""
+    return f'pip install ".[{name}]" in the folder of the sources of dudmap'
+
+
 def _sentence(name: str, purpose: str, missing: str) -> str:
-    return f'{purpose} needs the extra {name} ({missing} is not installed); pip install "dudmap[{name}]"'
+    return f"{purpose} needs the extra {name} ({missing} is not installed); {install(name)}"

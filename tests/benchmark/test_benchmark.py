@@ -130,7 +130,7 @@ def test_what_another_system_computed_stands_in_the_same_table(data, tmp_path, m
     assert outcome.exit_code == 0, outcome.output
     text = (tmp_path / "out" / "thesis.md").read_text()
     assert text.strip() in outcome.stdout
-    assert "| **dudmap** | measured here | 1.23 |" in text
+    assert "| **dudmap** | measured here | 12.3 |" in text
     assert "| ReFusion | [" in text
     assert "rgbd_bonn_balloon_tracking2: https://" in text
     rows = {row["system"]: row for row in json.loads((tmp_path / "out" / "thesis.json").read_text())["rows"]}
@@ -145,7 +145,7 @@ def test_what_another_system_computed_stands_in_the_same_table(data, tmp_path, m
 def test_a_recording_that_fails_is_a_line_not_the_end():
     good = {"sequence": "a", "system": "x", "ate_rmse_m": 0.01, "lost": 0}
     text = markdown([good, {"sequence": "b", "system": "x", "error": "its depth is missing"}])
-    assert "| a | x | 0 | 1.00 |" in text
+    assert "| a | x | 0 | 10.0 |" in text
     assert "- b, x: its depth is missing" in text
     assert "mask IoU" not in text
 
@@ -205,8 +205,8 @@ def test_the_limit_is_the_largest_coverage_below_the_first_failure(rows):
 def test_the_table_of_cells_marks_what_is_coped_with(rows):
     rows[1] |= {"lost": 3, "lost_share": 0.25}
     lines = cells_table(rows, [SWEEP], ["dudmap", "none"]).splitlines()
-    assert "| 0.1 | 10 % | **0.5** |  |" in lines
-    assert "| 0.1 | 30 % | 3.0 (25 % lost) |  |" in lines
+    assert "| 0.1 | 10 % | **5.0** |  |" in lines
+    assert "| 0.1 | 30 % | 30.0 (25 % lost) |  |" in lines
     assert len(lines) == 3 + len(SWEEP.xs) * len(SWEEP.coverages)
 
 

@@ -28,7 +28,7 @@ def test_table_has_a_line_per_recording():
     other = [row | {"drift_rmse_m": 0.004, "lost": 3} for row in rows("b", None, None, None)]
     text = color_table([*rows("a", 0.02, 0.01, 0.0108), *other], {"b": Column("drift_rmse_m", "drift, mm", 1000, 1)})
     lines = text.splitlines()
-    assert lines[2] == "| a | ATE RMSE, mm | 20.00 | 10.00 | 10.80 | 10.00 | 1.08 | NO |"
+    assert lines[2] == "| a | ATE RMSE, mm | 20.0 | 10.0 | 10.8 | 10.0 | 1.08 | NO |"
     assert lines[3] == "| b | drift, mm | 4.0 (3 lost) | 4.0 (3 lost) | 4.0 (3 lost) | 4.0 | 1.00 | yes |"
 
 
@@ -36,7 +36,7 @@ def test_failed_column_is_named_and_passes_nothing():
     found = rows("a", 0.02, 0.01, 0.01)
     found[1] = {"sequence": "a", "system": "without colour", "error": "no frame was tracked"}
     text = color_table(found)
-    assert "| failed | 10.00 | 20.00 |  |  |" in text
+    assert "| failed | 10.0 | 20.0 |  |  |" in text
     assert "- a, without colour: no frame was tracked" in text
 
 

@@ -62,9 +62,9 @@ def test_silent_failures_are_wrong_but_not_lost():
     rows = [row(0, 0.002), row(1, 0.3, lost=30), row(2, 0.06, lost=19), row(3, 0.049)]
     rows.append({"seed": 3, "world": 4, "parameters": draw_world(3, 4), "error": "no frame could be tracked"})
     text = report(rows, 3)
-    assert "| 5.45 | 26.40 | 30.00 | 49 of 400 in 2 worlds | 1 | 1 |" in text
+    assert "| 54.5 | 264.0 | 300.0 | 49 of 400 in 2 worlds | 1 | 1 |" in text
     silent, worst = text.split("Worst worlds:")
-    assert "world 2: 6.00 cm, 19 of 100 frames lost" in silent
+    assert "world 2: 60.0 mm, 19 of 100 frames lost" in silent
     assert "world 1" not in silent
     assert worst.index("world 1") < worst.index("world 2") < worst.index("world 3") < worst.index("world 0")
     assert "`dudmap benchmark random --seed 3 --only 2`" in silent

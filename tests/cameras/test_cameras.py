@@ -23,7 +23,7 @@ def test_a_missing_driver_is_named_with_the_command_that_installs_it(name, monke
     module = DRIVERS[name]
     monkeypatch.delitem(sys.modules, module, raising=False)
     monkeypatch.setattr(sys, "meta_path", [Absent(module), *sys.meta_path])
-    with pytest.raises(MissingExtraError, match=rf'\({module} is not installed\); pip install "dudmap\[{name}\]"$'):
+    with pytest.raises(MissingExtraError, match=rf'\({module} is not installed\); pip install "\.\[{name}\]" in'):
         open_camera(name)
 
 

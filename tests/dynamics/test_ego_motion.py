@@ -119,7 +119,7 @@ def test_the_motion_of_most_surface_is_found_or_the_expected_one_of_two(share, e
 
 def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
     """People at 1 m with most of the corners and a ninth of the surface walk past a wall at 4 m."""
-    v, u = np.indices(CAMERA.shape)
+    u = np.indices(CAMERA.shape)[1]
     level = Level(CAMERA, np.where(u < 200, 1, 4).astype(np.float32), np.zeros(CAMERA.shape, np.float32))
     rng = np.random.default_rng(8)
     people, wall = rng.integers([5, 5], [190, 230], (200, 2)), rng.integers([210, 5], [310, 230], (100, 2))

@@ -1,6 +1,7 @@
 """dudmap evaluate: the three forms, their JSON, their files, and one sentence for every mistake."""
 
 import json
+import re
 
 import cv2
 import numpy as np
@@ -128,7 +129,7 @@ def test_pictures(folders):
     np.savez(run / "residuals.npz", edges=edges, counts=np.arange(128)[::-1], prior=[0.8, 0.2], sigma=[1.0, 6.0])
     outcome = evaluate(run, "--reference", recording, "--plots")
     assert outcome.exit_code == 0, outcome.output
-    assert "ate_rmse_m" in outcome.stdout
+    assert re.search(r"ate_rmse +│ [\d.]+ mm", outcome.stdout)
     assert evaluate("mesh", run, recording, "--plots", "--samples", 2000).exit_code == 0
     assert evaluate("masks", run, recording, "--plots").exit_code == 0
     for name in ("trajectory", "error", "rpe", "residuals", "mesh_error", "masks"):
@@ -179,3 +180,11 @@ def test_the_truth_of_a_recording_is_read_as_its_format_stores_it(tmp_path):
         estimate = tmp_path / f"{layout.__name__}.txt"
         estimate.write_text("".join(tum_line(f"{t:.6f}", pose(k)) for k, t in enumerate(stamps)))
         assert figures(estimate, "--reference", folder)["ate_rmse_m"] == pytest.approx(0, abs=1e-5)
+
+
+def test_errors_are_printed_in_millimetres():
+    from dudmap.cli.evaluate import _shown
+
+    assert _shown("ate_rmse_m", 0.00745755) == ("ate_rmse", "7.5 mm")
+    assert _shown("rpe_trans_rmse_m_per_s", 0.0123) == ("rpe_trans_rmse per s", "12.3 mm")
+    assert _shown("path_length_m", 3.25) == ("path_length_m", "3.25")

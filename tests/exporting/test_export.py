@@ -92,7 +92,7 @@ def test_bad_input_is_refused(run_folder, tmp_path, monkeypatch):
         export_run(run_folder, tmp_path / "run.mcap")
     (run_folder / "movers.jsonl").unlink()
     monkeypatch.setitem(sys.modules, "rosbags.rosbag2", None)
-    with pytest.raises(ConfigError, match=r'needs the extra ros-bags .*; pip install "dudmap\[ros-bags\]"'):
+    with pytest.raises(ConfigError, match=r'needs the extra ros-bags .*; pip install "\.\[ros-bags\]"'):
         export_run(run_folder, tmp_path / "run.mcap")
 
 

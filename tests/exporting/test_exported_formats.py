@@ -362,7 +362,7 @@ def test_bad_input_is_one_sentence(made, run, mesh, tmp_path, monkeypatch):
         exported(run, tmp_path / "transforms.json")
     for name, module in ((".laz", "laspy"), (".e57", "pye57"), (".usdz", "pxr.Sdf")):
         monkeypatch.setitem(sys.modules, module, None)
-        with pytest.raises(ConfigError, match=r'pip install "dudmap\[export\]"'):
+        with pytest.raises(ConfigError, match=r'pip install "\.\[export\]"'):
             exported(run, tmp_path / f"map{name}")
     monkeypatch.setitem(sys.modules, "fast_simplification", None)
     with pytest.raises(ConfigError, match=r'^--max-triangles needs the extra export .*"dudmap\[export\]"'):

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,9 +23,10 @@ from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
 from dudmap.evaluation.surface import Surface
 from dudmap.fleet import fusion
-from dudmap.fleet.fusion import PlacedRun, RangeJob, fuse_range, planned_ranges
+from dudmap.fleet.fused_range import FusedRange, joined
+from dudmap.fleet.fusion import PlacedRun, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
-from dudmap.fleet.map_fusion import FusedRange, fuse_maps, joined
+from dudmap.fleet.map_fusion import fuse_maps
 from dudmap.fleet.merge import load_part, merge_fleet, read_world
 from dudmap.fleet.tiles import T_GLTF_MAP, write_tile, write_tileset, write_tree
 from dudmap.fleet.workers import Workers
@@ -67,8 +69,7 @@ def fuse(runs, out, limit, workers=1, bits=9):
     with pytest.MonkeyPatch.context() as patch, Workers(workers) as crew:
         patch.setattr(fusion, "CELL_BITS", bits)
         ranges = planned_ranges(runs, crew, limit)
-        jobs = [RangeJob(one, [runs[n] for n in one.runs], like, out, out / ".work") for one in ranges]
-        return list(crew.map(fuse_range, jobs))
+        return list(crew.map(partial(fuse_range, like, out, out / ".work"), ranges))
 
 
 def content(blocks):
@@ -86,9 +87,9 @@ def test_any_order_and_any_ranges_give_the_voxels_of_a_fusion_at_once(walls, tmp
     runs, volumes = walls
     expected = content(FusedRange.of(fuse_maps(volumes, POSES)))
     results = fuse([runs[n] for n in order], tmp_path, limit)
-    parts = [FusedRange.of(TsdfVolume.load(tmp_path / one.entry["file"])) for one in results]
-    for part, one in zip(parts, results, strict=True):
-        assert ((part.codes >= one.entry["codes"][0]) & (part.codes < one.entry["codes"][1])).all()
+    parts = [FusedRange.of(TsdfVolume.load(tmp_path / entry["file"])) for entry, _ in results]
+    for part, (entry, _) in zip(parts, results, strict=True):
+        assert ((part.codes >= entry["codes"][0]) & (part.codes < entry["codes"][1])).all()
     for a, b in zip(content(joined(parts)), expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -129,7 +130,7 @@ def tiles_of(tile):
 
 def test_tiles_keep_the_rules_of_3d_tiles_and_the_surface(walls, tmp_path):
     runs, volumes = walls
-    leaves = [tile for one in fuse(runs, tmp_path, 100) for tile in one.tiles]
+    leaves = [tile for _, tiles in fuse(runs, tmp_path, 100) for tile in tiles]
     with Workers(1) as crew:
         root = write_tree(leaves, 0.02, tmp_path, tmp_path / ".work", crew)
     write_tileset(root, 0.02, tmp_path)

@@ -137,7 +137,7 @@ def test_maps_with_several_voxel_sizes_are_the_cpus(machine):
         ({"driver": None}, "no NVIDIA driver was found"),
         ({"driver": (12, 8)}, "supports CUDA 12.8, but Warp needs 13.0, that is driver 580 or later"),
         ({"gpus": 0}, "finds no GPU"),
-        ({"warp": False}, r'pip install "dudmap\[gpu\]"'),
+        ({"warp": False}, r'pip install "\.\[gpu\]"'),
         ({"failure": "the driver does not start"}, "cannot be used: the driver does not start; take --device cpu"),
         ({"supported": ()}, "compute capability 7.5 or later"),
     ],

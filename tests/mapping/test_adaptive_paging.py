@@ -10,8 +10,8 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.mesh import joined
 from dudmap.core.map.adaptive_volume import AdaptiveVolume
 from dudmap.core.map.incremental_mesh import IncrementalMesh
-from dudmap.core.map.region_store import RegionStore
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.core.scratch_store import ScratchStore
 from dudmap.errors import MapError
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
@@ -148,7 +148,7 @@ def test_blocks_stay_in_memory_while_the_disk_is_full(monkeypatch):
     def full(self, region, records):
         raise MapError("the disk is full")
 
-    monkeypatch.setattr(RegionStore, "write", full)
+    monkeypatch.setattr(ScratchStore, "write", full)
     whole, paged = volume(), volume(MAX_BLOCKS)
     walk([whole, paged], range(50))
     assert paged.pager is not None

@@ -11,10 +11,11 @@ from dudmap.app.state.database import StateDatabase, StateReader
 from dudmap.app.state.system import restore, take_snapshot
 from dudmap.core.geometry import se3
 from dudmap.core.map.block_pager import MAX_PENDING, REGION, BlockPager
+from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.incremental_mesh import IncrementalMesh
-from dudmap.core.map.region_store import RegionStore
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import VoxelBlocks
+from dudmap.core.scratch_store import ScratchStore
 from dudmap.errors import MapError
 from triangles import triangles
 from wavy_wall import CAMERA, CONSTANT, wall
@@ -117,7 +118,7 @@ def test_blocks_stay_in_memory_while_the_disk_is_full(monkeypatch):
 
     whole, paged = (TsdfVolume(CAMERA, CONFIG, depth_max=DEPTH, max_blocks=limit) for limit in (None, MAX_BLOCKS))
     with monkeypatch.context() as patch:
-        patch.setattr(RegionStore, "write", full)
+        patch.setattr(ScratchStore, "write", full)
         for number in range(12):
             whole.integrate(*frame(number))
             paged.integrate(*frame(number))
@@ -132,10 +133,10 @@ def test_an_unreadable_store_is_reported(maps, monkeypatch):
         def execute(self, *arguments):
             raise sqlite3.OperationalError("disk I/O error")
 
-    store = RegionStore()
+    store = ScratchStore("blocks of the map")
     monkeypatch.setattr(store, "_connection", Broken())
     with pytest.raises(MapError, match=r"cannot be read from .*disk I/O error"):
-        store.read((0, 0, 0))
+        store.read("(0, 0, 0)")
 
 
 def test_a_paged_map_is_stored_and_goes_on(tmp_path):
@@ -186,7 +187,7 @@ def scattered(*starts):
     blocks = VoxelBlocks()
     coords = np.array([(start + REGION * n, 0, 0) for start in starts for n in range(20)], np.int32)
     blocks.allocate(blocks.entries_at(coords, len(coords)), 1)
-    return blocks
+    return BlockTree(blocks, ())
 
 
 def seen(pager, blocks, start):
@@ -194,8 +195,8 @@ def seen(pager, blocks, start):
 
 
 def test_no_frame_waits_for_the_disk(monkeypatch):
-    written, resume = RegionStore.write, threading.Event()
-    monkeypatch.setattr(RegionStore, "write", lambda *arguments: (resume.wait(20), written(*arguments)))
+    written, resume = ScratchStore.write, threading.Event()
+    monkeypatch.setattr(ScratchStore, "write", lambda *arguments: (resume.wait(20), written(*arguments)))
     blocks, pager = scattered(0, 2000, 4000, 6000), BlockPager(79)
     start = time.perf_counter()
     seen(pager, blocks, 0)

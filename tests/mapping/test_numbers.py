@@ -9,14 +9,13 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from dudmap.config import Config, SensorConfig, VolumeConfig
-from dudmap.core.backends.parameters import FusionParameters
 from dudmap.core.backends.threads import kernel
 from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, pack_pixel_color, pack_reading
 from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import LOCAL_GRID
-from dudmap.core.map.integrator import DEPTH_MIN, StorageScale
+from dudmap.core.map.integrator import fusion_parameters
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.estimate import PoseEstimate
@@ -42,15 +41,9 @@ def fuse_once(word, depth, free, red, green, blue, gain, z, repeats, by_unit, ol
 
 def parameters(volume, sensor):
     """FusionParameters of a map."""
-    scale = StorageScale.of(volume, sensor, DEPTH_MAX)
-    numbers = FusionParameters(
-        band=scale.band, voxel_size=scale.voxel_size, sdf_unit=scale.sdf_unit, depth_unit=scale.depth_unit,
-        max_weight=volume.max_weight, max_readings=volume.max_readings, carve_rate=volume.carve_rate,
-        depth_min=DEPTH_MIN, depth_max=DEPTH_MAX,
-    )  # fmt: skip
     from dudmap.core.backends.cpu.backend import single
 
-    return single(numbers)
+    return single(fusion_parameters(volume, sensor, DEPTH_MAX))
 
 
 def unpacked(word):
@@ -107,7 +100,7 @@ def test_merged_sums_of_many_maps_saturate(maps, steps, weight, shade):
         maps * weight * shade * one, maps * weight * one, maps * weight * 1020 * np.ones((1, 512, 3), np.int64),
         np.zeros(1, np.int64),
     )  # fmt: skip
-    out = fused(sums, MAX_STEPS, 64, 4)
+    out = fused(sums, MAX_STEPS, 64, 2**40)  # never free space
     found = unpacked(out.geometry[0, 0])
     assert found == (np.clip(steps, -MAX_STEPS, MAX_STEPS), min(maps * weight, MAX_COUNT), shade)
     assert (out.colors[0, 0] >> 20) & 0x3FF == 1020

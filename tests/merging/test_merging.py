@@ -237,24 +237,22 @@ def run_folder(folder, found, times):
 def test_run_folders_are_merged_into_one_that_can_be_merged_again(room, tmp_path):
     other, third = true_map(record("room", 3, "handheld")), true_map(record("room", 5))
     a, b = run_folder(tmp_path / "a", room, [0.0, 1.0]), run_folder(tmp_path / "b", other, [0.0, 1.0, 2.0])
-    report = merge_runs(a, b, tmp_path / "ab")
-    assert sorted(path.name for path in report.out.iterdir()) == [
+    out = tmp_path / "ab"
+    tree = merge_runs(a, b, out)
+    assert sorted(path.name for path in out.iterdir()) == [
         "config.toml", "keyframes.npz", "map.npz", "merge.json", "mesh.ply", "metrics.json", "trajectory-2.txt",
         "trajectory.txt",
     ]  # fmt: skip
-    tree = json.loads((report.out / "merge.json").read_text())
-    assert tree == report.tree
-    np.testing.assert_allclose(
-        Trajectory.load(report.out / "trajectory-2.txt").Ts_world_camera[1], report.pair.T_a_b, atol=1e-6
-    )
-    shown = RunFiles.load(report.out)
+    assert json.loads((out / "merge.json").read_text()) == tree
+    np.testing.assert_allclose(Trajectory.load(out / "trajectory-2.txt").Ts_world_camera[1], tree["T_a_b"], atol=1e-6)
+    shown = RunFiles.load(out)
     assert [frame.timestamp for frame in frames_of(shown)] == [0.0, 1.0]
     assert len(shown.mesh.faces) == tree["mesh_triangles"]
-    assert "5 of 5 frames were tracked" in write_report(report.out, tmp_path / "report.html").read_text()
-    merged = SavedMap.load(report.out)
+    assert "5 of 5 frames were tracked" in write_report(out, tmp_path / "report.html").read_text()
+    merged = SavedMap.load(out)
     assert len(merged.keyframes) == len(room.saved.keyframes) + len(other.saved.keyframes)
-    again = merge_runs(report.out, run_folder(tmp_path / "c", third, [5.0]), tmp_path / "abc")
-    assert again.tree["trajectories"] == ["trajectory.txt", "trajectory-2.txt", "trajectory-3.txt"]
+    again = merge_runs(out, run_folder(tmp_path / "c", third, [5.0]), tmp_path / "abc")
+    assert again["trajectories"] == ["trajectory.txt", "trajectory-2.txt", "trajectory-3.txt"]
     with pytest.raises(DudmapError, match="is one of the runs to be merged"):
         merge_runs(a, b, a)
 

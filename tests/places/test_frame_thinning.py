@@ -1,7 +1,5 @@
 """Stored frames that the map has forgotten are removed: their number is bounded, and what is rebuilt stays the same."""
 
-from itertools import pairwise
-
 import numpy as np
 import pytest
 
@@ -13,7 +11,6 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places import frame_thinning
 from dudmap.core.places.atlas import Atlas
-from dudmap.core.places.frame_file import FrameFile
 from dudmap.core.places.frame_store import DEPTH_UNIT, FrameStore
 from dudmap.core.places.frame_thinning import FrameThinning, chained
 from dudmap.core.places.loop_correction import LoopCorrector
@@ -85,26 +82,6 @@ class Walker:
 def to_and_fro(count, steps=10, step=0.05):
     """Places along a wall, to and fro."""
     return [at(step * (steps - abs(n % (2 * steps) - steps))) for n in range(count)]
-
-
-def test_room_of_removed_frames_is_used_again():
-    """Against a dictionary, with frames of random sizes; the file ends up with little more than what is stored."""
-    rng, file, known = np.random.default_rng(0), FrameFile(), {}
-    for n in range(3000):
-        parts = tuple(rng.bytes(size) for size in rng.integers(0, 120, 3))
-        known[n] = file.write(parts), parts
-        if len(known) > 50:
-            place, _ = known.pop(int(rng.choice(list(known))))
-            file.release(place)
-        if n % 100 == 0:
-            assert all(file.read(place) == content for place, content in known.values())
-    used = sum(len(part) for _, parts in known.values() for part in parts)
-    assert file.num_bytes < 2 * used
-    spans = sorted((place.start, place.end) for place, _ in known.values() if place.end > place.start)
-    assert all(a[1] <= b[0] for a, b in pairwise(spans))
-    for place, _ in known.values():
-        file.release(place)
-    assert file.num_bytes == 0
 
 
 def test_a_camera_that_stays_keeps_what_the_map_remembers():

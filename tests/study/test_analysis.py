@@ -111,7 +111,7 @@ def test_a_quadratic_response_is_found_believed_and_confirmed():
     truth = bowl(*found.best.coded)
     held = confirm(found.surface, found.best, [truth], [bowl(0, 0, 0)])
     assert held.held
-    assert "The model held" in str(held)
+    assert "The prediction was confirmed" in str(held)
 
 
 def test_a_response_that_is_not_quadratic_lacks_fit():

@@ -49,11 +49,12 @@ def test_every_recording_has_an_optimum_and_a_confirmation_of_its_own(tmp_path):
 def test_progress_says_time_left_core_hours_and_cost():
     state = Progress(total=100, done=20, begun=10, spent=7200.0, started=0.0, cores=2)
     assert state.core_hours == pytest.approx(4)
-    assert "4 of about 20 core-hours" in str(state)
+    assert "4.0 h of about 20.0 h of core time" in str(state)
     assert "cost" not in str(state)
     assert "cost 0.20 of about 1.00" in state.describe(0.05)
     assert "left" in str(state)
-    assert "run 0 of 9, 0 of about 0 core-hours" in str(Progress(9, 0, 0))
+    assert "3 s of about 26 s of core time" in str(Progress(total=9, done=1, begun=0, spent=2.836))
+    assert "run 0 of 9, 0 s of about 0 s of core time" in str(Progress(9, 0, 0))
 
 
 def test_a_plackett_burman_design_needs_two_levels():

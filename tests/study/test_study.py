@@ -50,7 +50,7 @@ def test_the_optimum_is_confirmed_on_a_new_seed(study):
     out, text = study
     confirmed = rows(out / "confirmation.csv")
     assert {row["at"] for row in confirmed} == {"optimum", "best point of the design"}
-    assert "The model held" in text or "The model did not hold" in text
+    assert "The prediction was confirmed" in text or "The prediction was not confirmed" in text
     assert len(list((out / "runs").iterdir())) in (7, 8)  # the optimum may be the best point
 
 

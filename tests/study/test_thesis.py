@@ -116,7 +116,7 @@ def test_it_says_why_the_optimum_must_not_be_believed(predicted):
 def test_the_thesis_own_confirmation_failed(tmp_path):
     text = published_report(tmp_path)
     assert "measured 0.089" in text
-    assert "The model did not hold." in text
+    assert "The prediction was not confirmed." in text
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert page.count("data:image/png;base64,") == 4
     assert "<img" in page

@@ -155,14 +155,14 @@ def test_images_are_reduced_to_a_width():
 
 @pytest.mark.parametrize(
     ("package", "arguments", "extra"),
-    [("viser", ["--view"], "dudmap[view]"), ("rerun", ["--rerun", "log.rrd"], "dudmap[rerun]")],
+    [("viser", ["--view"], ".[view]"), ("rerun", ["--rerun", "log.rrd"], ".[rerun]")],
 )
 def test_a_missing_extra_is_named(slam, tmp_path, monkeypatch, package, arguments, extra):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setitem(sys.modules, package, None)
     done = CliRunner().invoke(app, ["run", str(write_recording(tmp_path / "desk", 3)), *arguments])
     assert done.exit_code == 1
-    assert f'pip install "{extra}"' in done.stderr
+    assert f'pip install "{extra}" in the folder' in done.stderr
     assert not (tmp_path / "runs").exists()
 
 

@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import Literal
 
 from dudmap import __version__
+from dudmap.app.kernel_cache import compiled_kernels, kernel_cache
+from dudmap.extras import install
 
 PYTHON = ((3, 11), (3, 14))
 """First version of Python that is supported, and the first that is not."""
@@ -118,19 +120,13 @@ def _gpu() -> Check:
     return Check("GPU", "note", f"cannot be used: {found}", "none is needed; to use it, mend this")
 
 
-def kernel_cache() -> Path:
-    """Folder in which Numba keeps the compiled kernels, as far as it can be known without compiling."""
-    given = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(given) if given else Path(__file__).parents[1] / "core" / "backends" / "cpu" / "__pycache__"
-
-
 def _kernel_cache() -> Check:
     folder = kernel_cache()
     problem = not_writable(folder)
     if problem:
         mend = "set NUMBA_CACHE_DIR to a folder that you can write, or every start compiles for a minute"
         return Check("kernel cache", "note", f"{folder}: {problem}", mend)
-    count = len(list(folder.rglob("*.nbi"))) if folder.is_dir() else 0
+    count = compiled_kernels()
     if not count:
         return Check("kernel cache", "note", f"{folder} is empty", "dudmap warmup compiles all kernels in advance")
     return Check("kernel cache", "good", f"{folder}, {count} kernels")
@@ -157,7 +153,7 @@ def _extras() -> Iterator[Check]:
             if (found := installed(name)) is None or numbers(found) < numbers(lowest)
         ]  # fmt: skip
         if missing:
-            mend = f"only if you need it: pip install 'dudmap[{extra}]'"
+            mend = f"only if you need it: {install(extra)}"
             yield Check(f"extra {extra}", "note", f"without {', '.join(missing)}", mend)
         else:
             yield Check(f"extra {extra}", "good", ", ".join(f"{name} {installed(name)}" for name, _ in packages))

@@ -1,5 +1,7 @@
 """What is printed: names of files are shown as they are, whatever a terminal or markup would make of them."""
 
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -31,3 +33,18 @@ def plain_console(**options: Any) -> "Console":  # noqa: ANN401 - those of Conso
             return super().render_str(lines(text), **options)
 
     return PlainConsole(markup=False, emoji=False, highlight=False, **options)
+
+
+@contextmanager
+def counted(name: str, *, quiet: bool, console: "Console | None" = None) -> Iterator[Callable[[int, int], None]]:
+    """Bar on stderr, if that is a terminal; gives a function that takes the number of finished frames and of all.
+
+    A turning mark and the seconds show that the program works, also while it compiles and no frame is finished.
+    """
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+
+    console = console or plain_console(stderr=True)
+    columns = SpinnerColumn(), TextColumn(name), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
+    with Progress(*columns, console=console, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task(name, total=None)
+        yield lambda done, total: bar.update(task, completed=done, total=total)

@@ -8,10 +8,10 @@ from typing import Annotated, Any
 
 import typer
 
-from dudmap.app.terminal import say
+from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
 from dudmap.cli.benchmark_gpu import gpu
-from dudmap.cli.output import answer, counted
+from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
 
 RUNS = Path("runs/benchmark")
@@ -130,7 +130,7 @@ def random(
 
 def _print_world(row: dict[str, Any]) -> None:
     ate = row.get("ate_rmse_m")
-    figure = row.get("error") or "no ATE" if ate is None else f"{100 * ate:.2f} cm, {row['lost']} lost"
+    figure = row.get("error") or "no ATE" if ate is None else f"{1000 * ate:.1f} mm, {row['lost']} lost"
     say(f"world {row['world']}: {figure}", err=True)
 
 
@@ -343,9 +343,9 @@ def limits(
         rows = measure_cells(cells, wanted, out / "measured", jobs, done)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
-    text = "Largest dynamic share of the image with an ATE RMSE of at most 2 cm and no frame lost:\n"
+    text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
     text += limits_table(rows, sweeps, list(wanted))
-    text += "\nATE RMSE in cm and share of lost frames; bold where the system copes:\n"
+    text += "\nATE RMSE in mm and share of lost frames; bold where the system copes:\n"
     text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     _answer({"rows": rows}, text, out, as_json=as_json)

@@ -69,12 +69,13 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     import numpy as np
     from rich.table import Table
 
+    from dudmap.app.pipeline.calibration_report import UNITS, kind_of
     from dudmap.core.geometry.calibration import PARAMETERS
 
     out = Table("parameter", "change", "sigma", "unit", "")
     change = given.step_to(estimate.calibration)
     for name, value, sigma in zip(PARAMETERS, change, estimate.calibration.sigma, strict=True):
-        unit, factor = UNITS[name.split("_")[0] if name.startswith(("translation", "rotation", "center")) else name]
+        unit, factor = UNITS[kind_of(name)]
         found = name in estimate.calibration.estimated
         out.add_row(
             name,
@@ -86,32 +87,12 @@ def table(given: "Calibration", estimate: "Estimate") -> "Table":
     return out
 
 
-UNITS = {
-    "translation": ("mm", 1000.0),
-    "rotation": ("deg", 57.29578),
-    "log_focal": ("%", 100.0),
-    "center": ("px", 1.0),
-    "k1": ("", 1.0),
-    "k2": ("", 1.0),
-    "delay": ("ms", 1000.0),
-    "readout": ("ms", 1000.0),
-}
-"""Unit of each kind of parameter in the table, and how many there are in a metre, radian, pixel or second."""
-
-
 def remarks(estimate: "Estimate") -> list[str]:
     """Sentences on what was decided and why."""
-    from dudmap.core.calibration.estimator import EVIDENCE, GROUPS, MIN_PAIRS
+    from dudmap.app.pipeline.calibration_report import findings
 
-    out = []
-    for name, members in GROUPS.items():
-        value = estimate.evidence[name]
-        if value != value:
-            out.append(f"{name}: not observable, fewer than {MIN_PAIRS} pairs of overlapping views in half of the time")
-        elif members[0] not in estimate.calibration.estimated:
-            out.append(f"{name}: stays as given; other images are explained {value:+.1f} standard errors better by it")
-        else:
-            out.append(f"{name}: other images are explained {value:.1f} standard errors better (at least {EVIDENCE:g})")
-    out.append(f"{estimate.pairs} pairs of images; cost of images that were not used: {-100 * estimate.gain:+.1f} %")
-    out.append("the scale of the depth is not observable: it scales all motions and the offset alike")
-    return out
+    return [
+        *findings(estimate),
+        f"{estimate.pairs} pairs of images; cost of images that were not used: {-100 * estimate.gain:+.1f} %",
+        "the scale of the depth is not observable: it scales all motions and the offset alike",
+    ]

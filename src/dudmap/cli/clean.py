@@ -5,8 +5,9 @@ from typing import Annotated
 
 import typer
 
+from dudmap.app.terminal import counted
 from dudmap.cli import options as o
-from dudmap.cli.output import answer, counted
+from dudmap.cli.output import answer
 from dudmap.errors import DatasetError
 
 app = typer.Typer(add_completion=False)

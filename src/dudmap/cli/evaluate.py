@@ -243,10 +243,20 @@ def _report(figures: Figures, file: Path, pictures: list[Path], *, as_json: bool
     table = Table(title=title, show_header=False)
     for key, value in figures.items():
         if value is not None and not isinstance(value, list | dict):
-            table.add_row(key, f"{value:.6g}" if isinstance(value, float) else str(value))
+            table.add_row(*_shown(key, value))
     console = plain_console()
     console.print(table)
     console.print("written: " + ", ".join(str(path) for path in [file, *pictures]), soft_wrap=True)
+
+
+def _shown(key: str, value: object) -> tuple[str, str]:
+    """Name and value of a figure for people: errors in metres, and per second or metre, in millimetres."""
+    if not isinstance(value, float):
+        return key, str(value)
+    name, _, per = key.partition("_m_per_") if "_m_per_" in key else (key.removesuffix("_m"), "", "")
+    if name == key or not name.startswith(("ate_", "rpe_", "drift_")):
+        return key, f"{value:.6g}"
+    return f"{name} per {per}" if per else name, f"{1000 * value:.1f} mm"
 
 
 def _rounded(value: float, digits: int = 9) -> float | None:

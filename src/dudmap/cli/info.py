@@ -68,6 +68,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
     color = found.color_rate
     rates = [] if found.rate is None else [f"{found.rate:.4g} Hz depth"] + ([f"{color:.4g} Hz colour"] if color else [])
     registered = found.T_color_depth is None
+    color_camera = "assumed to be registered to depth" if registered else _camera(found.color_camera)
     shift = None if registered else [1000 * row[3] for row in found.T_color_depth or []]
     return [
         ("recording", found.name),
@@ -75,7 +76,7 @@ def rows(found: "Inspection") -> list[tuple[str, str]]:
         ("frames", f"{found.frames} in {found.duration:.2f} s" + (f", {', '.join(rates)}" if rates else "")),
         ("distinct images", _distinct(found)),
         ("depth camera", _camera(found.camera)),
-        ("colour camera", "the same, registered" if registered else _camera(found.color_camera)),
+        ("colour camera", f"{color_camera}; not tested (dudmap calibrate does)"),
         *([] if shift is None else [("colour from depth", "{:.1f} {:.1f} {:.1f} mm".format(*shift[:3]))]),
         *((f"{what} from", source) for what, source in found.sources.items()),
         ("depth", _depth(found)),

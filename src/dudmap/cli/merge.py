@@ -36,12 +36,12 @@ def merge(
     if len(runs) == 2 and not world:
         from dudmap.fleet.two_runs import merge_runs
 
-        report = merge_runs(runs[0], runs[1], out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}"))
-        found = report.tree
+        folder = out or free_folder(Path("runs") / f"{runs[0].name}-{runs[1].name}")
+        found = merge_runs(runs[0], runs[1], folder)
         text = (
             f"merged by {found['features']} features of {found['keyframes']} keyframes: {found['area']:.1f} m2 of "
             f"common surface, {found['denied']:.1%} denied by free space, colour correlation "
-            f"{found['color_correlation']:.2f}\nwritten to {report.out}"
+            f"{found['color_correlation']:.2f}\nwritten to {folder}"
         )
         if found["finer_blocks_left_out"]:
             text += f"; {found['finer_blocks_left_out']} blocks with smaller voxels are left out"

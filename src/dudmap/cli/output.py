@@ -1,8 +1,7 @@
 """What commands have in common: the answer on stdout, as text or as JSON, progress, and groups of commands."""
 
 import json
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -42,19 +41,6 @@ def plain(value: Any) -> Any:  # noqa: ANN401 - what JSON holds
     if isinstance(value, float):
         return value if abs(value) < float("inf") else None
     return value
-
-
-@contextmanager
-def counted(name: str, *, quiet: bool) -> Iterator[Callable[[int, int], None]]:
-    """Bar on stderr, if that is a terminal; gives a function that takes the number of finished frames and of all."""
-    from rich.progress import Progress
-
-    from dudmap.app.terminal import plain_console
-
-    console = plain_console(stderr=True)
-    with Progress(console=console, disable=quiet or not console.is_terminal) as bar:
-        task = bar.add_task(name, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def free_folder(wanted: Path) -> Path:

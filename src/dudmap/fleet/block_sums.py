@@ -11,8 +11,10 @@ from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import hashing
 from dudmap.core.backends.cpu.points import COLUMNS, EMPTY, INTENSITY, OBSERVED, RED, SDF, UNSEEN, WEIGHT, sample_points
+from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.map.voxel_blocks import BLOCK
+from dudmap.fleet.fused_range import FusedRange
 
 VOXELS = BLOCK**3
 MAX_COUNT = 255
@@ -154,23 +156,7 @@ def _sums(
     )  # fmt: skip
 
 
-@dataclass(frozen=True, eq=False)
-class FusedBlocks:
-    """Voxels of the blocks of the sums.
-
-    Attributes:
-        geometry, colors: (n, 512) int32 packed voxels.
-        has_voxels: (n,) bool, blocks that keep their voxels; the others are unknown or free space.
-        free_count: (n,) uint8 observations of emptiness of the others.
-    """
-
-    geometry: NDArray[np.int32]
-    colors: NDArray[np.int32]
-    has_voxels: NDArray[np.bool_]
-    free_count: NDArray[np.uint8]
-
-
-def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedBlocks:
+def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) -> FusedRange:
     """Divide the sums once.
 
     Emptiness that one map saw where another has voxels counts as an observation of the distance ``free_steps`` with the
@@ -195,11 +181,14 @@ def fused(sums: BlockSums, free_steps: int, carve_rate: int, free_after: int) ->
     least = weight.min(axis=1) // carve_rate
     empty = held & (least >= free_after) & np.all(distance * 10 >= 9 * free_steps, axis=1)
     count = np.where(held, np.where(empty, least, 0), sums.free)
-    return FusedBlocks(
-        np.where(weight > 0, packed, 0).astype(np.int32),
-        np.where(weight > 0, colors, 0).astype(np.int32),
-        held & ~empty,
+    has_voxels = held & ~empty
+    known = (weight > 0)[has_voxels]
+    return FusedRange(
+        morton.encode(sums.coords),
+        has_voxels,
         np.minimum(count, MAX_COUNT).astype(np.uint8),
+        np.where(known, packed[has_voxels], 0).astype(np.int32),
+        np.where(known, colors[has_voxels], 0).astype(np.int32),
     )
 
 

@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
+from dudmap.fleet.fused_range import FusedRange
 from dudmap.fleet.inputs import MapHeader
-from dudmap.fleet.map_fusion import FusedRange, RangeFusion, ReachedBlocks
+from dudmap.fleet.map_fusion import RangeFusion, ReachedBlocks
 from dudmap.fleet.open_maps import open_map, reached_blocks
 from dudmap.fleet.tiles import Tile, write_tile
 from dudmap.fleet.workers import Workers
@@ -41,38 +42,11 @@ class PlacedRun:
 
 @dataclass(frozen=True)
 class CellRange:
-    """Cells with codes from ``first`` to ``last``, and the runs (numbers) that reach them or a neighbouring cell."""
+    """Cells with codes from ``first`` to ``last``, and the runs that reach them or a neighbouring cell."""
 
     first: int
     last: int
-    runs: tuple[int, ...]
-
-
-@dataclass(frozen=True, eq=False)
-class RangeJob:
-    """A range to be fused.
-
-    Attributes:
-        range: Its cells.
-        runs: The runs that reach it.
-        like: Parameters of the result.
-        out: Folder of the world.
-        work: Folder of files that are needed until the merge ends.
-    """
-
-    range: CellRange
     runs: list[PlacedRun]
-    like: MapHeader
-    out: Path
-    work: Path
-
-
-@dataclass(frozen=True, eq=False)
-class RangeResult:
-    """A fused range: its entry in world.json, and the tiles of its cells."""
-
-    entry: dict[str, Any]
-    tiles: list[Tile]
 
 
 def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RANGE_BLOCKS) -> list[CellRange]:
@@ -97,59 +71,65 @@ def planned_ranges(runs: Sequence[PlacedRun], workers: Workers, limit: int = RAN
     for group in groups:
         around = np.unique(_with_neighbours(np.array(group, np.int64), CELL_BITS // 3)).tolist()
         numbers = set[int]().union(*(reached.get(cell, ()) for cell in around))
-        out.append(CellRange(group[0], group[-1], tuple(sorted(numbers))))
+        out.append(CellRange(group[0], group[-1], [runs[number] for number in sorted(numbers)]))
     return out
 
 
-def fuse_range(job: RangeJob) -> RangeResult:
-    """Fuse a range, write its map file and the tiles of its cells."""
-    like = job.like.volume()
-    low, high = job.range.first << CELL_BITS, (job.range.last + 1) << CELL_BITS
-    reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in job.runs]
+def fuse_range(like: MapHeader, out: Path, work: Path, cells: CellRange) -> tuple[dict[str, Any], list[Tile]]:
+    """Fuse a range, write its map file and the tiles of its cells.
+
+    Args:
+        like: Parameters of the result.
+        out: Folder of the world.
+        work: Folder of files that are needed until the merge ends.
+        cells: The range.
+
+    Returns:
+        The entry of the range in world.json, and the tiles.
+    """
+    empty_map = like.volume()
+    low, high = cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS
+    reached = [reached_blocks(run.folder, run.T_world_run.tobytes()) for run in cells.runs]
     inside = [one.within(low, high) for one in reached]
     near = _union([one.near for one in inside])
     empty = np.setdiff1d(_union([one.empty for one in inside]), near)
     touching = np.setdiff1d(np.unique(_with_neighbours(near, 0)), near)
     halo = np.intersect1d(touching[(touching < low) | (touching >= high)], _union([one.near for one in reached]))
-    fusion = RangeFusion(np.union1d(near, halo), empty, like)
+    fusion = RangeFusion(np.union1d(near, halo), empty, empty_map)
     wanted = _union([near, halo, empty])
-    for run, one in zip(job.runs, reached, strict=True):
+    for run, one in zip(cells.runs, reached, strict=True):
         part = ReachedBlocks(np.intersect1d(one.near, wanted), np.intersect1d(one.empty, wanted))
         if len(part.near) or len(part.empty):
             fusion.add(open_map(run.folder), run.T_world_run, part)
     fused = fusion.fused()
     own = fused.chosen((fused.codes >= low) & (fused.codes < high))
-    name = f"{MAP_FOLDER}/{job.range.first:013x}.npz"
-    own.volume(like).save(job.out / name)
-    return RangeResult(_entry(name, job.range, own, like.block_size), _write_tiles(job, fused, like))
+    name = f"{MAP_FOLDER}/{cells.first:013x}.npz"
+    own.volume(empty_map).save(out / name)
+    coords = morton.decode(own.codes[own.has_voxels]) if own.has_voxels.any() else np.zeros((1, 3), np.int32)
+    entry = {
+        "file": name,
+        "codes": [low, high],
+        "blocks": int(own.has_voxels.sum()),
+        "low_m": (coords.min(axis=0) * empty_map.block_size).round(6).tolist(),
+        "high_m": ((coords.max(axis=0) + 1) * empty_map.block_size).round(6).tolist(),
+    }
+    return entry, _write_tiles(cells, fused, empty_map, out, work)
 
 
-def _write_tiles(job: RangeJob, fused: FusedRange, like: TsdfVolume) -> list[Tile]:
+def _write_tiles(cells: CellRange, fused: FusedRange, like: TsdfVolume, out: Path, work: Path) -> list[Tile]:
     """Full surface of every cell of the range that has one."""
     volume = fused.volume(like)
-    cells = fused.codes[fused.has_voxels] >> CELL_BITS
-    own = (cells >= job.range.first) & (cells <= job.range.last)
-    names, numbers = np.unique(cells[own], return_inverse=True)
-    chunks = np.full(len(cells), -1)
+    cell_of = fused.codes[fused.has_voxels] >> CELL_BITS
+    own = (cell_of >= cells.first) & (cell_of <= cells.last)
+    names, numbers = np.unique(cell_of[own], return_inverse=True)
+    chunks = np.full(len(cell_of), -1)
     chunks[own] = numbers
-    meshes = volume.extract_chunks(np.arange(len(cells), dtype=np.int32), chunks) if len(names) else []
+    meshes = volume.extract_chunks(np.arange(len(cell_of), dtype=np.int32), chunks) if len(names) else []
     return [
-        write_tile(mesh, f"{cell:013x}", 0, job.out, job.work)
+        write_tile(mesh, f"{cell:013x}", 0, out, work)
         for cell, mesh in zip(names.tolist(), meshes, strict=False)
         if len(mesh.faces)
     ]
-
-
-def _entry(name: str, cells: CellRange, own: FusedRange, block_size: float) -> dict[str, Any]:
-    """What world.json says about a range."""
-    coords = morton.decode(own.codes[own.has_voxels]) if own.has_voxels.any() else np.zeros((1, 3), np.int32)
-    return {
-        "file": name,
-        "codes": [cells.first << CELL_BITS, (cells.last + 1) << CELL_BITS],
-        "blocks": int(own.has_voxels.sum()),
-        "low_m": (coords.min(axis=0) * block_size).round(6).tolist(),
-        "high_m": ((coords.max(axis=0) + 1) * block_size).round(6).tolist(),
-    }
 
 
 def _occupied_cells(run: PlacedRun) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:

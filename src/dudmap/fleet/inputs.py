@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.geometry.camera import Camera
-from dudmap.core.map.map_file import FORMAT
+from dudmap.core.map.map_file import read_parameters
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE
 from dudmap.errors import ConfigError, DudmapError, MapError
@@ -52,18 +52,11 @@ class MapHeader:
         """
         try:
             with open_arrays(path) as data:
-                if str(data["format"]) != FORMAT:
-                    raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
-                fx, fy, cx, cy = (float(value) for value in data["camera"])
-                width, height = (int(value) for value in data["image"])
                 coords = data["coords"] if blocks else np.zeros((0, 3), np.int32)
                 has_voxels = np.zeros(len(coords), bool)
                 if blocks:
                     has_voxels[data["entries"]] = True
-                return cls(
-                    Camera(fx, fy, cx, cy, width, height), VolumeConfig.model_validate_json(str(data["config"])),
-                    SensorConfig.model_validate_json(str(data["sensor"])), float(data["depth_max"]), coords, has_voxels,
-                )  # fmt: skip
+                return cls(*read_parameters(data, path), coords, has_voxels)
         except DAMAGE as error:
             raise MapError(f"{path} is not a readable map file: {error}") from error
 

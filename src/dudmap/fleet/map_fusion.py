@@ -14,9 +14,10 @@ from numpy.typing import NDArray
 from dudmap.core.geometry import se3
 from dudmap.core.map import morton
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.map.voxel_blocks import BLOCK, VoxelBlocks
+from dudmap.core.map.voxel_blocks import BLOCK
 from dudmap.errors import ConfigError
 from dudmap.fleet.block_sums import MAX_COUNT, PROBES, VOXELS, BlockSums, block_sums, empty_counts, fused
+from dudmap.fleet.fused_range import FusedRange, joined
 
 RANGE_BLOCKS = 4096
 """Blocks with voxels of a range of ``fuse_maps``: 75 MB of sums."""
@@ -63,47 +64,6 @@ class ReachedBlocks:
         return ReachedBlocks(*(part[slice(*np.searchsorted(part, [low, high]))] for part in (self.near, self.empty)))
 
 
-@dataclass(frozen=True, eq=False)
-class FusedRange:
-    """Blocks of the result.
-
-    Attributes:
-        codes: (n,) int64 Morton codes.
-        has_voxels: (n,) bool; the others were seen to be empty.
-        free_count: (n,) uint8 observations of emptiness.
-        geometry, colors: (m, 512) int32 packed voxels of the blocks that have some, in the same order.
-    """
-
-    codes: NDArray[np.int64]
-    has_voxels: NDArray[np.bool_]
-    free_count: NDArray[np.uint8]
-    geometry: NDArray[np.int32]
-    colors: NDArray[np.int32]
-
-    def chosen(self, keep: NDArray[np.bool_]) -> "FusedRange":
-        """Some of the blocks (n,)."""
-        rows = keep[self.has_voxels]
-        return FusedRange(
-            self.codes[keep], self.has_voxels[keep], self.free_count[keep], self.geometry[rows], self.colors[rows]
-        )
-
-    @classmethod
-    def of(cls, volume: TsdfVolume) -> "FusedRange":
-        """All blocks of a map."""
-        blocks, n = volume.blocks, volume.blocks.num_entries
-        has_voxels, slots = blocks.slot_of[:n] >= 0, blocks.slot_of[:n][blocks.slot_of[:n] >= 0]
-        codes = morton.encode(blocks.coords[:n])
-        return cls(codes, has_voxels, blocks.free_count[:n], blocks.geometry[slots], blocks.colors[slots])
-
-    def volume(self, like: TsdfVolume) -> TsdfVolume:
-        """The blocks as a map with the camera and the parameters of another."""
-        out = TsdfVolume(like.camera, like.config, like.sensor, like.depth_max)
-        entries = np.flatnonzero(self.has_voxels).astype(np.int32)
-        coords = morton.decode(self.codes)
-        out.blocks = VoxelBlocks.restored(coords, self.free_count, entries, self.geometry, self.colors)
-        return out
-
-
 class RangeFusion:
     """Sums over maps in some blocks; any order of the maps gives the same result.
 
@@ -136,15 +96,9 @@ class RangeFusion:
             fused(self._sums.rows(part), free_steps, like.config.carve_rate, like.config.free_after)
             for part in _batches(np.arange(len(self._near)))
         ]
-        none = np.zeros((0, VOXELS), np.int32)
-        codes = np.concatenate([self._near, self._empty])
-        has_voxels = np.concatenate([*(part.has_voxels for part in parts), np.zeros(len(self._empty), bool)])
-        free = np.minimum(self._free, MAX_COUNT).astype(np.uint8)
-        free_count = np.concatenate([*(part.free_count for part in parts), free])
-        geometry = np.concatenate([none, *(part.geometry[part.has_voxels] for part in parts)])
-        colors = np.concatenate([none, *(part.colors[part.has_voxels] for part in parts)])
-        all_blocks = FusedRange(codes, has_voxels, free_count, geometry, colors)
-        return all_blocks.chosen(has_voxels | (free_count > 0))
+        none, free = np.zeros((0, VOXELS), np.int32), np.minimum(self._free, MAX_COUNT).astype(np.uint8)
+        out = joined([*parts, FusedRange(self._empty, np.zeros(len(self._empty), bool), free, none, none)])
+        return out.chosen(out.has_voxels | (out.free_count > 0))
 
 
 def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[np.float64]]) -> TsdfVolume:
@@ -174,12 +128,6 @@ def fuse_maps(volumes: Sequence[TsdfVolume], Ts_world_volume: Sequence[NDArray[n
             fusion.add(volume, T, one)
         parts.append(fusion.fused())
     return joined(parts).volume(volumes[0])
-
-
-def joined(parts: Sequence[FusedRange]) -> FusedRange:
-    """Blocks of several ranges, which have none in common."""
-    names = FusedRange.__dataclass_fields__
-    return FusedRange(*(np.concatenate([getattr(part, name) for part in parts]) for name in names))
 
 
 def check_voxel_sizes(volumes: Sequence[TsdfVolume]) -> None:

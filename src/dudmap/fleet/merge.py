@@ -6,6 +6,7 @@ import shutil
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -18,9 +19,9 @@ from dudmap.core.map.volume import TsdfVolume
 from dudmap.errors import DudmapError, MapError
 from dudmap.extras import need
 from dudmap.fleet.block_sums import MAX_COUNT, VOXELS
-from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, RangeJob, fuse_range, planned_ranges
+from dudmap.fleet.fused_range import FusedRange, joined
+from dudmap.fleet.fusion import MAP_FOLDER, PlacedRun, fuse_range, planned_ranges
 from dudmap.fleet.inputs import MapHeader, check_runs
-from dudmap.fleet.map_fusion import FusedRange, joined
 from dudmap.fleet.map_samples import sample_map
 from dudmap.fleet.registration import RegisteredPair
 from dudmap.fleet.rounds import registered_runs
@@ -164,10 +165,8 @@ def _write_world(
         folder.mkdir(parents=True)
     try:
         runs = [PlacedRun(folders[run], graph.Ts[run]) for run in part]
-        ranges = planned_ranges(runs, crew)
-        jobs = [RangeJob(one, [runs[number] for number in one.runs], like, out, work) for one in ranges]
-        results = list(crew.map(fuse_range, jobs))
-        leaves = [tile for result in results for tile in result.tiles]
+        results = list(crew.map(partial(fuse_range, like, out, work), planned_ranges(runs, crew)))
+        leaves = [tile for _, tiles in results for tile in tiles]
         if leaves:
             root = write_tree(leaves, like.config.voxel_size, out, work, crew)
             write_tileset(root, like.config.voxel_size, out)
@@ -178,7 +177,7 @@ def _write_world(
         {"folder": str(run.folder), "T_world_run": run.T_world_run.tolist(), "trajectories": names}
         for run, names in zip(runs, trajectories, strict=True)
     ]
-    kept = [result.entry for result in results if result.entry["blocks"]]
+    kept = [entry for entry, _ in results if entry["blocks"]]
     return {
         "format": FORMAT, "voxel_size": like.config.voxel_size, "runs": entries, "ranges": kept,
         "map_blocks": sum(entry["blocks"] for entry in kept), "tiles": len(list((out / TILE_FOLDER).glob("*.glb"))),

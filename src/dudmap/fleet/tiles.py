@@ -8,6 +8,7 @@ a tile by its children when it comes near (refinement REPLACE).
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.atomic_file import atomic_file
-from dudmap.core.geometry.mesh import Mesh
+from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.geometry.mesh_simplification import clustered
 from dudmap.fleet.workers import Workers
 from dudmap.io.exporting.gltf import encoded
@@ -48,17 +49,6 @@ class Tile:
     children: tuple["Tile", ...] = ()
 
 
-@dataclass(frozen=True, eq=False)
-class _ParentJob:
-    """An inner tile to be made of its children."""
-
-    name: str
-    children: tuple[Tile, ...]
-    voxel_size: float
-    out: Path
-    work: Path
-
-
 def write_tile(mesh: Mesh, name: str, height: int, out: Path, work: Path, children: tuple[Tile, ...] = ()) -> Tile:
     """Write the GLB file of a tile, and its mesh for its parent."""
     with atomic_file(out / TILE_FOLDER / f"{name}.glb") as file:
@@ -79,12 +69,8 @@ def write_tree(leaves: Sequence[Tile], voxel_size: float, out: Path, work: Path,
     done = {leaf.name: leaf for leaf in leaves}
     inner = _inner_nodes(sorted(int(leaf.name, 16) for leaf in leaves))
     for height in sorted({height for height, _, _ in inner}):
-        jobs = [
-            _ParentJob(name, tuple(done[child] for child in children), voxel_size, out, work)
-            for level, name, children in inner
-            if level == height
-        ]
-        for tile in workers.map(_write_parent, jobs):
+        parents = [(name, tuple(done[c] for c in children)) for level, name, children in inner if level == height]
+        for tile in workers.map(partial(_write_parent, voxel_size, out, work), parents):
             done[tile.name] = tile
     return done[inner[-1][1]] if inner else leaves[0]
 
@@ -146,17 +132,12 @@ def _inner_nodes(cells: list[int]) -> list[tuple[int, str, list[str]]]:
     return out
 
 
-def _write_parent(job: _ParentJob) -> Tile:
-    height = 1 + max(child.height for child in job.children)
-    parts = [Mesh.load(job.work / f"{child.name}.ply") for child in job.children]
-    starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    whole = Mesh(
-        np.concatenate([part.vertices for part in parts]),
-        np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)]).astype(np.int32),
-        np.concatenate([part.colors for part in parts]),
-        np.concatenate([part.normals for part in parts]),
-    )
-    mesh = clustered(whole, job.voxel_size * 2**height)
+def _write_parent(voxel_size: float, out: Path, work: Path, parent: tuple[str, tuple[Tile, ...]]) -> Tile:
+    """Write an inner tile of a name and children."""
+    name, children = parent
+    height = 1 + max(child.height for child in children)
+    whole = joined([Mesh.load(work / f"{child.name}.ply") for child in children])
+    mesh = clustered(whole, voxel_size * 2**height)
     if len(mesh.faces) == 0:  # all of it is smaller than a cube
         mesh = whole
-    return write_tile(mesh, job.name, height, job.out, job.work, job.children)
+    return write_tile(mesh, name, height, out, work, children)

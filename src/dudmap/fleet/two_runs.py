@@ -3,7 +3,7 @@
 import json
 import re
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,34 +17,22 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.places.saved_map import KEYFRAME_FILE, MAP_FILE, SavedMap
 from dudmap.errors import DatasetError, MapError
 from dudmap.fleet.inputs import check_runs
-from dudmap.fleet.map_merging import MapPair, compare_maps, merged_map
+from dudmap.fleet.map_merging import compare_maps, merged_map
 from dudmap.input_files import damaged, read_bytes, read_json
 
 MERGE_FILE = "merge.json"
 
 
-@dataclass(frozen=True, eq=False)
-class MergeReport:
-    """Result of a merge.
-
-    Attributes:
-        out: The new run folder.
-        pair: What was found about the two maps.
-        tree: Content of merge.json.
-    """
-
-    out: Path
-    pair: MapPair
-    tree: dict[str, Any]
-
-
-def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
+def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> dict[str, Any]:
     """Join the maps of two run folders into a new run folder, in the world frame of the first.
 
     The folder receives map.npz, keyframes.npz, mesh.ply, config.toml (that of the first), the trajectories of both
     runs in the common world frame (trajectory.txt, trajectory-2.txt, ...), merge.json: the runs, the relative pose
     and the figures of all checks; and metrics.json with the sizes, which viewers and the report read. Nothing is
     written if the maps are not to be joined.
+
+    Returns:
+        Content of merge.json.
 
     Raises:
         MapError: The maps are not to be joined; the message says why.
@@ -72,16 +60,12 @@ def merge_runs(a: str | Path, b: str | Path, out: str | Path) -> MergeReport:
         finer = [level.blocks.num_voxel_blocks for saved in maps for level in saved.volume.levels]
         tree |= sizes | {"finer_blocks_left_out": sum(finer)}
         poses = sum(len(Trajectory.load(out / name)) for name in tree["trajectories"])
-        metrics: dict[str, Any] = {
-            "sequence": f"{a.name} and {b.name}",
-            "complete": True,
-            "frames": poses,
-            "tracked": poses,
-        }
+        metrics: dict[str, Any] = {"sequence": f"{a.name} and {b.name}", "complete": True}
+        metrics |= {"frames": poses, "tracked": poses}
         metrics |= sizes | {"camera": asdict(merged.volume.camera), "versions": versions(), "machine": machine()}
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
         write_text(out / MERGE_FILE, json.dumps(tree, indent=2) + "\n")
-    return MergeReport(out, pair, tree)
+    return tree
 
 
 def save_trajectories(out: Path, runs: Sequence[tuple[Path, NDArray[np.float64]]]) -> list[list[str]]:

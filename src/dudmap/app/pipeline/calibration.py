@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 import cv2
 import numpy as np
 
+from dudmap.app.pipeline.calibration_report import ASSUMED, findings
 from dudmap.app.pipeline.frame_source import read_ahead
 from dudmap.config import Config
 from dudmap.core.backends.cpu.backend import CpuBackend
@@ -50,7 +51,8 @@ def calibrate_start(
     sequence: "Sequence",
     config: Config,
     max_frames: int | None = None,
-    notice: "Callable[[str], None] | None" = None,
+    notice: "Callable[[str], None]" = lambda text: None,
+    progress: "Callable[[int, int], None]" = lambda done, total: None,
 ) -> Calibration | None:
     """Calibration estimated from the start of a recording; None where none was made.
 
@@ -60,22 +62,24 @@ def calibrate_start(
         sequence: The recording.
         config: All parameters.
         max_frames: Number of frames that will be processed; None for all.
-        notice: Receives sentences on what is being done and what was found.
+        notice: Receives sentences on what is being done, what was found, and what is assumed.
+        progress: Receives the number of frames tracked for it, and of all that will be.
     """
-    notice = notice or (lambda text: None)
     count = min(len(sequence), START_FRAMES, max_frames or len(sequence))
     if config.preset == "thesis" or count < MIN_FRAMES:
+        thesis, short = "preset thesis takes the images as they are", f"that takes {MIN_FRAMES} frames"
+        notice(f"colour camera: {ASSUMED}: {thesis if config.preset == 'thesis' else short}")
         return None
     notice(f"calibrating the colour camera from the first {count} frames (--calibration given leaves this out)")
     given = sequence.calibration or Calibration.registered(sequence.camera)
     try:
-        found = calibrate_sequence(sequence, config, given, count, notice).calibration
+        estimate = calibrate_sequence(sequence, config, given, count, notice, progress)
     except DatasetError as error:
-        notice(f"the colour camera is taken as given: {error}")
+        notice(f"colour camera: {ASSUMED}: {error}")
         return None
-    names = ", ".join(found.estimated)
-    notice(f"colour camera: estimated {names}" if names else "colour camera: as given, the images show no fault")
-    return found
+    for finding in findings(estimate):
+        notice(finding)
+    return estimate.calibration
 
 
 def calibrate_sequence(
@@ -84,6 +88,7 @@ def calibrate_sequence(
     given: Calibration,
     max_frames: int | None = None,
     notice: "Callable[[str], None]" = lambda text: None,
+    progress: "Callable[[int, int], None]" = lambda done, total: None,
 ) -> Estimate:
     """Track a recording quickly with the calibration as given, and estimate a better one.
 
@@ -95,6 +100,7 @@ def calibrate_sequence(
         given: The calibration to start from.
         max_frames: Use only so many frames.
         notice: Receives a sentence on what is being done.
+        progress: Receives the number of frames tracked so far, and of all that will be.
 
     Raises:
         DatasetError: Hardly any frame could be read and tracked.
@@ -107,7 +113,8 @@ def calibrate_sequence(
     notice(f"calibration: tracking {len(small)} images of {small.camera.width}x{small.camera.height}")
     collector, submap = KeyframeCollector(small.calibration.camera, GAP * small.interval), 0
     with closing(read_ahead(small, len(small), slam=slam)) as frames:
-        for read in frames:
+        for number, read in enumerate(frames, start=1):
+            progress(number, len(small))
             if isinstance(read.frame, FrameError) or read.prepared is None:
                 continue
             result = slam.process(read.prepared)

@@ -95,6 +95,7 @@ def _arriving_frames(
             put(SourceFrame(arrived.number - start, prepared(arrived.frame, state.slam), arrival=arrived.time))
 
     job.display.working("loading kernels")
+    job.display.announce_compilation()
     first = job.system(calibration=state.calibration)
     for frame in camera.preview(PREVIEW):
         first.process(frame)

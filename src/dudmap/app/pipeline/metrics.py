@@ -46,6 +46,7 @@ class RunRecord:
         warnings: Sentences on what looked wrong in the recording before the run.
         masked: Number of frames with an external mask, None without external masks.
         dropped: Number of frames dropped by a live run, None otherwise.
+        spent: Seconds, and seconds of processor time, of what belongs to the run and came before this process or pass.
     """
 
     rows: list[dict[str, Any]] = field(default_factory=list)
@@ -62,17 +63,17 @@ class RunRecord:
     warnings: list[str] = field(default_factory=list)
     masked: int | None = None
     dropped: int | None = None
-    _spent: tuple[float, float] = (0.0, 0.0)
+    spent: tuple[float, float] = (0.0, 0.0)
     _since: tuple[float, float] = field(default_factory=lambda: (time.perf_counter(), time.process_time()))
 
     def elapsed(self) -> tuple[float, float]:
         """Seconds, and seconds of processor time, since the run began, without those between two processes of it."""
-        (wall, cpu), (wall_since, cpu_since) = self._spent, self._since
+        (wall, cpu), (wall_since, cpu_since) = self.spent, self._since
         return wall + time.perf_counter() - wall_since, cpu + time.process_time() - cpu_since
 
     def settle(self) -> None:
         """Note the time so far, from which a continued run goes on."""
-        self._spent, self._since = self.elapsed(), (time.perf_counter(), time.process_time())
+        self.spent, self._since = self.elapsed(), (time.perf_counter(), time.process_time())
 
     def add(
         self,
@@ -187,7 +188,6 @@ class RunRecord:
             "ms_per_frame_median": _number(np.median(totals)),
             "ms_per_frame_p95": _number(np.percentile(totals, 95)),
             "ms_reading_median": _number(np.median(readings)),
-            **{name: round(seconds, 3) for name, seconds in zip(("wall_s", "cpu_s"), self.elapsed(), strict=True)},
             "peak_rss_mb": peak_rss_mb(),
             "dynamic_share_mean": _number(np.mean(shares), 4),
             "warnings": self.warnings,

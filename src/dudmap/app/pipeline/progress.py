@@ -5,10 +5,11 @@ from collections import deque
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
+from dudmap.app.kernel_cache import COMPILING, compiled_kernels
 from dudmap.app.terminal import plain_console
 
 if TYPE_CHECKING:
@@ -23,8 +24,8 @@ FIGURES = (
     ("peak memory", "peak_rss_mb", "{:.0f} MB", 1),
     ("map", "map_bytes", "{:.1f} MB", 1e-6),
     ("mesh", "mesh_triangles", "{} triangles", 1),
-    ("ATE RMSE", "ate_rmse_m", "{:.2f} cm", 100),
-    ("RPE RMSE, translation", "rpe_trans_rmse_m_per_s", "{:.2f} cm/s", 100),
+    ("ATE RMSE", "ate_rmse_m", "{:.1f} mm", 1000),
+    ("RPE RMSE, translation", "rpe_trans_rmse_m_per_s", "{:.1f} mm/s", 1000),
     ("RPE RMSE, rotation", "rpe_rot_rmse_deg_per_s", "{:.2f} deg/s", 1),
     ("mask IoU", "mask_iou_mean", "{:.3f}", 1),
 )
@@ -44,6 +45,7 @@ class RunProgress:
     def __init__(self, total: int | None, *, bar: bool = True) -> None:
         self.console = plain_console(stderr=True)
         self._bar = Progress(
+            SpinnerColumn(),  # turns while kernels are compiled, when no frame is finished for a minute
             TextColumn("frame"),
             MofNCompleteColumn(),
             BarColumn(),
@@ -93,6 +95,11 @@ class RunProgress:
     def note(self, sentence: str) -> None:
         """Print a sentence above the bar."""
         self.console.print(sentence, style="yellow", soft_wrap=True)
+
+    def announce_compilation(self) -> None:
+        """Say that the kernels are compiled first, where that is so."""
+        if not compiled_kernels():
+            self.note(COMPILING)
 
     def once(self, sentence: str) -> None:
         """Print a sentence above the bar unless it was printed before."""

@@ -14,6 +14,7 @@ from dudmap.app.pipeline.replay import in_real_time
 from dudmap.app.pipeline.run_folder import RunReport, locked, prepare_run_folder, save_mask, write_run_folder
 from dudmap.app.pipeline.storing import RunOptions, RunState, RunStore, Storing, restored
 from dudmap.app.state.database import StateReader
+from dudmap.app.terminal import counted
 from dudmap.config import Config
 from dudmap.errors import CameraError, ConfigError, DatasetError, DeviceError, DudmapError, FrameError
 from dudmap.io.cameras import LiveCamera
@@ -98,6 +99,7 @@ def run(
         KeyboardInterrupt: Ctrl-C, after writing; the message names what was saved.
     """
     from dudmap.app.pipeline.calibration import calibrate_start
+    from dudmap.app.pipeline.calibration_report import ASSUMED
 
     out = Path(out)
     count = len(sequence) if max_frames is None else min(max_frames, len(sequence))
@@ -124,6 +126,7 @@ def run(
         localize=localize, max_memory=max_memory, storing=storing,
     )  # fmt: skip
     with locked(out):
+        record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
         display = RunProgress(count * passes, bar=progress)
         job = Job(sequence, out, options, display, open_masks(masks, sequence), observers)
         prepare_run_folder(out, masks, save_masks=save_masks)
@@ -131,11 +134,16 @@ def run(
         if storing is not None:
             store = RunStore(out, storing.every, display.note)
             store.order(sequence, options)
+        notice = display.note if progress else lambda text: None
+        if progress:
+            display.announce_compilation()
         if calibrate:
-            calibration = calibrate_start(sequence, config, count, display.note if progress else None)
+            with counted("calibrating", quiet=not progress, console=display.console) as counting:
+                calibration = calibrate_start(sequence, config, count, notice, counting)
+        elif calibration is None and not live:
+            notice(f"colour camera: {ASSUMED}")
         calibration = calibration or sequence.calibration
         slam = job.system(calibration=calibration, live=live, saved_map=saved_map, localize=localize)
-        record = RunRecord(warnings=list(warnings), masked=None if masks is None else 0, dropped=0 if live else None)
         state = RunState(slam, record, calibration)
         if store is not None:
             store.begin(state)
@@ -220,7 +228,8 @@ class Job:
                 state.first_slam, state.first_record = state.slam, state.record
                 masked = state.record.masked and 0
                 state.slam = self._next_system(state, first_pass=state.slam)
-                state.record = RunRecord(warnings=state.record.warnings, masked=masked, dropped=None)
+                spent, warnings = state.record.elapsed(), state.record.warnings
+                state.record = RunRecord(warnings=warnings, masked=masked, dropped=None, spent=spent)
                 state.number, state.next = number, 0
             for observer in self.observers:
                 if state.next:

@@ -163,6 +163,7 @@ def write_run_folder(
         if sequence.ground_truth is not None:
             metrics.update(accuracy(trajectory, sequence.ground_truth))
         about = {"versions": versions(), "machine": machine(), "device": slam.device, "peak_rss_mb": peak_rss_mb()}
+        metrics.update(zip(("wall_s", "cpu_s"), (round(seconds, 3) for seconds in record.elapsed()), strict=True))
         metrics.update(camera=asdict(sequence.camera), **about)
         write_text(out / "metrics.json", json.dumps(metrics, indent=2) + "\n")
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.backends.cpu import hashing
-from dudmap.core.map.block_pager import Region
+from dudmap.core.map.block_pager import Away, Region
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
 from dudmap.core.map.volume import TsdfVolume
@@ -127,7 +127,7 @@ def _fine_index(level: FineBlocks) -> dict[str, Any]:
     return _index_of(level.blocks) | voxels
 
 
-def _away_rows(away: dict[Region, tuple[int, int, int, int]]) -> NDArray[np.int64]:
+def _away_rows(away: dict[Region, Away]) -> NDArray[np.int64]:
     """Coordinates, number of the content, and numbers of blocks (n, 7) of regions that have left the memory."""
     return np.array([(*region, *numbers) for region, numbers in away.items()], np.int64).reshape(-1, 7)
 

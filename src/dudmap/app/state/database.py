@@ -24,7 +24,7 @@ from dudmap.app.state.blocks import VOXELS, MapSnapshot, StoredMaps
 from dudmap.app.state.frames import FrameSnapshot, StoredFrames
 from dudmap.app.state.tree import Snapshot
 from dudmap.core.map.block_pager import Region
-from dudmap.core.map.region_store import COLUMNS, blobs_of, records_of
+from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of
 from dudmap.core.map.voxel_blocks import BlockRecords
 from dudmap.core.places.frame_store import EncodedFrame
 from dudmap.errors import StateError

@@ -36,22 +36,22 @@ core.frames.frame:FrameArrays,Frame core.frames.observation:Observation,Level co
 core.frames.pyramid:Pyramid core.frames.stream_check:Rejection,StreamCheck core.geometry.alignment:Alignment
 core.geometry.association:TimedFile core.geometry.calibration:Calibration core.geometry.camera:Camera
 core.geometry.lens:Lens core.geometry.mesh:Mesh core.geometry.other_view:OtherView core.geometry.trajectory:Trajectory
-core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:_Away,BlockPager core.map.block_tree:BlockTree
+core.map.adaptive_volume:AdaptiveVolume core.map.block_pager:BlockPager core.map.block_tree:BlockTree
 core.map.block_window:BlockWindow core.map.fine_blocks:FineBlocks core.map.incremental_mesh:IncrementalMesh
-core.map.integrator:StorageScale,Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
-core.map.paged_map:PagedMap core.map.refinement:Refinement core.map.region_store:RegionStore
+core.map.integrator:Integrator core.map.map_file:MapContent core.map.memory_limit:MemoryLimit
+core.map.paged_map:PagedMap core.map.refinement:Refinement
 core.map.volume:TsdfVolume core.map.volume_mirror:VolumeMirror core.map.voxel_blocks:BlockRecords,VoxelBlocks
 core.mapper:Mapper core.objects.moving_objects:_Frame,MovingObjects core.objects.object_fusion:ObjectFusion
 core.objects.object_map:RigidObject,ObjectVolume,ObjectTrack
 core.objects.object_tracker:Mover,_Measurement,_Track,ObjectTracker core.objects.object_view:ObjectView
 core.objects.regions:MovingPixels,Region core.objects.scene_flow:InstanceFrame core.places.atlas:TimedPose,Atlas
-core.places.features:ImageFeatures,SiftExtractor core.places.frame_file:FilePlace,FrameFile
+core.places.features:ImageFeatures,SiftExtractor
 core.places.frame_store:StoredFrame,FrameStore core.places.frame_thinning:FrameThinning
 core.places.loop_closing:LoopSearch,PendingCorrection,LoopCloser
 core.places.loop_correction:LoopCorrector core.places.loop_verification:LoopQuery,LoopVerifier
 core.places.map_rebuilding:MapRebuilding
 core.places.place_recognition:PlacedFeatures,Keyframe,PlaceMatch,KeyframeDatabase core.places.pose_graph:Edge
-core.places.prior_map:PriorMap core.places.redundancy:DescribedImage,SimilarityTest,_Place,RedundantViews
+core.places.prior_map:PriorMap core.places.redundancy:SimilarityTest,_Place,RedundantViews
 core.places.relocalizer:Relocalization,Relocalizer core.places.saved_map:SavedMap core.result:FrameResult
 core.slam:Slam core.stage_timer:StageTimer core.tracking.color_motion:RegisteredLevel,ColorMotion
 core.tracking.estimate:PoseEstimate core.tracking.frame_view:FrameView
@@ -65,9 +65,9 @@ core.tracking.tracker:TrackingResult,Minimum,Tracker
 NOT_STORED = {
     "Atlas": ("make_volume",),
     "BlockPager": (
-        "_store", "_executor", "_away", "_writing", "_reading", "_unchanged_since", "_serial", "_archived", "_archive",
+        "_store", "_executor", "_away", "_writing", "_reading", "_returned", "_archived", "_archive",
     ),
-    "FrameStore": ("registered", "_places", "_file", "_encoder", "_pending", "archived"),
+    "FrameStore": ("registered", "_first_own", "_file", "_encoder", "_pending", "archived"),
     "KeyframeDatabase": ("_sift",),
     "LoopCloser": ("_executor",),
     "RunRecord": ("_since",),

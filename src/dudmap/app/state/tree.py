@@ -22,7 +22,6 @@ from dudmap.app.state.blocks import MapSnapshot, StoredMaps, restore_map
 from dudmap.core.backends.device import make_backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.frame_file import FrameFile
 from dudmap.core.places.frame_store import FrameStore
 from dudmap.errors import DatasetError, StateError
 from dudmap.input_files import DAMAGE
@@ -364,7 +363,7 @@ def _defaults(cls: type) -> dict[str, Any]:
     """Values of the attributes that are not stored, of an object that is made without its constructor."""
     made: dict[str, dict[str, Any]] = {
         "BlockPager": {"_store": None, "_executor": None},
-        "FrameStore": {"registered": None, "_file": FrameFile(), "_encoder": None, "_pending": deque()},
+        "FrameStore": {"registered": None, "_file": None, "_first_own": 0, "_encoder": None, "_pending": deque()},
         "LoopCloser": {"_executor": None},
         "RunRecord": {"_since": (0.0, 0.0)},
         "Observation": {"_halvings": [], "_recorded_halvings": []},

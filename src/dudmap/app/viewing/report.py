@@ -36,7 +36,7 @@ CARDS = {
     "ms_per_frame_median": ("median per frame", 1, "{:.0f} ms"),
     "dynamic_share_mean": ("moves", 100, "{:.1f} %"),
     "mesh_triangles": ("triangles", 1e-3, "{:.0f} k"),
-    "ate_rmse_m": ("ATE RMSE", 100, "{:.2f} cm"),
+    "ate_rmse_m": ("ATE RMSE", 1000, "{:.1f} mm"),
     "mask_iou_mean": ("mask IoU", 1, "{:.3f}"),
 }
 """Key of metrics.json to label, factor and format of the figures at the top of the page."""

@@ -16,7 +16,7 @@ from dudmap.core.backends.cpu.backend import CpuBackend
 from dudmap.core.backends.spec import Backend
 from dudmap.core.backends.warp import faults
 from dudmap.errors import ConfigError
-from dudmap.extras import need
+from dudmap.extras import install, need
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -124,7 +124,7 @@ def obstacle() -> str:
     if num_gpus() == 0:
         return "the NVIDIA driver finds no GPU"
     if not _has_warp():
-        return 'Warp is not installed (pip install "dudmap[gpu]")'
+        return f"Warp is not installed ({install('gpu')})"
     if failure := warp_failure():
         return failure
     if not supported_gpus():

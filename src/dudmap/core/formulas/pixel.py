@@ -10,6 +10,9 @@ from dudmap.config import reading_sigma
 from dudmap.core.backends.threads import scalar, written_out
 
 f32, sqrt = np.float32, np.sqrt
+STEEPEST = f32(7.9)
+"""Tangent of the angle, 83 degrees, between the image plane and the steepest surface whose normal is taken from the
+readings beside a pixel; steeper ones are depth edges. Sensors give no reading beyond 84 degrees."""
 UNKNOWN_COSINE = f32(0.3)
 """Cosine of the angle of incidence that is assumed at depth edges, where it is not known."""
 
@@ -104,8 +107,7 @@ def reading_weight(z, left, right, up, down, x, y, fx, by_rows, best, noise):
     gu, gv = half * fx * (right - left), by_rows * (down - up)
     nz = z + x * gu + y * gv
     cosine = z / sqrt((gu * gu + gv * gv + nz * nz) * (x * x + y * y + one))
-    step = max(abs(left - right), abs(up - down))
-    smooth = (min(min(left, right), min(up, down)) > zero) & (step < f32(0.03) * z)
+    smooth = (min(min(left, right), min(up, down)) > zero) & (max(abs(gu), abs(gv)) < STEEPEST * z)
     cosine = cosine if smooth else UNKNOWN_COSINE
     weight = best * cosine * (noise.base + noise.scale) / sigma(z, noise)
     return min(max(weight + half, one), f32(16)) if z > zero else zero

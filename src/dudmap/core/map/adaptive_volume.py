@@ -12,14 +12,13 @@ from numpy.typing import NDArray
 
 from dudmap.config import SensorConfig, VolumeConfig
 from dudmap.core.backends.cpu import adaptive_raycasting
-from dudmap.core.backends.parameters import DepthView, RaycastParameters, RaycastResult
+from dudmap.core.backends.parameters import DepthView, MeshParameters, RaycastParameters, RaycastResult
 from dudmap.core.backends.spec import Backend
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.adaptive_mesh import extract_groups
-from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.fine_blocks import FineBlocks, two_levels
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
 from dudmap.core.map.map_file import MapContent
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -89,16 +88,13 @@ class AdaptiveVolume(TsdfVolume):
         self._integrators, self._refinements = [], []
         for number in range(self.config.adaptive_levels):
             coarse = self.voxel_size / 2**number
-            scale = StorageScale.of(self._halved(coarse / 2), self.sensor, depth_max)
-            band = scale.band._replace(limit=self.band.limit)
-            integrator = Integrator(self._halved(coarse / 2), scale, depth_max, self.backend)
-            integrator.parameters = integrator.parameters._replace(band=band, sdf_unit=self.sdf_unit)
-            self._integrators.append(integrator)
+            halved = self.config.model_copy(update={"voxel_size": coarse / 2})
+            parameters = fusion_parameters(halved, self.sensor, depth_max)
+            band = parameters.band._replace(limit=self.band.limit)
+            parameters = parameters._replace(band=band, sdf_unit=self.sdf_unit)
+            self._integrators.append(Integrator(halved, parameters, self.backend))
             parents = self.band if number == 0 else self._integrators[number - 1].parameters.band
             self._refinements.append(Refinement(self.config, self.sensor, parents, coarse, self.sdf_unit))
-
-    def _halved(self, voxel_size: float) -> VolumeConfig:
-        return self.config.model_copy(update={"voxel_size": voxel_size})
 
     def _empty(self) -> None:
         super()._empty()
@@ -106,20 +102,6 @@ class AdaptiveVolume(TsdfVolume):
         for n in reversed(range(self.config.adaptive_levels)):
             levels.insert(0, FineBlocks(self.voxel_size / 2 ** (n + 1), self._new_blocks(), *levels[:1]))
         self.levels = levels
-
-    @property
-    def all_blocks(self) -> BlockTree:
-        """See ``TsdfVolume.all_blocks``."""
-        return BlockTree(self.blocks, self.levels)
-
-    @property
-    def view_bytes(self) -> int:
-        """See ``TsdfVolume.view_bytes``."""
-        slots, count = self.window.near, len(self.window.near)
-        for level in self.levels:
-            slots = level.children_of(slots)
-            count += len(slots)
-        return count * self.blocks.slot_bytes
 
     @property
     def num_bytes(self) -> int:
@@ -202,25 +184,6 @@ class AdaptiveVolume(TsdfVolume):
         centres = (blocks.slot_coords[slots] + 0.5) * (8 * voxel_size)
         return (centres - T_world_camera[:3, 3]) @ T_world_camera[:3, 2]
 
-    def take_over(self, other: TsdfVolume) -> None:
-        """See ``TsdfVolume.take_over``."""
-        assert isinstance(other, AdaptiveVolume)
-        super().take_over(other)
-        self.levels = other.levels
-
-    def for_camera(
-        self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
-    ) -> "AdaptiveVolume":
-        """See ``TsdfVolume.for_camera``."""
-        other = AdaptiveVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
-        other.blocks, other._frame_number, other.levels = self.blocks, self._frame_number, self.levels
-        other.pager = self.pager or other.pager
-        return other
-
-    @property
-    def _num_levels(self) -> int:
-        return 1 + len(self.levels)
-
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: PagedMap, number: int) -> None:
         """See ``PagedMap``; where the other map is not refined, a level takes those of the next coarser one."""
         assert isinstance(other, AdaptiveVolume)
@@ -245,21 +208,9 @@ class AdaptiveVolume(TsdfVolume):
             self.grid, two_levels(self.levels), T_world_camera, camera.intrinsics, camera.shape, parameters
         )
 
-    def extract_mesh(self, min_weight: int | None = None) -> Mesh:
-        """Triangles of the zero level by dual contouring, where every cell corner has at least ``min_weight``
-        observations.
-
-        Raises:
-            MapError: The map is empty.
-        """
-        if self.is_empty:
-            raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
-        if self.pager is not None:
-            return joined(list(self.extract_pieces(min_weight)))
-        slots = self.active_slots
-        parameters = self._mesh_parameters(min_weight)
-        meshes = extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)
-        return meshes[0]
+    def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
+        """See ``TsdfVolume._extract``; by dual contouring."""
+        return extract_groups(self.blocks, self.levels, slots, np.zeros(len(slots), np.int64), parameters)[0]
 
     def extract_chunks(
         self, slots: NDArray[np.int32], chunks: NDArray[np.int64], min_weight: int | None = None

@@ -4,19 +4,20 @@ The blocks are exchanged in cubes of 16x16x16 of them, called regions, as in Nie
 """
 
 import weakref
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.map import morton
+from dudmap.core.map.block_records import COLUMNS, blobs_of, records_of
 from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.memory_limit import MemoryLimit
-from dudmap.core.map.region_store import RegionStore
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
+from dudmap.core.scratch_store import ScratchStore
 
 REGION_BITS = 4
 REGION = 1 << REGION_BITS
@@ -32,14 +33,14 @@ RETRY_AFTER = 100
 Region = tuple[int, int, int]
 
 
-@dataclass(frozen=True)
-class _Away:
-    """What is known of a region in the store: numbers of blocks, of those among them that own voxels, and of the finer
-    blocks inside these."""
+class Away(NamedTuple):
+    """What is known of a region in the store: a number that is another for each content, and the numbers of its blocks,
+    of those among them that own voxels, and of the finer blocks inside these."""
 
+    serial: int
     blocks: int
     voxel_blocks: int
-    finer: int = 0
+    finer: int
 
 
 class BlockPager:
@@ -60,7 +61,7 @@ class BlockPager:
     def __init__(self, max_blocks: int | MemoryLimit) -> None:
         self.max_blocks = max_blocks
         self.failure = ""
-        self._store: RegionStore | None = None
+        self._store: ScratchStore | None = None
         self._executor: ThreadPoolExecutor | None = None
         self._next_serial = 0
         self.clear()
@@ -70,11 +71,10 @@ class BlockPager:
         if self._store is not None:
             self._store.close()
         self._store = None
-        self._away: dict[Region, _Away] = {}
+        self._away: dict[Region, Away] = {}
         self._writing: dict[Region, tuple[BlockRecords, Future[None]]] = {}
         self._reading: dict[Region, Future[BlockRecords]] = {}
-        self._unchanged_since: dict[Region, int] = {}
-        self._serial: dict[Region, int] = {}
+        self._returned: dict[Region, tuple[int, int]] = {}  # frame number and serial of what the store also holds
         self._archived: set[Region] = set()
         self._archive: Callable[[Region], BlockRecords] | None = None
         self._middle = np.zeros(3)
@@ -91,11 +91,6 @@ class BlockPager:
         """Blocks with voxels in the store."""
         return sum(away.voxel_blocks for away in self._away.values())
 
-    @property
-    def num_free_blocks(self) -> int:
-        """Blocks without voxels in the store."""
-        return sum(away.blocks - away.voxel_blocks for away in self._away.values())
-
     def is_away(self, coords: NDArray[np.integer]) -> NDArray[np.bool_]:
         """Whether the region of each block (n, 3) is in the store."""
         if not self._away:
@@ -104,16 +99,9 @@ class BlockPager:
         away = np.array([_key(region) in self._away for region in regions])
         return away[which.reshape(-1)]
 
-    @property
-    def stored_regions(self) -> Iterable[Region]:
+    def away(self) -> dict[Region, Away]:
         """The regions in the store."""
-        return self._away.keys()
-
-    def away(self) -> dict[Region, tuple[int, int, int, int]]:
-        """Of each region in the store: a number that is another for each content, and its numbers of blocks, of blocks
-        with voxels and of finer blocks."""
-        away = self._away.items()
-        return {region: (self._serial[region], one.blocks, one.voxel_blocks, one.finer) for region, one in away}
+        return self._away
 
     def records(self, region: Region) -> BlockRecords:
         """Content of a region in the store.
@@ -128,17 +116,14 @@ class BlockPager:
     ) -> None:
         """Take regions from an archive, which has them as long as they have not come back into memory."""
         self.clear()
-        self._away = {region: _Away(*counts) for region, (_, *counts) in away.items()}
-        self._serial = {region: serial for region, (serial, *_) in away.items()}
+        self._away = {region: Away(*numbers) for region, numbers in away.items()}
         self._archived, self._archive = set(away), archive
 
     def changed(self, first: NDArray[np.integer]) -> None:
         """Note that the region that begins at a block (3,) was changed otherwise than by a frame."""
-        self._unchanged_since.pop(_key(first >> REGION_BITS), None)
+        self._returned.pop(_key(first >> REGION_BITS), None)
 
-    def focus(
-        self, blocks: VoxelBlocks | BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int
-    ) -> None:
+    def focus(self, blocks: BlockTree, low: NDArray[np.integer], high: NDArray[np.integer], frame_number: int) -> None:
         """Have all blocks of the box from ``low`` up to ``high`` (3,), and those ``MARGIN`` beside it, in memory.
 
         Regions farther away leave if there are too many blocks, and those in the direction of motion are read ahead.
@@ -168,7 +153,7 @@ class BlockPager:
         ranges = (range(a, b + 1) for a, b in zip(_key(first), _key(last), strict=True))
         return [(x, y, z) for x, y, z in product(*ranges) if (x, y, z) in self._away]
 
-    def _bring_back(self, blocks: VoxelBlocks | BlockTree, region: Region, frame_number: int) -> None:
+    def _bring_back(self, blocks: BlockTree, region: Region, frame_number: int) -> None:
         if region in self._writing:
             records, _ = self._writing.pop(region)  # it may not get written, so that it counts as changed
         else:
@@ -176,7 +161,7 @@ class BlockPager:
             # one that waits behind regions to be written is read at once
             records = self._read(region) if read is None or read.cancel() else read.result()
             if region not in self._archived:
-                self._unchanged_since[region] = frame_number
+                self._returned[region] = frame_number, self._away[region].serial
         del self._away[region]
         self._archived.discard(region)
         blocks.insert(records, frame_number + 1)  # as the next frame: followers of the map copy them
@@ -195,11 +180,15 @@ class BlockPager:
     def _read(self, region: Region) -> BlockRecords:
         if self._archive is not None and region in self._archived:
             return self._archive(region)
-        return self._stored.read(region)
+        parts = self._stored.read(str(region))
+        return records_of([parts[n : n + len(COLUMNS)] for n in range(0, len(parts), len(COLUMNS))])
+
+    def _write(self, region: Region, records: BlockRecords) -> None:
+        self._stored.write(str(region), [blob for level in blobs_of(records) for blob in level])
 
     def _make_room(
         self,
-        blocks: VoxelBlocks | BlockTree,
+        blocks: BlockTree,
         first: NDArray[np.integer],
         last: NDArray[np.integer],
         frame_number: int,
@@ -230,14 +219,14 @@ class BlockPager:
             self._send_all_away(blocks, keys, region_of, leaving, frame_number)
             blocks.remove(np.flatnonzero(leaving[region_of]), frame_number + 1)
 
-    def page_out(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
+    def page_out(self, blocks: BlockTree, frame_number: int) -> None:
         """Move all regions to the store; empty blocks must take the place of ``blocks``."""
         keys, region_of = _regions_of_entries(blocks)
         self._send_all_away(blocks, keys, region_of, np.ones(len(keys), dtype=bool), frame_number)
 
     def _send_all_away(
         self,
-        blocks: VoxelBlocks | BlockTree,
+        blocks: BlockTree,
         keys: NDArray[np.integer],
         region_of: NDArray[np.integer],
         leaving: NDArray[np.bool_],
@@ -249,24 +238,22 @@ class BlockPager:
         voxel_blocks = np.bincount(region_of, blocks.slot_of[: blocks.num_entries] >= 0, minlength=len(keys))
         finer = np.bincount(region_of, blocks.owned_slots(), minlength=len(keys)) - voxel_blocks
         for n in np.flatnonzero(leaving):
-            entries = order[ends[n - 1] if n else 0 : ends[n]]
-            self._away[_key(keys[n])] = _Away(len(entries), int(voxel_blocks[n]), int(finer[n]))
-            self._send_away(blocks, _key(keys[n]), entries, frame_number)
+            region, entries = _key(keys[n]), order[ends[n - 1] if n else 0 : ends[n]]
+            returned_in, serial = self._returned.pop(region, (-1, 0))
+            if returned_in != frame_number:  # the store does not hold it as it is
+                serial = self._next_serial = self._next_serial + 1
+                self._have_written(region, blocks, entries)
+            self._away[region] = Away(serial, len(entries), int(voxel_blocks[n]), int(finer[n]))
 
-    def _send_away(
-        self, blocks: VoxelBlocks | BlockTree, region: Region, entries: NDArray[np.integer], frame_number: int
-    ) -> None:
-        """Have a region written, unless the store holds it as it is; its entries (n,) are removed by the caller."""
-        if self._unchanged_since.pop(region, -1) == frame_number:
-            return
-        self._serial[region] = self._next_serial = self._next_serial + 1
+    def _have_written(self, region: Region, blocks: BlockTree, entries: NDArray[np.integer]) -> None:
+        """Have a region written; its entries (n,) are removed by the caller."""
         for pending in list(self._writing)[: max(len(self._writing) - MAX_PENDING + 1, 0)]:
             if self._writing[pending][1].exception() is None:  # waits; one that failed is taken back later
                 del self._writing[pending]
         records = blocks.records(entries)
-        self._writing[region] = records, self._submit(self._stored.write, region, records)
+        self._writing[region] = records, self._submit(self._write, region, records)
 
-    def _settle(self, blocks: VoxelBlocks | BlockTree, frame_number: int) -> None:
+    def _settle(self, blocks: BlockTree, frame_number: int) -> None:
         """Forget what has been written; take back what could not be."""
         for region, (records, written) in list(self._writing.items()):
             if not written.done():
@@ -280,9 +267,9 @@ class BlockPager:
                 self.failure = ""
 
     @property
-    def _stored(self) -> RegionStore:
+    def _stored(self) -> ScratchStore:
         if self._store is None:
-            self._store = RegionStore()
+            self._store = ScratchStore("blocks of the map")
         return self._store
 
     def _submit(self, work, *arguments) -> Future:  # noqa: ANN001, ANN002 - as of Executor.submit
@@ -292,15 +279,15 @@ class BlockPager:
         return self._executor.submit(work, *arguments)
 
 
-def regions_of(blocks: VoxelBlocks, pager: BlockPager | None) -> list[Region]:
+def regions_of(blocks: BlockTree, pager: BlockPager | None) -> list[Region]:
     """All regions of a map, in Morton order, so that neighbours follow each other."""
     near, _ = _regions_of_entries(blocks)
-    stored = np.array(list(() if pager is None else pager.stored_regions), np.int64).reshape(-1, 3)
+    stored = np.array(list(() if pager is None else pager.away()), np.int64).reshape(-1, 3)
     regions = np.unique(np.concatenate([near, stored]), axis=0)
     return [_key(region) for region in regions[np.argsort(morton.encode(regions))]]
 
 
-def _regions_of_entries(blocks: VoxelBlocks | BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
+def _regions_of_entries(blocks: BlockTree) -> tuple[NDArray[np.int64], NDArray[np.intp]]:
     """Regions (r, 3) with blocks in memory, and the number of the region of each entry (n,)."""
     x, y, z = (blocks.coords[: blocks.num_entries].T.astype(np.int64) >> REGION_BITS) + (1 << 15)
     packed, region_of = np.unique((x << 32) | (y << 16) | z, return_inverse=True)

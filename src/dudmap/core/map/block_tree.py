@@ -26,7 +26,7 @@ class BlockTree:
     @property
     def parents(self) -> list[VoxelBlocks]:
         """The next coarser level of each finer one."""
-        return [self.blocks, *(level.blocks for level in self.levels[:-1])]
+        return [self.blocks, *(level.blocks for level in self.levels)][: len(self.levels)]
 
     @property
     def coords(self) -> NDArray[np.int32]:
@@ -60,13 +60,13 @@ class BlockTree:
 
     def owned_slots(self) -> NDArray[np.int64]:
         """Number (entries,) of slots of each entry and of all blocks inside it."""
-        inside: NDArray[np.int64] | int = 0
+        finest = self.levels[-1].blocks if self.levels else self.blocks
+        inside = np.zeros(len(finest.entry_of), np.int64)
         for level, parents in zip(self.levels[::-1], self.parents[::-1], strict=True):
             active = level.blocks.active_slots
-            own = 1 + (inside[active] if isinstance(inside, np.ndarray) else np.zeros(len(active), np.int64))
-            inside = np.bincount(level.parents[active], own, minlength=len(parents.entry_of)).astype(np.int64)
+            inside = np.bincount(level.parents[active], 1 + inside[active], minlength=len(parents.entry_of))
         slots = self.blocks.slot_of[: self.blocks.num_entries]
-        return np.where(slots >= 0, 1 + (inside[slots] if isinstance(inside, np.ndarray) else 0), 0)
+        return np.where(slots >= 0, 1 + inside[slots].astype(np.int64), 0)
 
     def records(self, entries: NDArray[np.integer], *, by_slot: bool = False) -> BlockRecords:
         """Copies of the blocks of entries (n,), see ``VoxelBlocks.records``, and of all blocks inside them."""

@@ -1,7 +1,5 @@
 """Fusion of a depth image into the map: allocate, average (eq. 4.18-4.23), carve, remember free space."""
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -21,31 +19,23 @@ FRONTAL_WEIGHT = 4.0
 """Weight of a frontal reading at one metre, weighted by angle and noise: four steps down to the least weight 1."""
 
 
-@dataclass(frozen=True)
-class StorageScale:
-    """Discretisation of the map.
-
-    Attributes:
-        voxel_size: Edge of a voxel, metres.
-        band: Truncation band around a reading.
-        sdf_unit: Metres per step of a stored distance.
-        depth_unit: Metres per step of a reading on its way into the voxels.
-    """
-
-    voxel_size: float
-    band: TruncationBand
-    sdf_unit: float
-    depth_unit: float
-
-    @classmethod
-    def of(cls, config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> "StorageScale":
-        """Scale of a map whose readings end at ``depth_max`` metres."""
-        front = config.truncation_voxels * config.voxel_size
-        behind = config.truncation_behind_voxels * config.voxel_size
-        limit = max(MIN_LIMIT, front, behind)
-        noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
-        band = TruncationBand(front, behind, config.truncation_noise, limit, noise)
-        return cls(config.voxel_size, band, limit / 32767, depth_max / 65534)
+def fusion_parameters(config: VolumeConfig, sensor: SensorConfig, depth_max: float) -> FusionParameters:
+    """Parameters of a map whose readings end at ``depth_max`` metres."""
+    front = config.truncation_voxels * config.voxel_size
+    behind = config.truncation_behind_voxels * config.voxel_size
+    limit = max(MIN_LIMIT, front, behind)
+    noise = SensorNoise(sensor.sigma_base, sensor.sigma_scale)
+    return FusionParameters(
+        band=TruncationBand(front, behind, config.truncation_noise, limit, noise),
+        voxel_size=config.voxel_size,
+        sdf_unit=limit / 32767,
+        depth_unit=depth_max / 65534,
+        max_weight=config.max_weight,
+        max_readings=config.max_readings,
+        carve_rate=config.carve_rate if config.carving else 1,
+        depth_min=DEPTH_MIN,
+        depth_max=depth_max,
+    )
 
 
 class Integrator:
@@ -53,26 +43,12 @@ class Integrator:
 
     Args:
         config: Weights and carving.
-        scale: Discretisation of the map.
-        depth_max: Farthest reading, metres.
+        parameters: Those of the fusion.
         backend: Compute device.
     """
 
-    def __init__(self, config: VolumeConfig, scale: StorageScale, depth_max: float, backend: Backend) -> None:
-        self.config = config
-        self.scale = scale
-        self.backend = backend
-        self.parameters = FusionParameters(
-            band=scale.band,
-            voxel_size=scale.voxel_size,
-            sdf_unit=scale.sdf_unit,
-            depth_unit=scale.depth_unit,
-            max_weight=config.max_weight,
-            max_readings=config.max_readings,
-            carve_rate=config.carve_rate if config.carving else 1,
-            depth_min=DEPTH_MIN,
-            depth_max=depth_max,
-        )
+    def __init__(self, config: VolumeConfig, parameters: FusionParameters, backend: Backend) -> None:
+        self.config, self.parameters, self.backend = config, parameters, backend
 
     def integrate(
         self,
@@ -124,7 +100,7 @@ class Integrator:
         assert window.origin is not None
         return VoxelGrid(
             window.mirror, window.shape, window.origin, blocks.geometry_mirror, blocks.colors_mirror,
-            blocks.slot_coords, blocks.free_count, self.scale.voxel_size, self.scale.sdf_unit,
+            blocks.slot_coords, blocks.free_count, self.parameters.voxel_size, self.parameters.sdf_unit,
         )  # fmt: skip
 
     def _local_grid(self, blocks: VoxelBlocks, window: BlockWindow) -> VoxelGrid:
@@ -150,7 +126,7 @@ class Integrator:
         """Weights (H, W) of the readings: 1, or by the angle of incidence and the sensor's noise (eq. 4.20)."""
         if self.config.weighting == "constant":
             return np.ones(depth.shape, dtype=np.uint8)
-        return self.backend.reading_weights(depth, camera.intrinsics, self.scale.band.noise, FRONTAL_WEIGHT)
+        return self.backend.reading_weights(depth, camera.intrinsics, self.parameters.band.noise, FRONTAL_WEIGHT)
 
     def _average(
         self,

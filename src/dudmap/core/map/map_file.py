@@ -98,17 +98,8 @@ def read_map(path: str | Path) -> MapContent:
     """
     try:
         with open_arrays(path) as data:
-            if str(data["format"]) != FORMAT:
-                raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
-            if not 0 < data["depth_max"] <= LARGEST_DEPTH:
-                raise ValueError(f"its depths reach {data['depth_max']} m; expected up to {LARGEST_DEPTH:g} m")
-            fx, fy, cx, cy = (float(value) for value in data["camera"])
-            width, height = (int(value) for value in data["image"])
             return MapContent(
-                Camera(fx, fy, cx, cy, width, height),
-                VolumeConfig.model_validate_json(str(data["config"])),
-                SensorConfig.model_validate_json(str(data["sensor"])),
-                float(data["depth_max"]),
+                *read_parameters(data, path),
                 VoxelBlocks.restored(
                     data["coords"], data["free_count"], data["entries"], data["geometry"], data["colors"]
                 ),
@@ -116,6 +107,24 @@ def read_map(path: str | Path) -> MapContent:
             )
     except DAMAGE as error:
         raise MapError(f"{path} is not a readable map file: {error}") from error
+
+
+def read_parameters(data: Mapping[str, NDArray], path: str | Path) -> tuple[Camera, VolumeConfig, SensorConfig, float]:
+    """Camera, configuration, sensor and largest depth (m) of an open map file.
+
+    Raises:
+        MapError: The file is a map of another version.
+        ValueError: The values are not those of a map.
+    """
+    if str(data["format"]) != FORMAT:
+        raise MapError(f"{path} is a map of format {str(data['format'])!r}; this version reads {FORMAT!r}")
+    if not 0 < data["depth_max"] <= LARGEST_DEPTH:
+        raise ValueError(f"its depths reach {data['depth_max']} m; expected up to {LARGEST_DEPTH:g} m")
+    fx, fy, cx, cy = (float(value) for value in data["camera"])
+    width, height = (int(value) for value in data["image"])
+    config = VolumeConfig.model_validate_json(str(data["config"]))
+    sensor = SensorConfig.model_validate_json(str(data["sensor"]))
+    return Camera(fx, fy, cx, cy, width, height), config, sensor, float(data["depth_max"])
 
 
 def _read_levels(data: Mapping[str, NDArray]) -> list[VoxelBlocks]:

@@ -37,7 +37,7 @@ class MemoryLimit:
                 f"first frame, so that at least {(taken + LEAST) / 1e6:.0f} MB are needed"
             )
 
-    def __call__(self, blocks: VoxelBlocks | BlockTree) -> int:
+    def __call__(self, blocks: BlockTree) -> int:
         """Largest number of blocks with voxels, of all levels, that a map may have in memory now."""
         spare = SAFE_SHARE * self.limit - resident_bytes()
         if spare < 0 and _return_freed():

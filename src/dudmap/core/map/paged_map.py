@@ -6,12 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.config import VolumeConfig
-from dudmap.core.backends.spec import Backend
 from dudmap.core.map.block_pager import REGION, BlockPager, regions_of
 from dudmap.core.map.block_tree import BlockTree
 from dudmap.core.map.block_window import BlockWindow
 from dudmap.core.map.fine_blocks import FineBlocks
-from dudmap.core.map.integrator import Integrator
 from dudmap.core.map.voxel_blocks import BlockRecords, VoxelBlocks
 
 
@@ -19,21 +17,19 @@ class PagedMap:
     """What ``TsdfVolume`` does with its blocks as a whole, wherever they are; its attributes are described there."""
 
     config: VolumeConfig
-    backend: Backend
     levels: Sequence[FineBlocks]
     pager: BlockPager | None
     block_size: float
     blocks: VoxelBlocks
     window: BlockWindow
-    _integrator: Integrator
     _window_cells: int
     _frame_number: int
     _left: NDArray[np.int64] | None  # where the window was when all blocks left the memory
 
     @property
-    def all_blocks(self) -> VoxelBlocks | BlockTree:
+    def all_blocks(self) -> BlockTree:
         """The blocks in memory with all finer ones."""
-        return self.blocks
+        return BlockTree(self.blocks, self.levels)
 
     @property
     def num_blocks(self) -> int:
@@ -43,7 +39,11 @@ class PagedMap:
     @property
     def view_bytes(self) -> int:
         """Memory of the voxels around the view."""
-        return len(self.window.near) * self.blocks.slot_bytes
+        slots, count = self.window.near, len(self.window.near)
+        for level in self.levels:
+            slots = level.children_of(slots)
+            count += len(slots)
+        return count * self.blocks.slot_bytes
 
     def _new_blocks(self) -> VoxelBlocks:
         """Empty blocks, with room for as many as will be in memory."""
@@ -71,7 +71,7 @@ class PagedMap:
 
     def _visited_regions(self) -> Iterator[NDArray[np.int32]]:
         """First block (3,) of each region, which is in memory, with all that touch it, until the next is asked for."""
-        for region in regions_of(self.blocks, self.pager):
+        for region in regions_of(self.all_blocks, self.pager):
             first = np.array(region, dtype=np.int32) * REGION
             self._bring(first, first + REGION)
             yield first
@@ -93,7 +93,7 @@ class PagedMap:
         """
         assert other.config == self.config
         number = self._frame_number + 1
-        for level in range(self._num_levels):
+        for level in range(1 + len(self.levels)):
             for first in self._visited_regions():
                 other._bring(first, first + REGION)
                 slots = self.blocks.slot_of[self.blocks.entries_in(first, first + REGION)]
@@ -103,10 +103,6 @@ class PagedMap:
                 if self.pager is not None:
                     self.pager.changed(first)
         self._frame_number = number
-
-    @property
-    def _num_levels(self) -> int:
-        return 1
 
     def _take_level_colors(self, level: int, slots: NDArray[np.int32], other: "PagedMap", number: int) -> None:
         """Replace the colours of a level, 0 is the coarsest, within blocks (n,) of the coarsest one, as frame

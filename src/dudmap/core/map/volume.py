@@ -27,7 +27,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh, joined
 from dudmap.core.map.block_pager import REGION, BlockPager
 from dudmap.core.map.fine_blocks import FineBlocks
-from dudmap.core.map.integrator import DEPTH_MIN, Integrator, StorageScale
+from dudmap.core.map.integrator import DEPTH_MIN, Integrator, fusion_parameters
 from dudmap.core.map.map_file import read_map, write_map
 from dudmap.core.map.memory_limit import MemoryLimit
 from dudmap.core.map.paged_map import PagedMap
@@ -89,9 +89,9 @@ class TsdfVolume(PagedMap):
         self.sensor = sensor or SensorConfig()
         self.depth_max = depth_max
         self.backend: Backend = backend or CpuBackend()
-        scale = StorageScale.of(self.config, self.sensor, depth_max)
-        self._integrator = Integrator(self.config, scale, depth_max, self.backend)
-        self.voxel_size, self.sdf_unit, self.band = scale.voxel_size, scale.sdf_unit, scale.band
+        parameters = fusion_parameters(self.config, self.sensor, depth_max)
+        self._integrator = Integrator(self.config, parameters, self.backend)
+        self.voxel_size, self.sdf_unit, self.band = parameters.voxel_size, parameters.sdf_unit, parameters.band
         self.block_size = BLOCK * self.voxel_size
         self.truncation, self.truncation_behind = self.band.front, self.band.behind
         half = np.array([max(camera.cx, camera.width - camera.cx) / camera.fx,
@@ -200,15 +200,16 @@ class TsdfVolume(PagedMap):
         assert (other.config, other.sensor, other.depth_max) == (self.config, self.sensor, self.depth_max)
         self.blocks, self.window, self.pager = other.blocks, other.window, other.pager
         self._frame_number, self.map_id, self._left = other._frame_number, other.map_id, other._left
+        self.levels = other.levels
 
     def for_camera(
         self, camera: Camera, backend: Backend | None = None, max_blocks: int | MemoryLimit | None = None
     ) -> "TsdfVolume":
         """This map for frames of another camera, on another device if one is given. It takes over the blocks: this
         volume must not be used afterwards."""
-        other = TsdfVolume(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
+        other = type(self)(camera, self.config, self.sensor, self.depth_max, backend or self.backend, max_blocks)
         other.pager, other._frame_number = self.pager or other.pager, self._frame_number
-        other.blocks = self.blocks
+        other.blocks, other.levels = self.blocks, self.levels
         return other
 
     def look_at(self, T_world_camera: NDArray[np.float64]) -> None:
@@ -285,13 +286,13 @@ class TsdfVolume(PagedMap):
             raise MapError("the map is empty: no frame has been integrated, so there is no surface to extract")
         if self.pager is not None:
             return joined(list(self.extract_pieces(min_weight)))
-        slots, blocks = self.active_slots, self.blocks
-        return Mesh(
-            *meshing.extract(
-                blocks.geometry, blocks.colors, slots, blocks.slot_coords, blocks.neighbours(slots),
-                self._mesh_parameters(min_weight),
-            )
-        )  # fmt: skip
+        return self._extract(self.active_slots, self._mesh_parameters(min_weight))
+
+    def _extract(self, slots: NDArray[np.int32], parameters: MeshParameters) -> Mesh:
+        """Mesh of blocks (n,) that are in memory."""
+        blocks = self.blocks
+        neighbours = blocks.neighbours(slots)
+        return Mesh(*meshing.extract(blocks.geometry, blocks.colors, slots, blocks.slot_coords, neighbours, parameters))
 
     def extract_pieces(self, min_weight: int | None = None) -> Iterator[Mesh]:
         """The mesh region by region, in Morton order; vertices at the borders of regions belong to each of them.

@@ -262,10 +262,6 @@ class VoxelBlocks:
         self.fused[slots] = records.fused
         return slots
 
-    def owned_slots(self) -> NDArray[np.int64]:
-        """Number (entries,) of slots that each entry owns."""
-        return (self.slot_of[: self.num_entries] >= 0).astype(np.int64)
-
     def slots_at(self, coords: NDArray[np.int32]) -> NDArray[np.int32]:
         """Slots (n,) int32 of the blocks at coordinates (n, 3) int32; -1 where there are no voxels."""
         entries = hashing.find_all(self.table, self.coords, coords)

@@ -15,7 +15,7 @@ from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry.alignment import agree
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.volume import TsdfVolume
-from dudmap.core.places.frame_file import FilePlace, FrameFile
+from dudmap.core.scratch_store import ScratchStore
 
 DEPTH_UNIT = 0.0005
 """Step of the stored depth, metres. The quantisation error, 0.29 steps rms, is 0.14 mm: a seventh of ``sigma_base``."""
@@ -96,10 +96,10 @@ class FrameStore:
         self.replacements: list[int] = []
         self._next_serial = 0
         self.archived: Callable[[int], EncodedFrame] | None = None
-        self._places: list[FilePlace | None] = []  # None for an archived frame
-        self._file = FrameFile()
+        self._first_own = 0  # serial; the frames before it are archived
+        self._file: ScratchStore | None = None
         self._encoder: ThreadPoolExecutor | None = None
-        self._pending: deque[Future[EncodedFrame]] = deque()
+        self._pending: deque[tuple[int, Future[EncodedFrame]]] = deque()  # by serial
 
     @classmethod
     def of(cls, config: Config, camera: Camera) -> "FrameStore | None":
@@ -148,8 +148,8 @@ class FrameStore:
         self.submaps.append(submap)
         self.color_timestamps.append(frame.color_timestamp)
         self.serials.append(self._next_serial)
+        self._pending.append((self._next_serial, self._encoder.submit(_encoded, frame, static, exposure)))
         self._next_serial += 1
-        self._pending.append(self._encoder.submit(_encoded, frame, static, exposure))
         self._write(MAX_PENDING)
         return True
 
@@ -173,14 +173,14 @@ class FrameStore:
         self._drop(number)
 
     def _drop(self, number: int) -> None:
-        if number >= len(self._places):  # it is being encoded
+        serial = self.serials[number]
+        if any(serial == pending for pending, _ in self._pending):
             self._write(0)
-        place, serial = self._places[number], self.serials[number]
-        if place is not None:
-            self._file.release(place)
+        if self._file is not None and serial >= self._first_own:
+            self._file.remove(str(serial))
         self.links.pop(serial, None)
         columns = self.timestamps, self.color_timestamps, self.Ts_world_camera, self.counts, self.submaps, self.serials
-        for column in (*columns, self._places):
+        for column in columns:
             del column[number]
 
     def timeline(self, numbers: Sequence[int]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -214,17 +214,17 @@ class FrameStore:
     def encoded(self, number: int) -> EncodedFrame:
         """The files of a stored frame."""
         self._write(0)
-        place = self._places[number]
-        if place is None:
+        serial = self.serials[number]
+        if serial < self._first_own:
             assert self.archived is not None
-            return self.archived(self.serials[number])
-        depth, color, mask = self._file.read(place)
+            return self.archived(serial)
+        assert self._file is not None
+        depth, color, mask = self._file.read(str(serial))
         return depth, color, mask
 
     def continue_from(self, archived: Callable[[int], EncodedFrame]) -> None:
         """Take the frames, whose times and poses are set, from an archive."""
-        self.archived = archived
-        self._places = [None] * len(self)
+        self.archived, self._first_own = archived, self._next_serial
 
     def __iter__(self) -> Iterator[StoredFrame]:
         return (self[number] for number in range(len(self)))
@@ -252,9 +252,11 @@ class FrameStore:
 
     def _write(self, max_pending: int) -> None:
         """Write encoded frames to the file until at most this many are pending."""
-        while self._pending and (len(self._pending) > max_pending or self._pending[0].done()):
-            parts = self._pending.popleft().result()
-            self._places.append(self._file.write(parts))
+        while self._pending and (len(self._pending) > max_pending or self._pending[0][1].done()):
+            if self._file is None:
+                self._file = ScratchStore("fused frames")
+            serial, encoded = self._pending.popleft()
+            self._file.write(str(serial), encoded.result())
 
 
 def _encoded(frame: Frame, static: NDArray[np.bool_], exposure: tuple[float, float]) -> EncodedFrame:

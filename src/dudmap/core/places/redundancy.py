@@ -30,19 +30,6 @@ the fit 0.05, at a quarter of the width 0.10.
 """
 
 
-@dataclass(frozen=True, eq=False)
-class DescribedImage:
-    """A reduced image and the descriptors of its features.
-
-    Attributes:
-        image: (h, w) uint8, grey.
-        descriptors: (n, 128) float32.
-    """
-
-    image: NDArray[np.uint8]
-    descriptors: NDArray[np.float32]
-
-
 class SimilarityTest:
     """Compares the appearance of a frame with that of a reference frame.
 
@@ -55,7 +42,8 @@ class SimilarityTest:
         self.config = config or SimilarityConfig()
         self._sift = SiftExtractor(self.config.max_features)
         self._reference: NDArray[np.uint8] | None = None
-        self._cache: list[DescribedImage] = []  # at most the reference and the latest frame
+        # reduced images and the descriptors of their features: at most the reference and the latest frame
+        self._cache: list[tuple[NDArray[np.uint8], NDArray[np.float32]]] = []
 
     def set_reference(self, rgb: NDArray[np.uint8]) -> None:
         """Compare the frames that follow with this one, (H, W, 3)."""
@@ -69,21 +57,19 @@ class SimilarityTest:
         """Share in [0, 1] of the reference's features found again in a frame; 0 without enough features."""
         if self._reference is None:
             return 0.0
-        reference = self._describe(self._reference)
-        latest = self._describe(reduced_grey(rgb, self.config.image_width))
-        self._cache = [reference, latest]
-        if min(len(reference.descriptors), len(latest.descriptors)) < MIN_FEATURES:
+        images = self._reference, reduced_grey(rgb, self.config.image_width)
+        reference, latest = (self._descriptors(image) for image in images)
+        self._cache = [(images[0], reference), (images[1], latest)]
+        if min(len(reference), len(latest)) < MIN_FEATURES:
             return 0.0
-        matched = match_descriptors(reference.descriptors, latest.descriptors, self.config.ratio, mutual=False)
-        share = len(matched) / len(reference.descriptors)
+        share = len(match_descriptors(reference, latest, self.config.ratio, mutual=False)) / len(reference)
         return float(share ** np.interp(self._reference.shape[1] / rgb.shape[1], SCALES, EXPONENTS))
 
-    def _describe(self, image: NDArray[np.uint8]) -> DescribedImage:
-        """Descriptors of a reduced image, from the cache if it is one of the last two."""
-        for described in self._cache:
-            if np.array_equal(described.image, image):
-                return described
-        return DescribedImage(image, self._sift.extract(image).descriptors)
+    def _descriptors(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
+        """Descriptors (n, 128) of a reduced image, from the cache if it is one of the last two."""
+        known = (descriptors for other, descriptors in self._cache if np.array_equal(other, image))
+        found = next(known, None)
+        return self._sift.extract(image).descriptors if found is None else found
 
 
 @dataclass(eq=False)

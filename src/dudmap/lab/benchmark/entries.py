@@ -92,10 +92,12 @@ class Excerpt:
 
     def __init__(self, recording: "Sequence", frames: int | None = None) -> None:
         self.recording, self.timestamps = recording, recording.timestamps[:frames]
+        self.name, self.camera = recording.name, recording.camera
+        self.calibration, self.ground_truth = recording.calibration, recording.ground_truth
         self._frames: dict[int, Frame] = {}
         self._masks: dict[int, NDArray[np.bool_] | None] = {}
 
-    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - name, camera, calibration, ground truth, ...
+    def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - what else the recording has
         return getattr(self.recording, name)
 
     def __len__(self) -> int:

@@ -26,7 +26,7 @@ class Quantity(NamedTuple):
 
 
 QUANTITIES = (
-    Quantity("ate_rmse_m", "ATE RMSE, cm", 100, 0.2, 50, True, True, "{:.2g}"),
+    Quantity("ate_rmse_m", "ATE RMSE, mm", 1000, 2, 500, True, True, "{:.2g}"),
     Quantity("mask_iou_mean", "mask IoU", 1, 0, 1, False, False, "{:.2f}"),
     Quantity("ghost_area_m2", "ghost area, m²", 1, 0.5, 20, True, True, "{:.2g}"),
     Quantity("lost_share", "share of frames lost, %", 100, 0, 100, False, True, "{:.0f}"),
@@ -79,7 +79,7 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
         line[0].set_ylabel("mover coverage", fontsize=7)
     for axis in axes[-1]:
         axis.set_xlabel(sweep.x, fontsize=7)
-    copes_if = f"framed: ATE RMSE ≤ {100 * LARGEST_ATE:g} cm and no frame lost"
+    copes_if = f"framed: ATE RMSE ≤ {1000 * LARGEST_ATE:g} mm and no frame lost"
     figure.suptitle(f"Limit of dynamics; {copes_if}; *: error of the frames not lost", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
@@ -113,7 +113,7 @@ def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[st
 
 
 def cells_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:
-    """Markdown table of all cells: ATE in cm and share of lost frames, bold where the system copes."""
+    """Markdown table of all cells: ATE in mm and share of lost frames, bold where the system copes."""
     text = ""
     for sweep in sweeps:
         found = {(row["x"], row["coverage"], row["system"]): row for row in rows if row["sweep"] == sweep.name}
@@ -129,5 +129,5 @@ def cells_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str
 def _cell(row: Row) -> str:
     if row.get("ate_rmse_m") is None:
         return "no pose" if row.get("error") else ""
-    text = f"{100 * row['ate_rmse_m']:.1f}" + (f" ({100 * row['lost_share']:.0f} % lost)" if row["lost"] else "")
+    text = f"{1000 * row['ate_rmse_m']:.1f}" + (f" ({100 * row['lost_share']:.0f} % lost)" if row["lost"] else "")
     return f"**{text}**" if row["copes"] else text

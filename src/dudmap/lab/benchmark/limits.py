@@ -164,8 +164,10 @@ def _measure_chunk(chunk: list[ConditionJob]) -> Row:
 def measure_condition(condition: Condition, systems: Mapping[str, tuple[Config, Path]]) -> None:
     """Measure every system on the same frames of one condition, and write the figures to its file."""
     recording = Excerpt(condition.sequence()).load()
-    shares = np.array([recording.mask(index).mean() for index in range(len(recording))])
-    steps = np.linalg.norm(np.diff(recording.ground_truth.Ts_world_camera[:, :3, 3], axis=0), axis=1)
+    truth, masks = recording.ground_truth, [recording.mask(index) for index in range(len(recording))]
+    assert truth is not None  # all conditions are synthetic
+    shares = np.array([mask.mean() for mask in masks if mask is not None])
+    steps = np.linalg.norm(np.diff(truth.Ts_world_camera[:, :3, 3], axis=0), axis=1)
     speed = float(steps.sum() / (recording.timestamps[-1] - recording.timestamps[0]))
     scored = shares[shares > SCORED_COVERAGE]
     surfaces = _surfaces(condition.camera_path, condition.frames)

@@ -178,15 +178,15 @@ def report(rows: list[Row], seed: int, worst: int = 10) -> str:
     silent = [row for row in measured if is_silent_failure(row)]
     text = f"{len(rows)} random worlds of seed {seed}\n\n"
     if measured:
-        ates = 100 * np.array([row["ate_rmse_m"] for row in measured])
+        ates = 1000 * np.array([row["ate_rmse_m"] for row in measured])
         count, frames = (sum(row[key] for row in measured) for key in ("lost", "frames"))
         lost = f"{count} of {frames} in {sum(row['lost'] > 0 for row in measured)} worlds"
-        figures = [f"{value:.2f}" for value in (np.median(ates), np.percentile(ates, 95), ates.max())]
-        header = ["median ATE, cm", "95 % ATE, cm", "largest ATE, cm", "frames lost", "silent failures", "no result"]
+        figures = [f"{value:.1f}" for value in (np.median(ates), np.percentile(ates, 95), ates.max())]
+        header = ["median ATE, mm", "95 % ATE, mm", "largest ATE, mm", "frames lost", "silent failures", "no result"]
         text += grid(header, [[*figures, lost, str(len(silent)), str(len(failed))]], words=0)
     else:
         text += "No world gave a result.\n"
-    text += _listed("Silent failures (ATE > 5 cm, less than 20 % of the frames lost)", silent)
+    text += _listed("Silent failures (ATE > 50 mm, less than 20 % of the frames lost)", silent)
     text += _listed("Worst worlds", measured[:worst])
     return text + _listed("Worlds without a result", failed)
 
@@ -199,7 +199,7 @@ def _listed(title: str, rows: list[Row]) -> str:
     for row in rows:
         figure = row.get("error") or "no error could be computed"
         if row.get("ate_rmse_m") is not None:
-            figure = f"{100 * row['ate_rmse_m']:.2f} cm, {row['lost']} of {row['frames']} frames lost"
+            figure = f"{1000 * row['ate_rmse_m']:.1f} mm, {row['lost']} of {row['frames']} frames lost"
         again = f"dudmap benchmark random --seed {row['seed']} --only {row['world']}"
         text += f"\n- world {row['world']}: {figure}\n  - `{again}`\n  - `{synth_command(row['parameters'])}`\n"
     return text

@@ -21,8 +21,8 @@ class Column(NamedTuple):
 COLUMNS = (
     Column("frames", "frames"),
     Column("lost", "lost"),
-    Column("ate_rmse_m", "ATE RMSE, cm", 100, 2),
-    Column("rpe_trans_rmse_m_per_s", "RPE, cm/s", 100, 2),
+    Column("ate_rmse_m", "ATE RMSE, mm", 1000, 1),
+    Column("rpe_trans_rmse_m_per_s", "RPE, mm/s", 1000, 1),
     Column("rpe_rot_rmse_deg_per_s", "RPE, deg/s", 1, 2),
     Column("drift_rmse_m", "drift RMSE, mm", 1000, 1),
     Column("rotation_rmse_deg", "rotation RMSE, deg", 1, 2),

@@ -106,6 +106,6 @@ def spoilt_table(runs: list[SpoiltRun]) -> str:
     rows = []
     for run in runs:
         figures = [f"{run.tracked} of {run.frames}", str(run.doubtful)]
-        ate = f"{100 * run.ate:.1f}" if isinstance(run.ate, float) else "-"
+        ate = f"{1000 * run.ate:.1f}" if isinstance(run.ate, float) else "-"
         rows.append([run.name, "; ".join(run.warnings) or "nothing", *figures, ate])
-    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, cm"], rows, words=2)
+    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, mm"], rows, words=2)

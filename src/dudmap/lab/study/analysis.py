@@ -214,7 +214,7 @@ def describe_surface(report: Report, predicted: Prediction, heading: str) -> Non
     if not predicted.reasons:
         report.text("Nothing in the runs speaks against it; a confirmation is still needed.")
     else:
-        report.text("It must not be believed:")
+        report.text("Reasons to doubt it before it is measured:")
         report.items(predicted.reasons)
 
 

@@ -5,7 +5,7 @@ from importlib import import_module
 from typing import Any
 
 from dudmap.errors import ConfigError
-from dudmap.extras import extra
+from dudmap.extras import extra, install
 from dudmap.lab.study.executor import WorkerDied, set_threads
 from dudmap.lab.study.worker import Job, Outcome, perform
 
@@ -33,7 +33,7 @@ class RayExecutor:
         except (ConnectionError, ValueError) as error:
             raise ConfigError(f"there is no Ray cluster at {address}: {error}") from None
         except ImportError as error:  # ray:// needs the client of Ray
-            raise ConfigError(f"ray lacks its client ({error}); pip install 'dudmap[cluster]'") from None
+            raise ConfigError(f"ray lacks its client ({error}); {install('cluster')}") from None
         self._ray = ray
         self._perform: Any = ray.remote(num_cpus=CPUS_PER_RUN, max_retries=0)(
             _perform

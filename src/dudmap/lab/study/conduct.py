@@ -54,9 +54,9 @@ class Progress:
         return self.spent * self.cores / 3600
 
     def cost(self, price: float = 0.0) -> str:
-        """Core-hours so far and about how many the whole study needs, with their cost at a price per core-hour."""
+        """Time of one core so far and about how much the whole study needs, with its cost at a price per core-hour."""
         whole = self.core_hours / self.done * self.total if self.done else 0.0
-        hours = f"{self.core_hours:.3g} of about {whole:.3g} core-hours"
+        hours = f"{duration(3600 * self.core_hours)} of about {duration(3600 * whole)} of core time"
         return hours + (f", cost {self.core_hours * price:.2f} of about {whole * price:.2f}" if price else "")
 
     def describe(self, price: float = 0.0) -> str:

@@ -155,7 +155,7 @@ class Confirmation:
         return (
             f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({runs}), {part} the interval "
             f"{self.low:.4g} to {self.high:.4g}{wide}; {found} than the best point of the design on the same "
-            f"recordings, {self.best_point:.4g}. The model {'held' if self.held else 'did not hold'}."
+            f"recordings, {self.best_point:.4g}. The prediction was {'' if self.held else 'not '}confirmed."
         )
 
 

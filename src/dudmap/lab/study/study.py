@@ -124,11 +124,10 @@ def _confirm(
     try:
         measured, best = (usable(table, name, name in plan.log) for table in tables)
     except ConfigError as error:
-        return f"The model did not hold: a confirmation failed, {error}."
+        return f"The prediction was not confirmed: a confirmation failed, {error}."
     if len(measured) < len(at_optimum):
-        return (
-            f"The model did not hold: {len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed."
-        )
+        failed = f"{len(at_optimum) - len(measured)} of {len(at_optimum)} confirmation runs failed"
+        return f"The prediction was not confirmed: {failed}."
     return confirm(predicted.surface, predicted.best, measured[name].tolist(), best[name].tolist())
 
 
@@ -184,16 +183,17 @@ def write_report(
     analysis.describe_losses(report, table)
     analysis.describe_failures(report, table)
     report.save(out)
-    return outcome(predicted, confirmation) if effects is None else screening.summary(effects)
+    heading = analysis.heading_of(plan.responses[0], plan.responses[0] in plan.log)
+    return outcome(heading, predicted, confirmation) if effects is None else screening.summary(effects)
 
 
-def outcome(predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:
-    """What a study found, in words."""
+def outcome(heading: str, predicted: "Prediction | str", confirmation: "Confirmation | str") -> str:
+    """What a study found of the response with a heading, name and unit, in words."""
     from dudmap.lab.study.analysis import values_text
 
     if isinstance(predicted, str):
         return predicted
-    lines = [f"Predicted optimum: {predicted.best.predicted:.4g} at {values_text(predicted.point)}."]
+    lines = [f"{heading}: predicted optimum {predicted.best.predicted:.4g} at {values_text(predicted.point)}."]
     if predicted.reasons:
-        lines += ["It must not be believed:", *(f"- {reason}" for reason in predicted.reasons)]
-    return "\n".join([*lines, str(confirmation)])
+        lines += ["Reasons to doubt it before it is measured:", *(f"- {reason}" for reason in predicted.reasons)]
+    return "\n".join([*lines, f"Confirmation runs: {confirmation}"])

@@ -113,8 +113,9 @@ class SensorFaults:
     @property
     def color_is_separate(self) -> bool:
         """Whether colour is seen from another place, at another time or through another lens than depth."""
-        separating = [fault for fault in fields(self) if fault.name.startswith("color_")]
-        return any(np.any(np.not_equal(getattr(self, fault.name), fault.default)) for fault in separating)
+        without: Any = SensorFaults()
+        names = [fault.name for fault in fields(self) if fault.name.startswith("color_")]
+        return any(np.any(np.not_equal(getattr(self, name), getattr(without, name))) for name in names)
 
     def row_times(self, height: int, margin: int = 0) -> NDArray[np.float64]:
         """Exposure (H + 2 margin,) of the rows from -margin on relative to the stamp, seconds; H = ``height``."""

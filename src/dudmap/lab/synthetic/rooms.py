@@ -70,7 +70,7 @@ def _solids(row: dict[str, Any], materials: dict[str, Material]) -> Iterator[Pri
     """Solids of a row."""
     row = dict(row)
     for number in np.arange(*row.pop("repeat")) if "repeat" in row else (None,):
-        values = [
+        values: list[Any] = [
             [number if x == "*" else x for x in value] if isinstance(value, tuple) else value for value in row.values()
         ]
         kind, *keys = row

@@ -1,0 +1,52 @@
+"""What is said of a colour camera: estimated, tested and kept, or assumed."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from dudmap import Config
+from dudmap.app.pipeline.calibration import calibrate_start
+from dudmap.app.pipeline.calibration_report import findings
+from dudmap.core.calibration.estimator import GROUPS, Estimate
+from dudmap.core.geometry.calibration import NUM_PARAMETERS, Calibration
+from dudmap.core.geometry.camera import Camera
+
+CAMERA = Camera(160, 160, 79.5, 59.5, 160, 120)
+
+
+def estimate(sigma: float, evidence: float, estimated: tuple[str, ...] = ()) -> Estimate:
+    found = Calibration.registered(CAMERA)
+    found = replace(found, sigma=np.full(NUM_PARAMETERS, sigma), estimated=estimated)
+    return Estimate(found, dict.fromkeys(GROUPS, evidence), 0.0, 80)
+
+
+def test_what_was_not_tested_is_called_assumed():
+    assert all("assumed as given, not tested" in finding for finding in findings(estimate(np.nan, np.nan)))
+
+
+def test_what_was_tested_and_kept_has_its_uncertainty():
+    timing, _, geometry = findings(estimate(0.025, -0.5))
+    for text in ("assumed as given; tested", "-0.5 standard errors", "delay 25 ms"):
+        assert text in timing
+    for text in ("translation 25 mm", "rotation 1.4 deg", "focal length 2.5 %"):
+        assert text in geometry
+
+
+def test_a_significant_but_small_difference_is_not_called_none():
+    assert all("too small a share to be used" in finding for finding in findings(estimate(0.025, 3.0)))
+
+
+def test_what_was_estimated_has_its_uncertainty():
+    timing = findings(estimate(0.002, 4.0, GROUPS["timing"]))[0]
+    assert timing.startswith("colour camera, timing: estimated")
+    assert "delay 2 ms" in timing
+
+
+def test_a_recording_too_short_to_be_tested_is_said_to_be_assumed():
+    class Short:
+        def __len__(self):
+            return 5
+
+    said = []
+    assert calibrate_start(Short(), Config(), notice=said.append) is None
+    assert said == ["colour camera: assumed as given, not tested: that takes 90 frames"]

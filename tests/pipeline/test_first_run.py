@@ -1,0 +1,46 @@
+"""What somebody sees of a first run: that kernels are compiled, that the program works, and how long all of it took."""
+
+import io
+import time
+
+from rich.console import Console
+
+from dudmap import Config
+from dudmap.app.kernel_cache import COMPILING, compiled_kernels
+from dudmap.app.pipeline.progress import RunProgress
+from dudmap.app.pipeline.run import run
+from dudmap.app.terminal import counted
+from dudmap.core.geometry.calibration import Calibration
+from dudmap.io.sequences import open_sequence
+from recordings import write_recording
+
+
+def test_compilation_is_announced_only_while_the_cache_is_empty(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "cache"))
+    assert compiled_kernels() == 0
+    RunProgress(3, bar=False).announce_compilation()
+    assert COMPILING in capsys.readouterr().err
+    (tmp_path / "cache").mkdir()
+    (tmp_path / "cache" / "kernel.nbi").touch()
+    RunProgress(3, bar=False).announce_compilation()
+    assert not capsys.readouterr().err
+
+
+def test_a_bar_moves_while_nothing_is_finished():
+    console = Console(file=io.StringIO(), force_terminal=True)
+    with counted("calibrating", quiet=False, console=console):
+        before = len(console.file.getvalue())
+        time.sleep(0.5)
+        assert len(console.file.getvalue()) > before
+
+
+def test_the_time_of_a_run_counts_its_calibration(slam, tmp_path, monkeypatch):
+    sequence = open_sequence(write_recording(tmp_path / "desk", 4))
+
+    def calibrate(*_):
+        time.sleep(1.0)
+        return Calibration.registered(sequence.camera)
+
+    monkeypatch.setattr("dudmap.app.pipeline.calibration.calibrate_start", calibrate)
+    done = run(sequence, Config(), tmp_path / "out", progress=False, calibrate=True)
+    assert done.metrics["wall_s"] > 1.0
