@@ -1,6 +1,7 @@
 """Motion from image to image against the truth of synthetic worlds and against numerical derivatives."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,6 +13,7 @@ from dudmap.core.dynamics import dominant_motion as dominant
 from dudmap.core.dynamics import ego_motion
 from dudmap.core.dynamics.dominant_motion import dominant_motion
 from dudmap.core.dynamics.ransac import NOISE_PX, flow_jacobian, reproject, rigid_motion
+from dudmap.core.frames.observation import Level
 from dudmap.core.frames.optical_flow import consistent_with_static
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
@@ -113,6 +115,22 @@ def test_the_motion_of_most_surface_is_found_or_the_expected_one_of_two(share, e
     slow = int(np.searchsorted(areas, share * areas[-1]))
     targets = np.concatenate([reproject(SLOW, points[:slow], CAMERA), reproject(FAST, points[slow:], CAMERA)])
     np.testing.assert_allclose(rigid_motion(points, targets, CAMERA, expected), found, atol=1e-6)
+
+
+def test_the_share_that_follows_a_motion_is_one_of_the_surface(monkeypatch):
+    """People at 1 m with most of the corners and a ninth of the surface walk past a wall at 4 m."""
+    u = np.indices(CAMERA.shape)[1]
+    level = Level(CAMERA, np.where(u < 200, 1, 4).astype(np.float32), np.zeros(CAMERA.shape, np.float32))
+    rng = np.random.default_rng(8)
+    people, wall = rng.integers([5, 5], [190, 230], (200, 2)), rng.integers([210, 5], [310, 230], (100, 2))
+    pixels = np.concatenate([people, wall])
+    targets = pixels + np.where(np.arange(300)[:, None] < 200, [6.0, 0.0], 0.0)
+    monkeypatch.setattr(dominant, "track_forward_backward", lambda *_: (pixels, targets, np.zeros(300)))
+    monkeypatch.setattr(dominant, "consistent_with_static", lambda *parts: np.zeros(len(parts[2]), bool))
+    view = SimpleNamespace(fine=level, grey=None, corners=pixels, labelled=level)
+    motion = dominant_motion(view, view, (None, None))
+    np.testing.assert_allclose(motion.T_after_before, np.eye(4), atol=1e-6)
+    assert motion.share == pytest.approx(16 / 18)
 
 
 @pytest.mark.parametrize("seed", range(4))

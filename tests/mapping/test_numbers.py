@@ -11,10 +11,12 @@ from scipy.spatial import cKDTree
 from dudmap.config import Config, SensorConfig, VolumeConfig
 from dudmap.core.backends.threads import kernel
 from dudmap.core.formulas.voxel import fuse_color, fuse_voxel, pack_pixel_color, pack_reading
+from dudmap.core.frames.frame import Frame
 from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.map.block_window import LOCAL_GRID
 from dudmap.core.map.integrator import fusion_parameters
+from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.slam import Slam
 from dudmap.core.tracking.estimate import PoseEstimate
 from dudmap.core.tracking.tracker import TrackingResult
@@ -163,3 +165,15 @@ def test_a_camera_ten_kilometres_away_is_as_accurate(frames, monkeypatch):
         distance, _ = cKDTree(near_mesh.vertices).query(vertices)
         assert abs(len(far_mesh.vertices) - len(near_mesh.vertices)) < 0.02 * len(near_mesh.vertices)
         assert np.median(distance) < 1e-3
+
+
+def test_free_space_ten_kilometres_away_is_seen_as_at_the_origin():
+    camera, block, known = Camera(131.25, 131.25, 79.5, 59.5, 160, 120), 8 * CONFIG.volume.voxel_size, []
+    wall = Frame(0.0, np.full(camera.shape, 3, np.float32), np.full((*camera.shape, 3), 120, np.uint8))
+    for place in (np.zeros(3), block * LOCAL_GRID * np.rint(FAR / (block * LOCAL_GRID))):
+        volume, T = TsdfVolume(camera, CONFIG.volume, CONFIG.sensor, depth_max=4.0), np.eye(4)
+        T[:3, 3] = place
+        for _ in range(2 * CONFIG.volume.free_after):
+            volume.integrate(wall, T)
+        known.append(volume.num_free_blocks)
+    assert known[1] == known[0] > 100

@@ -60,6 +60,29 @@ def test_samples_are_the_distance_to_the_wall():
     assert list(far.state) == [EMPTY, 0]
 
 
+def test_gradients_are_the_derivatives_of_the_samples():
+    """On a slanted wall that is lit from one corner, inside the cells, where every value is linear along an axis."""
+    v, u = np.indices(SMALL.shape)
+    depth = (WALL + 0.003 * (u - 30) - 0.005 * (v - 20)).astype(np.float32)
+    color = np.repeat((40 + 2 * u + v).astype(np.uint8)[..., None], 3, axis=2)
+    volume = TsdfVolume(SMALL, VolumeConfig(voxel_size=0.02))
+    volume.integrate(Frame(0.0, depth, color), np.eye(4))
+    rng = np.random.default_rng(4)
+    chosen = v[8:40, 8:56].reshape(-1), u[8:40, 8:56].reshape(-1)
+    points = SMALL.points(chosen[1], chosen[0], depth[chosen].astype(np.float64)) / 0.02
+    points = 0.02 * (np.floor(points) + rng.uniform(0.2, 0.8, points.shape))
+    samples, step = sample_map(volume, points), 0.002
+    lit = (samples.state == OBSERVED) & (samples.intensity > 0)
+    for axis, shift in enumerate(step * np.eye(3)):
+        forth, back = sample_map(volume, points + shift), sample_map(volume, points - shift)
+        for name in ("sdf", "intensity"):
+            numeric = (getattr(forth, name) - getattr(back, name)) / (2 * step)
+            found = getattr(samples, f"{name}_gradient")[:, axis]
+            np.testing.assert_allclose(found[lit], numeric[lit], atol=1e-3)
+            assert np.abs(found[lit]).mean() > 0.02
+    assert np.count_nonzero(lit) > 300
+
+
 def words(volume):
     """Content of a map by block."""
     blocks = volume.blocks

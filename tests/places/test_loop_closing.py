@@ -1,5 +1,6 @@
 """Loop closing and submaps: drift is corrected, submaps are joined, and without a loop nothing changes."""
 
+from concurrent.futures import Future
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.core.map.volume import TsdfVolume
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_store import FrameStore
-from dudmap.core.places.loop_closing import LoopCloser
+from dudmap.core.places.loop_closing import LoopCloser, LoopSearch
 from dudmap.core.places.loop_verification import LoopQuery, LoopVerifier
 from dudmap.core.places.place_recognition import Keyframe, KeyframeDatabase, PlacedFeatures, PlaceMatch
 from dudmap.core.slam import Slam
@@ -133,6 +134,25 @@ def test_a_correction_where_the_older_pass_shows_nothing_is_believed():
     verifier = LoopVerifier(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
     far = shifted(3.0)
     assert verifier.is_drifted(PlaceMatch(atlas.keyframes.keyframes[0], far, 20), query_of(far, 3.0), np.eye(4))
+
+
+def test_a_correction_is_confirmed_by_the_search_that_follows_or_not_at_all(monkeypatch):
+    """Of three searches the first and the last agree on a drift, and the one between them finds nothing."""
+    atlas = made_up_atlas([0, 0, 0, 0])
+    loops = LoopCloser(Config(), atlas, Tracker(TrackerConfig(), SensorConfig()))
+    corrected = []
+    T = atlas.poses[-1].T_world_camera
+    drift = shifted(0.3)
+    monkeypatch.setattr(loops.verifier, "is_plausible", lambda *_: True)
+    monkeypatch.setattr(loops.verifier, "register", lambda *_: drift @ T)
+    monkeypatch.setattr(loops.verifier, "is_drifted", lambda *_: True)
+    monkeypatch.setattr(loops, "_correct", lambda *_: corrected.append(True))
+    place = PlaceMatch(atlas.keyframes.keyframes[0], drift @ T, 20)
+    for places, expected in (([place], 0), ([], 0), ([place], 0), ([place], 1)):
+        matches = Future()
+        matches.set_result(places)
+        loops._evaluate(LoopSearch(query_of(T, 3.0), 0, True, matches, 0), query_of(T, 3.0), None)
+        assert len(corrected) == expected
 
 
 def test_join_brings_one_map_into_the_other():

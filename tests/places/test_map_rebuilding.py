@@ -7,10 +7,11 @@ import pytest
 
 from dudmap.config import Config, SensorConfig
 from dudmap.core.frames.frame import Frame
+from dudmap.core.geometry import se3
 from dudmap.core.map.adaptive_volume import make_volume
 from dudmap.core.places.atlas import Atlas
 from dudmap.core.places.frame_store import FrameStore
-from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, nearest_views
+from dudmap.core.places.map_rebuilding import AT_ONCE, PER_FRAME, VIEW_DEPTH, nearest_views, view_distances
 from dudmap.core.places.place_recognition import KeyframeDatabase
 from wavy_wall import CAMERA, CONSTANT, wall
 
@@ -193,3 +194,15 @@ def test_a_map_is_painted_anew_over_many_frames_as_it_is_at_once():
         painted.append(content(atlas.volume))
         assert painted[-1] != before
     assert painted[0] == painted[1]
+
+
+def test_the_distance_of_views_is_that_of_what_is_looked_at():
+    """Cameras on a circle that look at its middle see the same; one that turns on the spot sees something else."""
+    around = np.stack([se3.exp(np.array([0, 0, 0, 0, angle, 0])) for angle in (0.0, 0.5, 1.0, -1.5)])
+    outside = around.copy()
+    outside[:, :3, 3] = -VIEW_DEPTH * around[:, :3, 2]
+    np.testing.assert_allclose(view_distances(outside, outside[0]), 0, atol=1e-12)
+    expected = 2 * VIEW_DEPTH * np.sin(np.abs([0.0, 0.5, 1.0, -1.5]) / 2)
+    np.testing.assert_allclose(view_distances(around, around[0]), expected, atol=1e-12)
+    turned = se3.exp(np.array([0, 0, 0, 0.7, 0, 0])) @ around
+    np.testing.assert_allclose(view_distances(turned, turned[0]), expected, atol=1e-12)

@@ -178,6 +178,17 @@ def test_another_pose_is_never_redundant(wavy):
     assert not camera.see(wavy)
 
 
+def test_a_place_moves_with_the_world():
+    """The camera looks sideways, so that the order of the two motions matters."""
+    views, volume = RedundantViews(Config()), SimpleNamespace(voxel_size=0.01)
+    T = se3.exp(np.array([1.0, 2.0, 0, 0, 1.5, 0]))
+    level = Level(CAMERA, np.ones(CAMERA.shape, np.float32), np.ones(CAMERA.shape, np.float32))
+    views.update(volume, SimpleNamespace(labelled=level), SimpleNamespace(T_world_camera=T, labels=None))
+    correction = se3.exp(np.array([0.2, -0.1, 0.3, 0.4, 0, 0]))
+    views.apply_correction(correction)
+    np.testing.assert_allclose(views._place.T_world_camera, correction @ T)
+
+
 def test_uncovered_background_is_fused(wavy, box):
     in_front, pixels = box
     camera = Camera()

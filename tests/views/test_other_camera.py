@@ -96,6 +96,22 @@ def test_depth_is_seen_from_the_other_camera(made):
     assert abs(shown - calibration.camera.project(point)[0, 0]) <= 1.5
 
 
+def test_what_another_surface_hides_from_the_other_camera_is_not_in_its_mask():
+    """A camera 30 cm to the left sees a post at 1 m before most of a marked part of the wall at 3 m."""
+    depth, mask = np.full(CAMERA.shape, 3.0, np.float32), np.zeros(CAMERA.shape, bool)
+    depth[:, 70:90] = 1.0
+    mask[40:80, 92:110] = True
+    T_color_depth = np.eye(4)
+    T_color_depth[0, 3] = 0.3
+    found = OtherView(Lens(CAMERA), Lens(CAMERA)).mask(mask, depth, T_color_depth)
+    wall, post = (round(CAMERA.fx * 0.3 / z) for z in (3.0, 1.0))
+    expected = np.zeros(CAMERA.shape, bool)
+    expected[40:80, 92 + wall : 70 + post] = True
+    assert np.count_nonzero(expected) == 40 * 4
+    assert not np.any(found & ~grown(expected, 1))
+    assert np.all(found[expected])
+
+
 def test_both_cameras_are_cleaned(made):
     where, sequence, _, calibration = made
     out = where / "cleaned"
