@@ -35,7 +35,7 @@ def findings(estimate: "Estimate") -> list[str]:
     out = []
     for name, members in GROUPS.items():
         evidence, known = estimate.evidence[name], _sigma(estimate.calibration, name)
-        if evidence != evidence:
+        if np.isnan(evidence):
             said = f"{ASSUMED}: fewer than {MIN_PAIRS} pairs of overlapping views in half of the time"
         elif members[0] in estimate.calibration.estimated:
             said = f"estimated; other images fit {evidence:.1f} standard errors better; standard deviations {known}"
