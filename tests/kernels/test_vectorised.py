@@ -24,7 +24,7 @@ from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
-    (registration, "linearize_rows"): {"loops": 3, "fma": 48, "packed": 140, "converted": 2},
+    (registration, "linearize_rows"): {"loops": 2, "fma": 48, "packed": 140, "converted": 2},
     (sampling, "sample_rows"): {"loops": 3, "fma": 6, "packed": 11, "converted": 7},
     (integration, "integrate_blocks"): {"loops": 3, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},

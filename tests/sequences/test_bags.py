@@ -294,7 +294,9 @@ def test_a_damaged_bag_is_one_sentence(tmp_path, kind):
 def test_rosbags_missing_is_one_sentence(tmp_path, monkeypatch):
     path = write_bag(tmp_path / "a.bag", "ros1")
     monkeypatch.setitem(__import__("sys").modules, "rosbags.typesys", None)
-    with pytest.raises(MissingExtraError, match=r'the ROS bag .* needs the extra ros-bags .*"dudmap\[ros-bags\]"'):
+    with pytest.raises(
+        MissingExtraError, match=r'the ROS bag .* needs the extra ros-bags .*pip install "\.\[ros-bags\]"'
+    ):
         open_sequence(path)
 
 

@@ -83,5 +83,5 @@ def test_defects_are_one_sentence(tmp_path):
 def test_lzfse_missing_is_one_sentence(tmp_path, monkeypatch):
     path = write_r3d(tmp_path / "a.r3d", pack=bytes)
     monkeypatch.setitem(__import__("sys").modules, "lzfse", None)
-    with pytest.raises(MissingExtraError, match=r'needs the extra record3d .*"dudmap\[record3d\]"'):
+    with pytest.raises(MissingExtraError, match=r'needs the extra record3d .*pip install "\.\[record3d\]"'):
         open_sequence(path)
