@@ -114,6 +114,7 @@ def test_one_scalar_loop_is_caught(signatures, module_name):
     way_out = f"{indent}    if T[{index} % 3, {index} % 4] > 1e30:\n{indent}        break\n"
     variant = source[: heart.start(3)] + way_out + source[heart.start(3) :]
     caught = scalar_loops(compiled(signatures, {name: variant}))
-    assert any(" loops" in sentence for sentence in caught), caught
-    if name == "linearize_rows":  # of the other, the compiler for some processors packs what is left nevertheless
-        assert any(" packed" in sentence for sentence in caught), caught
+    # the compiler for some processors packs what is left of the fusion nevertheless, and whether the loops of what the
+    # registration calls are counted as its own depends on what it takes from the cache
+    lost = " packed" if name == "linearize_rows" else " loops"
+    assert any(lost in sentence for sentence in caught), caught
