@@ -14,7 +14,7 @@ PROGRAM = """
 import sys
 from dudmap import Config, run, synthetic
 from dudmap.core.geometry.camera import Camera
-from dudmap.lab.synthetic.sensors import SensorFaults
+from dudmap.lab.synthetic.faults import SensorFaults
 
 camera = Camera(262.0, 262.0, 159.5, 119.5, 320, 240)
 faults = SensorFaults(color_delay=0.02, color_distortion=(0.1, -0.1, 0.0, 0.0))
