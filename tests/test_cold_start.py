@@ -25,7 +25,7 @@ INTEGERS = {
     "_cell", "_cell_key", "_changes_sign", "_corner_words", "_is_empty", "_known_leaf", "_mark", "_may_cross", "_put",
     "_slot_at", "_step_block", "_surrounded_words", "_voxel", "_yield_core", "announce", "corners_at", "done", "fill",
     "find", "finest_at", "finest_level", "finish", "half_word", "inside_window", "is_known", "least_weight",
-    "load_corners", "load_row", "may_hold_surface", "quarter_word", "take", "wait_for_all", "wait_for_work",
+    "load_corners", "may_hold_surface", "quarter_word", "take", "wait_for_all", "wait_for_work",
 }  # fmt: skip
 """Kernels without arithmetic on fractions, which have no roundings."""
 

@@ -24,8 +24,8 @@ from dudmap.lab.synthetic import sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
 FEWEST = {
-    (registration, "linearize_rows"): {"loops": 2, "fma": 48, "packed": 140, "converted": 2},
-    (sampling, "sample_rows"): {"loops": 3, "fma": 6, "packed": 11, "converted": 7},
+    (registration, "linearize_rows"): {"loops": 2, "fma": 66, "packed": 180, "converted": 18},
+    (sampling, "sample_rows"): {"loops": 2, "fma": 8, "packed": 15, "converted": 10},
     (integration, "integrate_blocks"): {"loops": 3, "fma": 9, "packed": 48, "converted": 16},
     (integration, "pack_pixels"): {"loops": 2, "packed": 9},
     (labeling, "upsample_rows"): {"loops": 1, "packed": 3},
@@ -114,7 +114,6 @@ def test_one_scalar_loop_is_caught(signatures, module_name):
     way_out = f"{indent}    if T[{index} % 3, {index} % 4] > 1e30:\n{indent}        break\n"
     variant = source[: heart.start(3)] + way_out + source[heart.start(3) :]
     caught = scalar_loops(compiled(signatures, {name: variant}))
-    # the compiler for some processors packs what is left of the fusion nevertheless, and whether the loops of what the
-    # registration calls are counted as its own depends on what it takes from the cache
-    lost = " packed" if name == "linearize_rows" else " loops"
-    assert any(lost in sentence for sentence in caught), caught
+    assert any(" loops" in sentence for sentence in caught), caught
+    if name == "linearize_rows":  # of the other, the compiler for some processors packs what is left nevertheless
+        assert any(" packed" in sentence for sentence in caught), caught

@@ -5,13 +5,14 @@ import sys
 from collections.abc import Callable
 from pathlib import Path
 from statistics import median
-from types import CodeType, FrameType
+from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 from numba.core.dispatcher import Dispatcher
 
 from dudmap.config import Config
 from dudmap.core import slam as slam_module
+from dudmap.core.backends import threads
 from dudmap.core.backends.cpu import teams
 from dudmap.core.slam import Slam
 
@@ -57,7 +58,7 @@ def summary(counts: list[dict[str, int]]) -> dict[str, float]:
 def _counted(function: Callable[[Any], object], argument: object) -> dict[str, int]:
     """The counts of one call."""
     kernels = {found.py_func.__code__ for found in gc.get_objects() if isinstance(found, Dispatcher)}
-    sharing = {teams.run_team.__code__, *_codes_of("run_bands")}
+    sharing = {teams.run_team.__code__, threads.run_bands.__code__}
     launches = barriers = calls = 0
     files: set[str] = set()
 
@@ -78,9 +79,3 @@ def _counted(function: Callable[[Any], object], argument: object) -> dict[str, i
     finally:
         sys.setprofile(None)
     return {"launches": launches, "barriers": barriers, "calls": calls, "files": len(files)}
-
-
-def _codes_of(name: str) -> set[CodeType]:
-    from dudmap.core.backends import threads
-
-    return {getattr(threads, name).__code__}

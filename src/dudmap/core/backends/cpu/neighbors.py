@@ -81,7 +81,7 @@ def locate(x, y, z, last, size_y, size_z):
     return cell, voxel, crosses, inside, x - lx, y - ly, z - lz
 
 
-@kernel
+@scalar
 def load_row(window, shape, geometry, cells, voxels, crossing, wanted, outer, words):
     """Words of the eight voxels around each point of a row, 0 = unknown.
 
