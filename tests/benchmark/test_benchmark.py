@@ -18,7 +18,7 @@ from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
 from dudmap.lab.benchmark.published import published
 from dudmap.lab.benchmark.suites import SUITES, find_suite
-from dudmap.lab.benchmark.systems import systems
+from dudmap.lab.benchmark.systems import ABLATION, systems
 from dudmap.lab.benchmark.table import markdown
 from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
@@ -51,7 +51,8 @@ def test_every_suite_has_the_recordings_the_papers_name(tmp_path):
         assert len(set(suite.names())) == count
     assert len(find_suite("synthetic", None).entries) >= 15
     assert len(find_suite("synthetic", None, quick=True).entries) == 3
-    assert set(SUITES) == {*counts, "synthetic", "local"}
+    assert len(find_suite("ablation", None).entries) == 5
+    assert set(SUITES) == {*counts, "synthetic", "ablation", "local"}
 
 
 def test_recordings_are_found_one_folder_down(data):
@@ -103,6 +104,7 @@ def test_systems_are_configurations(tmp_path):
     assert found["threshold"].dynamics.method == "threshold"
     assert not found["em"].dynamics.free_space
     assert found["thesis"].preset == "thesis"
+    assert len({str(config) for config in systems(ABLATION).values()}) == 13  # two-passes has the default configuration
     (tmp_path / "mine.toml").write_text("[tracker]\nhuber = 0.05\n")
     assert systems(str(tmp_path / "mine.toml"))["mine"].tracker.huber == 0.05
     for text in ("", "dudmapp", "none,none"):

@@ -143,6 +143,14 @@ FAKED = {
         ["benchmark", "speed", "--out", "speed"],
         {"dudmap.lab.benchmark.speed.speed_figures": lambda *_: []},
     ),
+    "benchmark roofline": (
+        ["benchmark", "roofline", "--out", "roofline"],
+        {"dudmap.lab.benchmark.roofline.roofline": lambda *_: ({}, "")},
+    ),
+    "benchmark soak": (
+        ["benchmark", "soak"],
+        {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
+    ),
     "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],

@@ -10,12 +10,9 @@ import typer
 
 from dudmap.app.terminal import counted, say
 from dudmap.cli import options as o
-from dudmap.cli.benchmark_gpu import gpu
+from dudmap.cli.benchmark_machine import RUNS, QuickOption, gpu, roofline, soak, speed
 from dudmap.cli.output import answer
 from dudmap.lab.benchmark.suites import SUITES
-
-RUNS = Path("runs/benchmark")
-"""Folder of the output folders, unless another one is named."""
 
 app = typer.Typer(
     add_completion=False,
@@ -26,15 +23,16 @@ app = typer.Typer(
 SystemsOption = Annotated[
     str,
     typer.Option(
-        "--systems", help="Comma-separated: dudmap, thesis, threshold, none, em, or paths of .toml configurations."
+        "--systems",
+        help="Comma-separated names (docs/benchmarks.md) or .toml files. Default: dudmap; of the suite ablation, the "
+        "default with one part switched off at a time.",
     ),
 ]
-QuickOption = Annotated[bool, typer.Option("--quick", help="Reduced version for a quick check.")]
 
 
 def suite_command(
     context: typer.Context,
-    systems: SystemsOption = "dudmap",
+    systems: SystemsOption = "",
     out: Annotated[Path | None, typer.Option(help="Default: runs/benchmark/<suite>.")] = None,
     data: Annotated[Path | None, typer.Option(help="Folder of the recordings; nothing is downloaded.")] = None,
     jobs: o.JobsOption = 1,
@@ -51,10 +49,12 @@ def suite_command(
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.lab.benchmark.report import named_folders, run_suite
     from dudmap.lab.benchmark.suites import find_suite
+    from dudmap.lab.benchmark.systems import ABLATION
     from dudmap.lab.benchmark.systems import systems as find_systems
 
     name = str(context.info_name)
-    wanted, others = find_systems(systems), named_folders(score or [])
+    usual = ABLATION if name == "ablation" else "dudmap"
+    wanted, others = find_systems(systems or usual), named_folders(score or [])
     suite = find_suite(name, data, quick=quick)
     out = out or RUNS / name
     text = run_suite(suite, wanted, others, out, workers=jobs, done=_print_outcome)
@@ -62,7 +62,8 @@ def suite_command(
     _answer(tree, text, out, as_json=as_json)
 
 
-app.command()(gpu)
+for _command in (speed, gpu, roofline, soak):
+    app.command()(_command)
 for _name, _help in SUITES.items():
     app.command(_name, help=_help)(suite_command)
 
@@ -80,6 +81,7 @@ def _print_outcome(row: dict[str, Any]) -> None:
 def sensors(
     out: Annotated[Path, typer.Option(help="Output folder for sensors.md, .csv and .json.")] = RUNS / "sensors",
     only: Annotated[str, typer.Option(help="Comma-separated sensors; default: all.")] = "",
+    data: Annotated[Path | None, typer.Option(help="Measure the recordings in this folder instead.")] = None,
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     assignments: o.SetOption = None,
@@ -91,10 +93,12 @@ def sensors(
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.color_columns import color_table, measure_columns
+    from dudmap.lab.benchmark.entries import local_entries
     from dudmap.lab.benchmark.suites import sensor_entries
     from dudmap.lab.benchmark.table import save
 
-    entries = sensor_entries([name for name in only.split(",") if name], quick=quick)
+    names = [name for name in only.split(",") if name]
+    entries = sensor_entries(names, quick=quick) if data is None else local_entries(data)
     rows = measure_columns(entries, o.read_config(None, None, assignments), jobs, _print_outcome)
     text = color_table(rows)
     save(rows, text, out, "sensors", {"machine": machine(), "versions": versions()})
@@ -349,40 +353,3 @@ def limits(
     text += cells_table(rows, sweeps, list(wanted))
     save(rows, text, out, "limits", {"machine": machine(), "versions": versions()})
     _answer({"rows": rows}, text, out, as_json=as_json)
-
-
-@app.command()
-def speed(
-    out: Annotated[Path, typer.Option(help="Output folder for speed.md and speed.json.")] = RUNS / "speed",
-    long: Annotated[
-        bool, typer.Option("--long", help="Also measure the growth of the time per frame over 2000 frames.")
-    ] = False,
-    open3d: Annotated[
-        Path | None,
-        typer.Option(metavar="PYTHON", help="Python interpreter with open3d, to compare with its dense SLAM."),
-    ] = None,
-    recording: Annotated[
-        Path | None, typer.Option(help="Recording of that comparison; default: a synthetic room.")
-    ] = None,
-    quick: QuickOption = False,
-    as_json: o.JsonOption = False,
-) -> None:
-    """Measure time and memory on this machine, which should be idle otherwise."""
-    from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.interleaved import find_open3d
-    from dudmap.lab.benchmark.speed import markdown, speed_figures
-
-    frames, long_frames = (20, 60) if quick else (300, 2000)
-    figures = speed_figures(
-        frames,
-        long_frames if long else 0,
-        lambda what: say(f"measuring {what}", err=True),
-        find_open3d(open3d),
-        recording,
-    )
-    text = markdown(figures)
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "speed.md").write_text(text, encoding="utf-8")
-    content = {"machine": machine(), "versions": versions(), "figures": [figure._asdict() for figure in figures]}
-    (out / "speed.json").write_text(json.dumps(content, indent=2) + "\n", encoding="utf-8")
-    _answer(content, text, out, as_json=as_json)

@@ -23,7 +23,7 @@ others take it as given, and with colour it counts the same at any motion."""
 TOLERANCE = 0.05
 """Relative amount by which the default may be worse than the better column."""
 ATE = Column("ate_rmse_m", "ATE RMSE, mm", 1000, 1)
-"""The figure that is compared unless a recording has another one."""
+"""The figure that is compared."""
 
 
 class Measurement(NamedTuple):

@@ -16,6 +16,7 @@ VOLUMEDEFORM = "https://cloud9.cs.fau.de/index.php/s/46qcNZSNePHx08A"
 
 SUITES: dict[str, str] = {
     "synthetic": "Synthetic worlds with exact ground truth; needs no data.",
+    "ablation": "Five small synthetic worlds, the default with one part switched off at a time.",
     "thesis": "The recordings of tables 5.1 to 5.8 of the DUDMap thesis.",
     "tum-dynamic": "The eight fr3 sitting and walking recordings of TUM RGB-D.",
     "bonn": "The 24 dynamic and 2 static recordings of Bonn RGB-D Dynamic.",
@@ -57,6 +58,20 @@ SYNTHETIC: dict[str, dict[str, object]] = {
     "plane-person": {"scene": "plane"},
     "room-realsense": {"noise": "realsense"},
 }
+WORLDS: dict[str, dict[str, dict[str, object]]] = {
+    "synthetic": SYNTHETIC,
+    "ablation": {
+        name: {"frames": 90, "camera": (320, 240), **world}
+        for name, world in {
+            "two-people": {"movers": ("people",)},
+            "crowd-from-the-start": {"coverage": 0.4, "start_dynamic": True},
+            "slow-creeper": {"movers": ("creeper",)},
+            "an-object-starts-to-move": {"situation": "starts"},
+            "kidnapped": {"situation": "kidnapped"},
+        }.items()
+    },
+}
+"""Worlds of the suites that need no data."""
 ROOM = {"movers": (), "frames": 120}
 UNREGISTERED = {"color_translation": (0.025, 0.0, 0.0), "color_focal_ratio": 0.95}
 DELAY = {"color_delay": 0.025}
@@ -76,7 +91,7 @@ SENSORS: dict[str, dict[str, object]] = {
     },
 }
 """The same static room, taken with sensors of different faults and with named cameras."""
-QUICK = ("room-static", "room-person", "room-people-at-start")
+QUICK = ("room-static", "room-person", "room-people-at-start", "two-people")
 
 
 @dataclass(frozen=True)
@@ -103,8 +118,8 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
 
     Args:
         name: One of ``SUITES``.
-        data: Folder that is searched, two levels deep, for the recordings; only ``synthetic`` needs none.
-        quick: Only three synthetic worlds, and at most 60 frames of every recording.
+        data: Folder that is searched, two levels deep, for the recordings; synthetic worlds need none.
+        quick: Only one to three synthetic worlds, and at most 60 frames of every recording.
 
     Raises:
         ConfigError: There is no such suite, or it needs ``data``.
@@ -112,10 +127,9 @@ def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
     """
     if name not in SUITES:
         raise ConfigError(f"unknown suite {name!r}; known suites: {', '.join(SUITES)}")
-    if name == "synthetic":
-        chosen = [
-            Entry(key, parameters=parameters) for key, parameters in SYNTHETIC.items() if not quick or key in QUICK
-        ]
+    if name in WORLDS:
+        worlds = WORLDS[name].items()
+        chosen = [Entry(key, parameters=world) for key, world in worlds if not quick or key in QUICK]
         return Suite(name, [_short(entry) for entry in chosen] if quick else chosen, [])
     if data is None:
         raise ConfigError(f"the suite {name} reads recordings from disk; name their folder with --data")

@@ -16,10 +16,23 @@ SYSTEMS: dict[str, tuple[str, ...]] = {
     ),
     "none": ("dynamics.method=none",),
     "em": ("dynamics.free_space=false", "dynamics.regions=false", "dynamics.start_seconds=0"),
+    "no-start": ("dynamics.start_seconds=0",),
+    "no-free-space": ("dynamics.free_space=false",),
+    "no-regions": ("dynamics.regions=false",),
+    "no-pieces": ("dynamics.pieces=false",),
+    "no-second-registration": ("tracker.second_pass=false",),
+    "no-carving": ("volume.carving=false",),
+    "no-limit-of-readings": ("volume.max_readings=255",),
+    "no-colour": ("tracker.color_weight=0",),
+    "no-exposure-fit": ("tracker.exposure=false",),
+    "no-noise-weighting": ("tracker.noise_weighting=false",),
+    "no-relocalisation": ("relocalization.enabled=false",),
 }
 """Differences from the default configuration: the default itself; the default with two passes; the values of the
 thesis; threshold and flood fill as in ReFusion, with its threshold of 7 cm and the truncation distance of 10 cm that it
-needs; no detection of dynamics; EM on the residuals alone."""
+needs; no detection of dynamics; EM on the residuals alone; and the default with one part switched off."""
+ABLATION = ",".join(["dudmap", "two-passes", *(name for name in SYSTEMS if name.startswith("no"))])
+"""Systems of the suite ``ablation``."""
 
 PASSES = {"two-passes": 2}
 """Systems that process a recording more than once, and how often."""
