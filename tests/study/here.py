@@ -1,7 +1,6 @@
 """Executor of the tests."""
 
 from concurrent.futures import Future
-from dataclasses import replace
 
 from dudmap.lab.study.worker import perform
 
@@ -17,7 +16,7 @@ class Here:
     def submit(self, job):
         self.runs.append(job.run)
         out = Future()
-        out.set_result(perform(replace(job, do=self.do)))
+        out.set_result(perform(job._replace(do=self.do)))
         return out
 
     def close(self):

@@ -58,8 +58,8 @@ def test_the_report_has_every_response(study):
     out, _ = study
     report = (out / "report.md").read_text(encoding="utf-8")
     for heading in (
-        "ATE RMSE, m",
-        "ms per frame",
+        "ATE RMSE, mm",
+        "time per frame, ms",
         "lost frames",
         "mask IoU",
         "peak memory, MB",

@@ -31,7 +31,7 @@ class Entry:
 
     name: str
     path: Path | None = None
-    parameters: Mapping[str, Any] = field(default_factory=dict)
+    parameters: Mapping[str, Any] = field(default_factory=dict, hash=False)
     address: str = ""
     max_frames: int | None = None
 

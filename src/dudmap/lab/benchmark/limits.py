@@ -9,7 +9,7 @@ import json
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import astuple, replace
-from functools import cache, lru_cache
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -20,7 +20,7 @@ from dudmap.errors import DudmapError
 from dudmap.evaluation.segmentation import SCORED_COVERAGE
 from dudmap.lab.benchmark.conditions import FPS, SIZE, Condition
 from dudmap.lab.benchmark.entries import Excerpt
-from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
+from dudmap.lab.benchmark.measure import Row, code_hash, in_own_process, measure_sequence
 
 if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
@@ -141,18 +141,6 @@ def _fingerprint(condition: Condition, config: Config) -> str:
     """File name that is unique to the code, the configuration and the condition."""
     text = f"{code_hash()}{astuple(condition)}{SIZE}{FPS}{LARGEST_ATE}{SAMPLES}{config.to_toml()}"
     return hashlib.sha256(text.encode()).hexdigest()[:20]
-
-
-@cache
-def code_hash(without: tuple[str, ...] = ()) -> str:
-    """SHA-256 of all sources of the package, except of the packages ``without``."""
-    import dudmap
-
-    root = Path(dudmap.__file__).parent
-    sources = sorted(
-        source for source in root.rglob("*.py") if not source.relative_to(root).as_posix().startswith(without)
-    )
-    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()
 
 
 def _measure_chunk(chunk: list[ConditionJob]) -> Row:

@@ -1,5 +1,6 @@
 """Measurement of one system on one recording, in a separate process so that time and memory are not shared."""
 
+import hashlib
 import multiprocessing
 import tempfile
 import traceback
@@ -7,6 +8,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -142,3 +144,15 @@ def in_own_process(function: Callable[[Any], Row], argument: Any) -> Row:  # noq
         except Exception as error:  # a defect in one measurement must not discard the others of a suite
             traceback.print_exception(error)
             return {"error": f"{type(error).__name__}: {error}"}
+
+
+@cache
+def code_hash(without: tuple[str, ...] = ()) -> str:
+    """SHA-256 of all sources of the package, except of the packages ``without``."""
+    import dudmap
+
+    root = Path(dudmap.__file__).parent
+    sources = sorted(
+        source for source in root.rglob("*.py") if not source.relative_to(root).as_posix().startswith(without)
+    )
+    return hashlib.sha256(b"".join(source.read_bytes() for source in sources)).hexdigest()

@@ -12,8 +12,7 @@ import numpy as np
 
 from dudmap.config import Config
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.limits import code_hash
-from dudmap.lab.benchmark.measure import Row, in_own_process, measure_sequence
+from dudmap.lab.benchmark.measure import Row, code_hash, in_own_process, measure_sequence
 from dudmap.lab.benchmark.table import grid
 
 SILENT_ATE, SILENT_LOST = 0.05, 0.2

@@ -10,10 +10,10 @@ from queue import SimpleQueue
 from typing import Any
 
 from dudmap.lab.study.executor import Executor, WorkerDied
+from dudmap.lab.study.factors import Table
 from dudmap.lab.study.plan import Run
 from dudmap.lab.study.store import StudyFolder
-from dudmap.lab.study.tables import Table
-from dudmap.lab.study.worker import Job
+from dudmap.lab.study.worker import Do, Job
 
 ATTEMPTS = 3
 """Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""
@@ -43,31 +43,21 @@ class Progress:
     started: float = 0.0
     cores: int = 1
 
-    def seconds_left(self) -> float | None:
-        """Expected time left at the rate so far; None before the first run ended."""
-        now = self.done - self.begun
-        return None if not now else (time.monotonic() - self.started) / now * (self.total - self.done)
-
     @property
     def core_hours(self) -> float:
         """Core-hours of all runs so far."""
         return self.spent * self.cores / 3600
 
-    def cost(self, price: float = 0.0) -> str:
-        """Time of one core so far and about how much the whole study needs, with its cost at a price per core-hour."""
-        whole = self.core_hours / self.done * self.total if self.done else 0.0
-        hours = f"{duration(3600 * self.core_hours)} of about {duration(3600 * whole)} of core time"
-        return hours + (f", cost {self.core_hours * price:.2f} of about {whole * price:.2f}" if price else "")
-
     def describe(self, price: float = 0.0) -> str:
         """State in words, with the cost at a price per core-hour."""
-        left = self.seconds_left()
-        died = f", {self.deaths} workers died" if self.deaths else ""
-        rest = "" if left is None else f", {duration(left)} left"
-        return f"run {self.done} of {self.total}{rest}, {self.cost(price)}{died}"
-
-    def __str__(self) -> str:
-        return self.describe()
+        now, whole = self.done - self.begun, self.core_hours / max(self.done, 1) * self.total
+        left = (time.monotonic() - self.started) / now * (self.total - self.done) if now else None
+        return (
+            f"run {self.done} of {self.total}{'' if left is None else f', {duration(left)} left'}, "
+            f"{duration(3600 * self.core_hours)} of about {duration(3600 * whole)} of core time"
+            + (f", cost {self.core_hours * price:.2f} of about {whole * price:.2f}" if price else "")
+            + (f", {self.deaths} workers died" if self.deaths else "")
+        )
 
 
 def duration(seconds: float) -> str:
@@ -83,7 +73,7 @@ def conduct(
     executor: Executor,
     *,
     keep: bool = False,
-    do: Callable[[Run, Path | None], dict[str, Any]] | None = None,
+    do: Do | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Progress:
     """Do all runs that have no result yet.

@@ -5,12 +5,12 @@ Box-Behnken (1960) designs from pyDOE3, Latin hypercubes and Sobol sequences fro
 of Saltelli (2010) and Morris (1991), from which their indices are computed without a model, from SALib.
 """
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Sequence
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
 
 from dudmap.errors import ConfigError
 from dudmap.lab.study.factors import Factor, Value
@@ -18,17 +18,20 @@ from dudmap.lab.study.factors import Factor, Value
 Coded = NDArray[np.float64]
 Point = dict[str, Value]
 """Values of all factors by key."""
-
+Kind = Literal[
+    "full-factorial", "fractional-factorial", "plackett-burman", "central-composite", "box-behnken", "latin-hypercube",
+    "sobol", "saltelli", "morris",
+]  # fmt: skip
+DESIGNS: tuple[str, ...] = get_args(Kind)
 MORRIS_LEVELS = 4
 """Levels per factor of a Morris design; Morris (1991) and SALib take 4."""
 
 
-@dataclass(frozen=True)
-class DesignOptions:
+class DesignOptions(BaseModel):
     """Table ``design`` of a design file.
 
     Attributes:
-        kind: Name of the design, one of ``DESIGNS``.
+        kind: Name of the design.
         samples: Number of points of a Latin hypercube or Sobol sequence; base samples N of a Saltelli design, which has
             N (2 K + 2) points for K factors; trajectories N of a Morris design, which has N (K + 1) points.
         resolution: Resolution of a fractional factorial design.
@@ -38,8 +41,10 @@ class DesignOptions:
             interactions of two factors.
     """
 
-    kind: str = "full-factorial"
-    samples: int = 64
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Kind = Field("full-factorial", description=f"one of {', '.join(DESIGNS)}")
+    samples: int = Field(64, ge=1)
     resolution: int = 4
     generators: str = ""
     seed: int = 0
@@ -47,25 +52,25 @@ class DesignOptions:
 
 
 def points_of(factors: Sequence[Factor], options: DesignOptions) -> list[Point]:
-    """All points of a design, each once.
+    """All points of a design, each once; those of Saltelli and Morris need every row for their indices.
 
     Raises:
-        ConfigError: The design does not exist, or does not fit the factors.
+        ConfigError: The design does not fit the factors.
     """
-    if options.kind not in DESIGNS:
-        raise ConfigError(f"unknown design {options.kind!r}; known are {', '.join(DESIGNS)}")
-    found: list[Point]
-    if options.kind == "full-factorial":
+    kind = options.kind
+    if kind == "full-factorial":
         found = _full_factorial(factors)
-    elif options.kind in ("fractional-factorial", "plackett-burman"):
-        found = [_two_level(factors, row) for row in DESIGNS[options.kind](factors, options)]
+    elif kind in ("fractional-factorial", "plackett-burman"):
+        ends = [(f.value(-1), f.value(1)) if f.numeric else (f.levels[0], f.levels[-1]) for f in factors]
+        rows = (_fractional if kind == "fractional-factorial" else _plackett_burman)(factors, options)
+        found = [{f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)} for row in rows]
     else:
         words = [factor.key for factor in factors if not factor.numeric]
         if words:
-            raise ConfigError(f"a {options.kind} design needs numbers, but {words[0]} has levels that are none")
-        rows = DESIGNS[options.kind](factors, options)
+            raise ConfigError(f"a {kind} design needs numbers, but {words[0]} has levels that are none")
+        rows = (_response_surface if kind in ("central-composite", "box-behnken") else _sampled)(factors, options)
         found = [{f.key: f.value(float(x)) for f, x in zip(factors, row, strict=True)} for row in rows]
-    if options.kind in ("saltelli", "morris"):  # their indices need every row, repeated ones too
+    if kind in ("saltelli", "morris"):
         return found
     return [point for number, point in enumerate(found) if point not in found[:number]]
 
@@ -94,25 +99,16 @@ def _full_factorial(factors: Sequence[Factor]) -> list[Point]:
     return [{f.key: f.levels[n] for f, n in zip(factors, row, strict=True)} for row in rows]
 
 
-def _two_level(factors: Sequence[Factor], row: Coded) -> Point:
-    ends = [(f.levels[0], f.levels[-1]) if not f.numeric else (f.value(-1), f.value(1)) for f in factors]
-    return {f.key: end[int(x > 0)] for f, end, x in zip(factors, ends, row, strict=True)}
-
-
 def _fractional(factors: Sequence[Factor], options: DesignOptions) -> Coded:
     from pyDOE3 import fracfact, fracfact_by_res
 
+    given, count = options.generators, len(factors)
     try:
-        if options.generators:
-            rows = np.asarray(fracfact(options.generators))
-        else:
-            rows = np.asarray(fracfact_by_res(len(factors), options.resolution))
+        rows = np.asarray(fracfact(given) if given else fracfact_by_res(count, options.resolution))
     except ValueError as error:
-        raise ConfigError(f"no fractional factorial design for {len(factors)} factors: {error}") from None
-    if rows.shape[1] != len(factors):
-        raise ConfigError(
-            f"the generators {options.generators!r} make {rows.shape[1]} columns for {len(factors)} factors"
-        )
+        raise ConfigError(f"no fractional factorial design for {count} factors: {error}") from None
+    if rows.shape[1] != count:
+        raise ConfigError(f"the generators {given!r} make {rows.shape[1]} columns for {count} factors")
     return rows
 
 
@@ -121,9 +117,8 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
 
     for factor in factors:
         if len(factor.levels) > 2:
-            raise ConfigError(
-                f"a plackett-burman design has two levels, but {factor.key} has {len(factor.levels)}; give it a range"
-            )
+            count = len(factor.levels)
+            raise ConfigError(f"a plackett-burman design has two levels, but {factor.key} has {count}; give it a range")
     runs = 4 * (len(factors) // 4 + 1)
     while True:  # pyDOE3 knows the sizes 2^n, 12 2^n and 20 2^n
         try:
@@ -135,18 +130,15 @@ def _plackett_burman(factors: Sequence[Factor], options: DesignOptions) -> Coded
 
 
 def _response_surface(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    """Central composite or Box-Behnken design."""
     from pyDOE3 import bbdesign, ccdesign
 
-    composite = options.kind == "central-composite"
-    if len(factors) < (2 if composite else 3):
+    count, composite = len(factors), options.kind == "central-composite"
+    if count < (2 if composite else 3):
         raise ConfigError(f"a {options.kind} design needs {'two' if composite else 'three'} factors or more")
-    count = len(factors)
     return np.asarray(ccdesign(count, center=(0, 1), face="faced") if composite else bbdesign(count, center=1))
 
 
 def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
-    """Latin hypercube, or Sobol, Saltelli or Morris design."""
     from SALib.sample import morris, sobol
     from scipy.stats.qmc import LatinHypercube, Sobol
 
@@ -164,18 +156,5 @@ def _sampled(factors: Sequence[Factor], options: DesignOptions) -> Coded:
 
 def problem(factors: Sequence[Factor]) -> dict[str, Any]:
     """The factors in coded units, as SALib wants them."""
-    return {
-        "num_vars": len(factors),
-        "names": [factor.name for factor in factors],
-        "bounds": [[-1.0, 1.0]] * len(factors),
-    }
-
-
-DESIGNS: dict[str, Callable[[Sequence[Factor], DesignOptions], Coded]] = {
-    "full-factorial": lambda factors, options: np.empty((0, len(factors))),
-    "fractional-factorial": _fractional,
-    "plackett-burman": _plackett_burman,
-    **dict.fromkeys(("central-composite", "box-behnken"), _response_surface),
-    **dict.fromkeys(("latin-hypercube", "sobol", "saltelli", "morris"), _sampled),
-}
-"""Designs by name, as coded points; full-factorial takes the levels themselves (``_full_factorial``)."""
+    names = [factor.name for factor in factors]
+    return {"num_vars": len(factors), "names": names, "bounds": [[-1.0, 1.0]] * len(factors)}

@@ -17,17 +17,15 @@ class WorkerDied(Exception):  # noqa: N818 - what happened to a worker, no mista
 
 
 class Executor(Protocol):
-    """Does jobs. An engine for clusters needs no more than this."""
+    """Does jobs. An engine for clusters needs no more than this.
 
-    @property
-    def workers(self) -> int:
-        """Number of jobs that are done at a time."""
-        ...
+    Attributes:
+        workers: Number of jobs that are done at a time.
+        cores: Cores that a job uses.
+    """
 
-    @property
-    def cores(self) -> int:
-        """Cores that a job uses."""
-        ...
+    workers: int
+    cores: int
 
     def submit(self, job: Job) -> "Future[Outcome]":
         """Start a job as soon as a worker is free; the future raises ``WorkerDied`` if its worker ends before it."""
@@ -68,7 +66,9 @@ class LocalExecutor:
         try:
             return pool.submit(perform, job).result()
         except BrokenProcessPool:
-            self._forget()
+            self._pids.discard(self._own.pid)
+            pool.shutdown(wait=False)
+            self._own.pool = None
             raise WorkerDied from None
 
     def _pool(self) -> ProcessPoolExecutor:
@@ -89,11 +89,6 @@ class LocalExecutor:
             if self._closed:
                 self.close()
         return self._own.pool
-
-    def _forget(self) -> None:
-        self._pids.discard(self._own.pid)
-        self._own.pool.shutdown(wait=False)
-        self._own.pool = None
 
     def close(self) -> None:
         """See ``Executor``."""
@@ -131,11 +126,7 @@ def start_worker(threads: int) -> None:
 
 
 def _end_with(parent: "multiprocessing.process.BaseProcess") -> None:
-    """Wait for the end of the parent and end this process, whatever it is doing.
-
-    A process pool's own worker waits for its next job forever when its parent is killed, since it holds both ends of
-    the pipe that it reads.
-    """
+    """End this process with its parent: a worker of a process pool would wait for its next job forever."""
     parent.join()
     os._exit(1)
 

@@ -1,11 +1,12 @@
 """Factors of a study: configuration keys with levels or a range."""
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from operator import attrgetter
 from typing import Any, Literal
 
 import numpy as np
-import tomli_w
 from numpy.typing import NDArray
 
 from dudmap.config import Config, keys
@@ -13,6 +14,8 @@ from dudmap.errors import ConfigError
 
 Value = float | int | bool | str | list[Any]
 """Value of a configuration key."""
+Table = Any
+"""A pandas DataFrame or Series. Type checkers cannot follow which of its many types an expression of pandas has."""
 
 
 @dataclass(frozen=True)
@@ -69,18 +72,13 @@ def is_number(value: object) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def assignment(key: str, value: Value) -> str:
-    """``key=value`` as ``Config.override`` reads it."""
-    return f"{key}={tomli_w.dumps({'value': value}).partition('=')[2].strip()}"
-
-
 def configured(base: Config, values: Mapping[str, Value]) -> Config:
     """Configuration ``base`` with the values of some keys.
 
     Raises:
         ConfigError: A key is unknown or a value invalid.
     """
-    return base.override([assignment(key, value) for key, value in values.items()])
+    return base.override([f"{key}={json.dumps(value)}" for key, value in values.items()])
 
 
 def make_factor(key: str, given: object, base: Config) -> Factor:
@@ -97,48 +95,25 @@ def make_factor(key: str, given: object, base: Config) -> Factor:
     table = {"levels": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or len({"levels", "range"} & set(table)) != 1:
         raise ConfigError(f"factor {key} is {given!r}; expected a list of levels, or range = [low, high]")
-    unknown = set(table) - {"levels", "range", "scale"}
-    scale = table.get("scale", "linear")
-    if unknown or scale not in ("linear", "log"):
-        raise ConfigError(
-            f"factor {key} has {', '.join(sorted(unknown)) or f'scale {scale!r}'}; "
-            "known are levels, range and scale = linear or log"
-        )
-    values = table.get("levels", table.get("range"))
+    scale, values = table.get("scale", "linear"), table.get("levels", table.get("range"))
+    if set(table) - {"levels", "range", "scale"} or scale not in ("linear", "log"):
+        raise ConfigError(f"factor {key} is {given!r}; known are levels, range and scale = linear or log")
     if not isinstance(values, list) or len(values) < 2 or any(value in values[:n] for n, value in enumerate(values)):
         raise ConfigError(f"factor {key} has {values!r}; expected two or more different values")
-    factor = _factor(key, values, "range" in table, scale, base)
-    for value in values:
-        configured(base, {key: value})
-    return factor
-
-
-def _factor(key: str, values: list[Any], is_range: bool, scale: Any, base: Config) -> Factor:  # noqa: ANN401
     if key not in keys():
         configured(base, {key: values[0]})  # names the nearest known key
-    numeric = all(is_number(value) for value in values)
+    numeric, is_range = all(map(is_number, values)), "range" in table
     if is_range and (not numeric or len(values) != 2 or values[0] >= values[1]):
         raise ConfigError(f"factor {key} has range {values!r}; expected two growing numbers")
     low, high = (float(min(values)), float(max(values))) if numeric else (float("nan"), float("nan"))
     if scale == "log" and not low > 0:
         raise ConfigError(f"factor {key} has the scale log and the values {values!r}; expected numbers above 0")
-    whole = numeric and _is_whole(key, base)
+    whole = numeric and type(attrgetter(key)(base)) is int
     if whole and any(value != round(value) for value in values):
         raise ConfigError(f"factor {key} has {values!r}; it takes whole numbers only")
+    for value in values:
+        configured(base, {key: value})
     return Factor(key, () if is_range else tuple(values), low, high, scale, whole)
-
-
-def value_of(config: Config, key: str) -> Any:  # noqa: ANN401 - values have many types
-    """Value of a dotted key."""
-    value: Any = config
-    for part in key.split("."):
-        value = getattr(value, part)
-    return value
-
-
-def _is_whole(key: str, base: Config) -> bool:
-    value = value_of(base, key)
-    return isinstance(value, int) and not isinstance(value, bool)
 
 
 def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...]:
@@ -153,18 +128,17 @@ def make_factors(table: Mapping[str, object], base: Config) -> tuple[Factor, ...
 
     flat: dict[str, object] = {}
     for key, given in table.items():
-        if key == "all_numeric":
-            continue
-        nested = isinstance(given, dict) and not {"levels", "range"} & set(given)
+        nested = isinstance(given, dict) and key != "all_numeric" and not {"levels", "range"} & set(given)
         flat |= {f"{key}.{name}": inner for name, inner in given.items()} if nested else {key: given}  # type: ignore[union-attr]
+    everything = flat.pop("all_numeric", None)
     chosen = tuple(make_factor(key, given, base) for key, given in flat.items())
     if "all_numeric" in table:
-        chosen += numeric_factors(table["all_numeric"], base, flat)
+        chosen += numeric_factors(everything, base, flat)
     if not chosen:
         raise ConfigError('the design has no factors; expected, for example, [factors] "tracker.huber" = [0.005, 0.01]')
     return chosen
 
 
-def coded_points(factors: Sequence[Factor], points: Sequence[Mapping[str, Any]]) -> NDArray[np.float64]:
-    """(N, K) coded values of N points with K numeric factors."""
-    return np.column_stack([factor.coded([point[factor.key] for point in points]) for factor in factors])
+def coded_points(factors: Sequence[Factor], points: Table) -> NDArray[np.float64]:
+    """(N, K) coded values of a table of N points with K numeric factors."""
+    return np.column_stack([factor.coded(points[factor.key]) for factor in factors])

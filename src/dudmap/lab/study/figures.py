@@ -1,4 +1,4 @@
-"""Figures of a study as PNG: main effects, interactions, residuals, Pareto front, indices."""
+"""Figures of a study as PNG: main effects, interactions, response surface, Pareto front, indices, screening."""
 
 import io
 from collections.abc import Sequence
@@ -6,8 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from dudmap.lab.study.factors import Factor
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.factors import Factor, Table
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -77,25 +76,6 @@ def interactions_figure(tables: dict[tuple[str, str], Table], factors: Sequence[
             ax.tick_params(axis="y", labelsize=7)
             ax.legend(fontsize=6, title=first.name, title_fontsize=6)
     figure.supylabel(heading, fontsize=9)
-    return png(figure)
-
-
-def residuals_figure(surface: "Surface") -> bytes:
-    """Residuals against predictions, their normal quantiles, and Cook's distance of every run."""
-    from scipy import stats
-
-    figure, axes = _axes(1, 3, 3.6, 3.0)
-    fitted, residuals = np.asarray(surface.model.fittedvalues), np.asarray(surface.model.resid)
-    axes[0][0].scatter(fitted, residuals, s=8)
-    axes[0][0].axhline(0, color="0.7", lw=0.8)
-    axes[0][0].set(xlabel="predicted", ylabel="residual")
-    quantiles: Any = stats.probplot(residuals)
-    (ordered, values), (slope, offset, _) = quantiles
-    axes[0][1].scatter(ordered, values, s=8)
-    axes[0][1].plot(ordered, slope * ordered + offset, color="0.6", lw=0.8)
-    axes[0][1].set(xlabel="normal quantile", ylabel="residual")
-    axes[0][2].bar(range(len(fitted)), surface.model.get_influence().cooks_distance[0])
-    axes[0][2].set(xlabel="run", ylabel="Cook's distance")
     return png(figure)
 
 

@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.lab.study.designs import MORRIS_LEVELS, problem
-from dudmap.lab.study.factors import Factor, coded_points
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.factors import Factor, Table, coded_points
 
 FOLDS = 5
 """Folds of the cross-validation of an emulator."""
@@ -57,7 +56,7 @@ def emulated_indices(table: Table, factors: Sequence[Factor], response: str, see
     from sklearn.model_selection import KFold, cross_val_predict
 
     means = table.groupby([factor.key for factor in factors], as_index=False)[response].mean()
-    x = coded_points(factors, means[[factor.key for factor in factors]].to_dict("records"))
+    x = coded_points(factors, means)
     y = means[response].to_numpy(float)
     if len(y) < 2 * FOLDS or np.ptp(y) == 0:
         return None, f"{len(y)} different points are too few for an emulator, or the response does not vary."
@@ -72,10 +71,8 @@ def emulated_indices(table: Table, factors: Sequence[Factor], response: str, see
     text = f"A Gaussian process predicts {max(share, 0):.0%} of the variance between the points in cross-validation"
     if share < ENOUGH_PREDICTED:
         return None, f"{text}; Sobol indices of it would mean nothing."
-    sampled = sample(problem(factors), EMULATED, calc_second_order=True, seed=seed)
-    return sobol_indices(
-        factors, np.asarray(process.predict(sampled)), seed
-    ), f"{text}; the indices are those of the process."
+    values = process.predict(sample(problem(factors), EMULATED, calc_second_order=True, seed=seed))
+    return sobol_indices(factors, np.asarray(values), seed), f"{text}; the indices are those of the process."
 
 
 def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values: NDArray[np.float64]) -> Table:
@@ -90,8 +87,7 @@ def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values
     from SALib.analyze.morris import analyze
 
     found = analyze(problem(factors), coded, values, num_levels=MORRIS_LEVELS, seed=0)
+    names = [factor.name for factor in factors]
     columns = {"mu*": found["mu_star"], "95 % +-": found["mu_star_conf"], "mu": found["mu"], "sigma": found["sigma"]}
-    frame = pd.DataFrame(
-        {"factor": [factor.name for factor in factors], **{k: np.asarray(v) for k, v in columns.items()}}
-    )
+    frame = pd.DataFrame({"factor": names} | {key: np.asarray(value) for key, value in columns.items()})
     return frame.sort_values("mu*", ascending=False, ignore_index=True)

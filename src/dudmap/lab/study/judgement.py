@@ -1,11 +1,15 @@
-"""Whether the optimum of a response surface is to be believed: reasons against it, and confirmation runs."""
+"""The optimum of a response surface, whether it is to be believed, and runs that confirm it."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from dudmap.lab.study.response_surface import LackOfFit, Optimum, Surface, optimum
+from dudmap.lab.study.designs import Point
+from dudmap.lab.study.factors import Factor, Table
+from dudmap.lab.study.response_surface import Optimum, Surface, fit_surface, lack_of_fit, optimum, values_text
+from dudmap.lab.study.responses import Scale
 
 ENOUGH_EXPLAINED = 0.5
 """Smallest share of the variance that a model must predict (leave-one-out) to be better than a guess."""
@@ -13,62 +17,56 @@ SIGNIFICANT = 0.05
 """Largest p of a significant lack of fit."""
 
 
-@dataclass(frozen=True)
-class Influence:
-    """The run with the largest Cook's distance, and the model without it.
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """Quadratic model of a response, its optimum and the best point of the design.
 
     Attributes:
-        label: The run.
-        value: Its response.
-        distance: Its Cook's distance.
-        limit: Median of F(P, N - P): beyond it the run moves the estimate out of its own 50 % confidence region
-            (Cook 1977).
-        r2_without: Share of the variance that the model explains without it.
-        sd_without: Standard deviation of the residuals without it.
-        optimum_without: Optimum without it.
+        surface: The model.
+        best: Its optimum.
+        point: Values of all factors at the optimum; those without numbers have their best level.
+        best_point: Values of all factors at the best point of the design.
+        reasons: What speaks against the optimum before it is confirmed, each a sentence.
     """
 
-    label: str
-    value: float
-    distance: float
-    limit: float
-    r2_without: float
-    sd_without: float
-    optimum_without: Optimum
-
-    @property
-    def carries(self) -> bool:
-        """Whether the run carries the model."""
-        return self.distance > self.limit
+    surface: Surface
+    best: Optimum
+    point: Point
+    best_point: Point
+    reasons: tuple[str, ...]
 
 
-def influence(surface: Surface) -> Influence | None:
-    """The most influential run; None if the model cannot be fitted without it."""
-    import statsmodels.api as sm
-    from scipy import stats
+def predict_optimum(data: Table, factors: Sequence[Factor], scale: Scale) -> Prediction | str:
+    """Quadratic model of a response and its optimum, or a sentence that says why there is none.
 
-    model = surface.model
-    distances = model.get_influence().cooks_distance[0]
-    worst = int(np.argmax(distances))
-    rest = np.arange(len(distances)) != worst
-    exog = np.asarray(model.model.exog)
-    if np.linalg.matrix_rank(exog[rest]) < exog.shape[1] or rest.sum() <= exog.shape[1]:
-        return None
-    without = sm.OLS(surface.observed[rest], exog[rest]).fit()
-    smaller = Surface(
-        surface.factors, surface.features, without, surface.blocks, surface.observed[rest], surface.coded[rest],
-        [label for label, keep in zip(surface.labels, rest, strict=True) if keep], surface.better,
-    )  # fmt: skip
-    limit = float(stats.f.ppf(0.5, exog.shape[1], model.df_resid))
-    return Influence(
-        surface.labels[worst], float(surface.observed[worst]), float(distances[worst]), limit,
-        smaller.r2, smaller.residual_sd, optimum(smaller),
-    )  # fmt: skip
+    Args:
+        data: Runs, as ``Scale.usable`` gives them.
+        factors: All factors.
+        scale: The response.
+    """
+    surface = fit_surface(data, factors, scale)
+    if isinstance(surface, str):
+        return surface
+    best, name = optimum(surface), scale.response
+    sizes = data.groupby("point")[name].transform("size")
+    means = scale.sign * data[sizes == sizes.max()].groupby("point")[name].mean()
+    first = data[data["point"] == means.idxmin()].iloc[0]
+    point: dict[str, Any] = {}
+    for factor in factors:
+        labels = data[factor.key].map(str)
+        label = (scale.sign * data.groupby(labels)[name].mean()).idxmin()
+        point[factor.key] = best.values.get(factor.key, _plain(data[factor.key][labels == label].iloc[0]))
+    best_point = {factor.key: _plain(first[factor.key]) for factor in factors}
+    return Prediction(surface, best, point, best_point, reasons_against(surface, best))
 
 
-def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influence | None) -> tuple[str, ...]:
+def _plain(value: Any) -> Any:  # noqa: ANN401 - a value of a table as plain Python
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def reasons_against(surface: Surface, best: Optimum) -> tuple[str, ...]:
     """Reasons not to believe the optimum of a surface before it is confirmed, each a sentence."""
-    reasons = []
+    reasons, scale = [], surface.scale
     if surface.r2_predicted < ENOUGH_EXPLAINED:
         reasons.append(
             f"The model explains {surface.r2:.0%} of the variance (R2 = {surface.r2:.2f}) and predicts "
@@ -76,32 +74,46 @@ def judge(surface: Surface, best: Optimum, fit: LackOfFit | None, single: Influe
             f"(R2 = {surface.r2_predicted:.2f})."
         )
     seen = surface.best_seen
-    gain = abs(seen - best.predicted)
     noise = surface.residual_sd / np.sqrt(len(surface.observed) / len(surface.point_means))
-    if gain < noise:
-        per = " per point" if noise < surface.residual_sd else ""
-        side = "below" if surface.better == "low" else "above"
-        beyond = (best.predicted < seen) == (surface.better == "low") and best.predicted != seen
+    if abs(seen - best.predicted) < noise:
+        beyond = scale.sign * best.predicted < scale.sign * seen
+        side = "below" if scale.sign > 0 else "above"
         where = f"lies {side} everything observed" if beyond else "is no better than the best observed"
         reasons.append(
-            f"The prediction {best.predicted:.4g} {where} ({seen:.4g}), from which it differs by {gain:.2g}, less than "
-            f"the standard deviation of the residuals{per}, {noise:.3g}."
+            f"The prediction {scale.text(best.predicted)} {where} ({scale.text(seen)}), from which it differs by less "
+            f"than the standard deviation of the residuals of a point, {noise:.3g}{scale.unit}."
         )
-    if single is not None and single.carries:
-        where = ", ".join(
-            f"{key.rpartition('.')[2]} {value:.4g}" for key, value in single.optimum_without.values.items()
-        )
-        reasons.append(
-            f"One value carries the model: {single.value:.4g} at {single.label}, with a Cook's distance of "
-            f"{single.distance:.2f} (limit {single.limit:.2f}); without it R2 is {single.r2_without:.2f}, the "
-            f"standard deviation of the residuals {single.sd_without:.3g}, and the optimum "
-            f"{single.optimum_without.predicted:.4g} at {where}."
-        )
-    if fit is not None and fit.p < SIGNIFICANT:
-        reasons.append(
-            f"The lack of fit is significant (F = {fit.f:.2f}, p = {fit.p:.2g}): the response is not quadratic."
-        )
+    if (single := carried_by(surface)) is not None:
+        reasons.append(single)
+    fit = lack_of_fit(surface)
+    if fit is not None and fit[1] < SIGNIFICANT:
+        reasons.append(f"The lack of fit is significant (F = {fit[0]:.2f}, p = {fit[1]:.2g}): it is not quadratic.")
     return tuple(reasons)
+
+
+def carried_by(surface: Surface) -> str | None:
+    """The run that carries the model, and the model without it, as a sentence; None if no run does.
+
+    A run carries the model if its Cook's distance is beyond the median of F(P, N - P): it then moves the estimate out
+    of its own 50 % confidence region (Cook 1977).
+    """
+    import statsmodels.api as sm
+    from scipy import stats
+
+    model, scale = surface.model, surface.scale
+    distances, exog = model.get_influence().cooks_distance[0], np.asarray(model.model.exog)
+    worst, limit = int(np.argmax(distances)), float(stats.f.ppf(0.5, exog.shape[1], model.df_resid))
+    rest = np.arange(len(distances)) != worst
+    if distances[worst] <= limit or np.linalg.matrix_rank(exog[rest]) < exog.shape[1] or rest.sum() <= exog.shape[1]:
+        return None
+    observed = surface.observed[rest]
+    smaller = replace(surface, model=sm.OLS(observed, exog[rest]).fit(), observed=observed, coded=surface.coded[rest])
+    best = optimum(smaller)
+    return (
+        f"One value carries the model: {scale.text(surface.observed[worst])} at {surface.labels[worst]}, with a Cook's "
+        f"distance of {distances[worst]:.2f} (limit {limit:.2f}); without it R2 is {smaller.r2:.2f}, and the optimum "
+        f"{scale.text(best.predicted)} at {values_text(best.values)}."
+    )
 
 
 @dataclass(frozen=True)
@@ -109,15 +121,16 @@ class Confirmation:
     """Runs at the predicted optimum, beside runs at the best point of the design on the same recordings.
 
     Attributes:
+        scale: The response; all values are as it is analysed.
         predicted: Prediction of the model.
         low, high: Interval in which the mean of the confirmation runs should fall.
-        measured: Mean of the confirmation runs.
         design_mean: Mean of all runs of the design: what one would predict without a model.
+        measured: Mean of the confirmation runs.
         best_point: Mean of the runs at the best point of the design on the same recordings.
         count: Number of confirmation runs.
-        better: Whether ``low`` or ``high`` values are good.
     """
 
+    scale: Scale
     predicted: float
     low: float
     high: float
@@ -125,12 +138,6 @@ class Confirmation:
     measured: float
     best_point: float
     count: int
-    better: str
-
-    @property
-    def inside(self) -> bool:
-        """Whether the measured mean lies in the interval."""
-        return self.low <= self.measured <= self.high
 
     @property
     def informative(self) -> bool:
@@ -140,22 +147,23 @@ class Confirmation:
     @property
     def improves(self) -> bool:
         """Whether the optimum is at least as good as the best point of the design."""
-        return self.measured == self.best_point or (self.measured < self.best_point) == (self.better == "low")
+        return self.scale.sign * self.measured <= self.scale.sign * self.best_point
 
     @property
     def held(self) -> bool:
         """Whether the model held: it said what would be measured, more exactly than the mean does, and where to go."""
-        return self.inside and self.informative and self.improves
+        return self.low <= self.measured <= self.high and self.informative and self.improves
 
     def __str__(self) -> str:
+        text = self.scale.text
         runs = "1 run" if self.count == 1 else f"mean of {self.count} runs"
-        part = "inside" if self.inside else "outside"
-        wide = "" if self.informative else f" (so wide that it holds the mean of the design, {self.design_mean:.4g})"
+        part = "inside" if self.low <= self.measured <= self.high else "outside"
+        wide = "" if self.informative else f" (so wide that it holds the mean of the design, {text(self.design_mean)})"
         found = "no worse" if self.improves else "worse"
         return (
-            f"Predicted {self.predicted:.4g}, measured {self.measured:.4g} ({runs}), {part} the interval "
-            f"{self.low:.4g} to {self.high:.4g}{wide}; {found} than the best point of the design on the same "
-            f"recordings, {self.best_point:.4g}. The prediction was {'' if self.held else 'not '}confirmed."
+            f"Predicted {text(self.predicted)}, measured {text(self.measured)} ({runs}), {part} the interval "
+            f"{text(self.low)} to {text(self.high)}{wide}; {found} than the best point of the design on the same "
+            f"recordings, {text(self.best_point)}. The prediction was {'' if self.held else 'not '}confirmed."
         )
 
 
@@ -169,7 +177,5 @@ def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_poi
         best_point: (M,) response of runs at the best point of the design, on the same recordings.
     """
     predicted, low, high = surface.interval(np.array(best.coded), len(measured))
-    mean, other = float(np.mean(measured)), float(np.mean(best_point))
-    return Confirmation(
-        predicted, low, high, float(surface.observed.mean()), mean, other, len(measured), surface.better
-    )
+    mean, other, usual = (float(np.mean(values)) for values in (measured, best_point, surface.observed))
+    return Confirmation(surface.scale, predicted, low, high, usual, mean, other, len(measured))

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from dudmap.lab.benchmark.table import grid
-from dudmap.lab.study.tables import Table
+from dudmap.lab.study.factors import Table
 
 STYLE = (
     "body{font:15px/1.5 sans-serif;max-width:70em;margin:2em auto;padding:0 1em}img{max-width:100%}figure{margin:1em 0}"

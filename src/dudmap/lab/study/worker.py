@@ -4,10 +4,9 @@ import json
 import time
 import traceback
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, cast
 
 from dudmap.errors import DudmapError
 from dudmap.lab.benchmark.entries import Entry, Excerpt
@@ -29,21 +28,24 @@ SAMPLES = 40_000
 """Points sampled on each surface; the standard error of a share of 1 % is then at most 0.05 %."""
 
 
-@dataclass(frozen=True)
-class Job:
+Do = Callable[[Run, Path | None], dict[str, Any]]
+"""Makes the row of a run, and keeps the run in a folder if given."""
+
+
+class Job(NamedTuple):
     """A run and the study folder that takes its result.
 
     Attributes:
         run: The run.
         root: The study folder.
         keep: Whether the whole run folder (trajectory, mesh, map) is kept beside the figures.
-        do: Function that makes the row of the run, and keeps it in a folder if given; None runs the system.
+        do: What is done; None runs the system.
     """
 
     run: Run
     root: Path
     keep: bool = False
-    do: Callable[[Run, Path | None], dict[str, Any]] | None = None
+    do: Do | None = None
 
 
 def perform(job: Job) -> Outcome:
@@ -83,42 +85,27 @@ def measure_run(run: Run, out: Path | None) -> dict[str, Any]:
     from dudmap.lab.benchmark.measure import measure_sequence
 
     reset_peak_memory()
-    same = SameRecording(run.entry)
     return measure_sequence(
-        _recording(same), run.config, _surfaces(same) if run.surfaces else None, out,
+        _recording(run.entry), run.config, _surfaces(run.entry) if run.surfaces else None, out,
         run.entry.max_frames, SAMPLES, calibrate=run.calibrate, ahead=0,
     )  # fmt: skip
 
 
-class SameRecording:
-    """Entry that is equal to others of the same recording, as the key of a cache."""
-
-    def __init__(self, entry: Entry) -> None:
-        self.entry = entry
-        self._content = json.dumps([str(entry.path), dict(entry.parameters)], sort_keys=True, default=str)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, SameRecording) and self._content == other._content
-
-    def __hash__(self) -> int:
-        return hash(self._content)
-
-
 @lru_cache(maxsize=1)
-def _recording(of: SameRecording) -> "Sequence":
+def _recording(entry: Entry) -> "Sequence":
     """Recording of a run; a short one is read or rendered once for all runs that follow each other."""
-    sequence = of.entry.open()
-    frames = min(len(sequence), of.entry.max_frames or len(sequence))
+    sequence = entry.open()
+    frames = min(len(sequence), entry.max_frames or len(sequence))
     size = frames * sequence.camera.width * sequence.camera.height * PIXEL_BYTES
     return cast("Sequence", Excerpt(sequence)) if size <= CACHED_BYTES else sequence
 
 
 @lru_cache(maxsize=4)
-def _surfaces(of: SameRecording) -> "tuple[Surface, Surface] | None":
+def _surfaces(entry: Entry) -> "tuple[Surface, Surface] | None":
     """True surfaces of a recording with their search trees."""
     from dudmap.evaluation.surface import Surface
 
-    found = of.entry.surfaces(of.entry.open())
+    found = entry.surfaces(entry.open())
     return None if found is None else (Surface(found[0], "the true surface"), Surface(found[1], "its observed part"))
 
 
