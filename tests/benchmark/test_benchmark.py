@@ -16,9 +16,8 @@ from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
 from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
-from dudmap.lab.benchmark.published import published
-from dudmap.lab.benchmark.suites import SUITES, find_suite
-from dudmap.lab.benchmark.systems import ABLATION, systems
+from dudmap.lab.benchmark.report import published
+from dudmap.lab.benchmark.suites import ABLATION, SUITES, find_suite, systems
 from dudmap.lab.benchmark.table import markdown
 from layouts import corbs, icl_nuim, pose, volume_deform, write
 from recordings import write_recording
@@ -178,7 +177,7 @@ def test_a_process_that_dies_or_fails_is_an_error_of_its_row(capfd):
 # -- the limit of dynamics --------------------------------------------------------------------------------------------
 
 
-SWEEP = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.1, 0.3, 0.5))
+SWEEP = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.1, 0.3, 0.5))
 
 
 def made_up(system, x, coverage, ate):
@@ -237,7 +236,7 @@ def test_the_grids_hold_what_is_asked_for():
 
 @pytest.mark.slow
 def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
-    sweep = limits.Sweep("speed", "mover speed, m/s", (0.1, 1.0), (0.0,))
+    sweep = limits.Sweep("speed", "mover speed, m/s", "speed", (0.1, 1.0), (0.0,))
     cells = limits.grid_cells((sweep,), 6)
     wanted = systems("none")
     first = limits.measure_cells(cells, wanted, tmp_path, 1)
@@ -245,9 +244,9 @@ def test_limits_measure_once_and_go_on(tmp_path, monkeypatch):
     assert first[0]["copes"]
     assert first[0]["ate_rmse_m"] == first[1]["ate_rmse_m"]
     assert len(list(tmp_path.iterdir())) == 1
-    monkeypatch.setattr(limits, "in_own_process", lambda *_: pytest.fail("measured again"))
+    monkeypatch.setattr(measure, "in_own_process", lambda *_: pytest.fail("measured again"))
     assert limits.measure_cells(cells, wanted, tmp_path, 1) == first
-    monkeypatch.setattr(limits, "in_own_process", lambda *_: {"error": "the process died"})
+    monkeypatch.setattr(measure, "in_own_process", lambda *_: {"error": "the process died"})
     other = limits.measure_cells(cells, systems("em"), tmp_path, 2)
     assert [row["error"] for row in other] == ["the process died"] * 2
 

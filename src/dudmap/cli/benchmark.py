@@ -48,9 +48,8 @@ def suite_command(
 ) -> None:
     """Measure every recording of the suite; write Markdown, CSV and JSON."""
     from dudmap.lab.benchmark.report import named_folders, run_suite
-    from dudmap.lab.benchmark.suites import find_suite
-    from dudmap.lab.benchmark.systems import ABLATION
-    from dudmap.lab.benchmark.systems import systems as find_systems
+    from dudmap.lab.benchmark.suites import ABLATION, find_suite
+    from dudmap.lab.benchmark.suites import systems as find_systems
 
     name = str(context.info_name)
     usual = ABLATION if name == "ablation" else "dudmap"
@@ -327,10 +326,9 @@ def limits(
     Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
     from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.conditions import FRAMES
     from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
-    from dudmap.lab.benchmark.limits import QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
-    from dudmap.lab.benchmark.systems import systems as find_systems
+    from dudmap.lab.benchmark.limits import FRAMES, QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
+    from dudmap.lab.benchmark.suites import systems as find_systems
     from dudmap.lab.benchmark.table import save
 
     wanted = find_systems(systems)
@@ -339,12 +337,12 @@ def limits(
     total, finished = len({cell.condition for cell in cells}), 0
     with counted("conditions", quiet=as_json) as progress:
 
-        def done(count: int) -> None:
+        def done(_: object) -> None:
             nonlocal finished
-            finished += count
+            finished += 1
             progress(finished, total)
 
-        rows = measure_cells(cells, wanted, out / "measured", jobs, done)
+        rows = measure_cells(cells, wanted, out, jobs, done)
     for sweep in sweeps:
         save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"

@@ -10,25 +10,9 @@ from dudmap.config import Config
 from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.measure import Row, measure_sequence
+from dudmap.lab.benchmark.suites import WORLDS
 from dudmap.lab.benchmark.table import grid
 
-SMALL = (320, 240)
-WORLDS: dict[str, dict[str, Any]] = {
-    "room-people-at-start": {"frames": 40, "situation": "people_at_start"},
-    "room-crowd": {"frames": 64, "coverage": 0.35},
-    "desk-fast-camera": {"frames": 40, "scene": "desk", "movers": (), "camera_path": "fast"},
-    "colour-faults": {
-        "frames": 60,
-        "movers": (),
-        "faults": {
-            "color_translation": (0.025, 0.0, 0.0),
-            "color_focal_ratio": 0.95,
-            "color_delay": 0.025,
-            "color_readout": 0.025,
-        },
-    },
-    "kinect-v1": {"frames": 40, "situation": "people_at_start", "sensor": "kinect_v1"},
-}
 EXCERPT = "freiburg1_xyz"
 """Twelve real frames among the test fixtures."""
 FIGURES: dict[str, tuple[str, float, float]] = {
@@ -49,7 +33,7 @@ def gate_entries(fixtures: Path) -> list[Entry]:
     Args:
         fixtures: Folder that contains the real excerpt.
     """
-    worlds = [Entry(name, parameters={**parameters, "camera": SMALL}) for name, parameters in WORLDS.items()]
+    worlds = [Entry(name, parameters=parameters) for name, parameters in WORLDS["gate"].items()]
     return [*worlds, Entry(EXCERPT, fixtures / EXCERPT)]
 
 

@@ -9,40 +9,33 @@ from numpy.typing import NDArray
 
 from dudmap.lab.benchmark.limits import LARGEST_ATE, Sweep, limit
 from dudmap.lab.benchmark.measure import Row
-from dudmap.lab.benchmark.table import grid
+from dudmap.lab.benchmark.table import Column, grid
 
 
 class Quantity(NamedTuple):
-    """One row of heat maps: figure, heading, factor from the stored unit, range and scale of the colours, format."""
+    """One row of heat maps: figure, range of the colours from good to bad, and whether they are logarithmic."""
 
-    key: str
-    heading: str
-    factor: float
-    low: float
-    high: float
-    logarithmic: bool
-    good_is_low: bool
-    form: str
+    figure: Column
+    good: float
+    bad: float
+    logarithmic: bool = False
 
 
 QUANTITIES = (
-    Quantity("ate_rmse_m", "ATE RMSE, mm", 1000, 2, 500, True, True, "{:.2g}"),
-    Quantity("mask_iou_mean", "mask IoU", 1, 0, 1, False, False, "{:.2f}"),
-    Quantity("ghost_area_m2", "ghost area, m²", 1, 0.5, 20, True, True, "{:.2g}"),
-    Quantity("lost_share", "share of frames lost, %", 100, 0, 100, False, True, "{:.0f}"),
+    Quantity(Column("ate_rmse_m", "ATE RMSE, mm", 1000, 1), 2, 500, True),
+    Quantity(Column("mask_iou_mean", "mask IoU", 1, 2), 1, 0),
+    Quantity(Column("ghost_area_m2", "ghost area, m²", 1, 1), 0.5, 20, True),
+    Quantity(Column("lost_share", "share of frames lost, %", 100, 0), 0, 100),
 )
-NOT_KNOWN = "#d0d0d0"
 
 
 def values(rows: Listing[Row], sweep: Sweep, system: str, key: str) -> NDArray[np.float64]:
     """Array (coverages, xs) of one figure of a system, NaN where there is none."""
-    found = {
-        (row["coverage"], row["x"]): row.get(key)
-        for row in rows
-        if row["sweep"] == sweep.name and row["system"] == system
-    }
-    cells = [[found.get((coverage, x)) for x in sweep.xs] for coverage in sweep.coverages]
-    return np.array([[np.nan if cell is None else float(cell) for cell in line] for line in cells])
+    out = np.full((len(sweep.coverages), len(sweep.xs)), np.nan)
+    for row in rows:
+        if (row["sweep"], row["system"]) == (sweep.name, system) and row.get(key) is not None:
+            out[sweep.coverages.index(row["coverage"]), sweep.xs.index(row["x"])] = row[key]
+    return out
 
 
 def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path: Path) -> None:
@@ -51,31 +44,31 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
     A framed cell is a condition with which the system copes (ATE within the limit, no frame lost). Grey cells have no
     value. A star marks an ATE that excludes lost frames.
     """
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib import colormaps
+    from matplotlib.colors import LogNorm, Normalize
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
     width, height = 0.62 * len(sweep.xs) + 0.9, 0.34 * len(sweep.coverages) + 0.9
     figure = Figure((width * len(systems) + 0.6, height * len(QUANTITIES) + 0.6), layout="constrained")
-    FigureCanvasAgg(figure)
     axes = figure.subplots(len(QUANTITIES), len(systems), squeeze=False)
-    for line, quantity in zip(axes, QUANTITIES, strict=True):
+    for line, (column, good, bad, logarithmic) in zip(axes, QUANTITIES, strict=True):
+        colors = colormaps["RdYlGn_r" if good < bad else "RdYlGn"].with_extremes(bad="#d0d0d0")
+        scale = (LogNorm if logarithmic else Normalize)(min(good, bad), max(good, bad), clip=True)
         for axis, system in zip(line, systems, strict=True):
-            shown = values(rows, sweep, system, quantity.key) * quantity.factor
+            shown = values(rows, sweep, system, column.key) * column.factor
             copes, lost = (values(rows, sweep, system, key) for key in ("copes", "lost"))
-            axis.set_facecolor(NOT_KNOWN)
-            axis.imshow(_colors(shown, quantity), origin="lower", aspect="auto")
+            axis.imshow(np.ma.masked_invalid(shown), colors, scale, origin="lower", aspect="auto", alpha=0.65)
             for (r, c), value in np.ndenumerate(shown):
-                text = "–" if np.isnan(value) else ("{:.0f}" if value >= 10 else quantity.form).format(value)
-                text += "*" if quantity.key == "ate_rmse_m" and lost[r, c] > 0 else ""
+                text = "–" if np.isnan(value) else f"{value:.{0 if value >= 10 else column.digits}f}"
+                text += "*" if column.key == "ate_rmse_m" and lost[r, c] > 0 else ""
                 axis.text(c, r, text, ha="center", va="center", fontsize=7)
                 if copes[r, c] == 1:
                     axis.add_patch(Rectangle((c - 0.46, r - 0.44), 0.92, 0.88, fill=False, lw=1.2))
             axis.set_xticks(range(len(sweep.xs)), [str(x) for x in sweep.xs], fontsize=7)
-            axis.set_yticks(
-                range(len(sweep.coverages)), [f"{100 * share:.0f} %" for share in sweep.coverages], fontsize=7
-            )
-            axis.set_title(f"{system}: {quantity.heading}", fontsize=8)
+            labels = [f"{100 * share:.0f} %" for share in sweep.coverages]
+            axis.set_yticks(range(len(labels)), labels, fontsize=7)
+            axis.set_title(f"{system}: {column.heading}", fontsize=8)
         line[0].set_ylabel("mover coverage", fontsize=7)
     for axis in axes[-1]:
         axis.set_xlabel(sweep.x, fontsize=7)
@@ -83,21 +76,6 @@ def save_heat_maps(rows: Listing[Row], sweep: Sweep, systems: Listing[str], path
     figure.suptitle(f"Limit of dynamics; {copes_if}; *: error of the frames not lost", fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
-
-
-def _colors(shown: NDArray[np.float64], quantity: Quantity) -> NDArray[np.float64]:
-    """Colours (R, C, 4) from green (good) to red (bad), transparent for NaN."""
-    from matplotlib import colormaps
-
-    if quantity.logarithmic:
-        clipped = np.clip(shown, quantity.low, quantity.high)
-        share = np.log(clipped / quantity.low) / np.log(quantity.high / quantity.low)
-    else:
-        share = (shown - quantity.low) / (quantity.high - quantity.low)
-    colors = colormaps["RdYlGn_r" if quantity.good_is_low else "RdYlGn"](np.nan_to_num(share))
-    colors[..., :3] = 0.35 + 0.65 * colors[..., :3]  # lighter, so that the numbers are legible
-    colors[np.isnan(shown), 3] = 0.0
-    return colors
 
 
 def limits_table(rows: Listing[Row], sweeps: Listing[Sweep], systems: Listing[str]) -> str:

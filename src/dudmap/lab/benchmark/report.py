@@ -1,17 +1,49 @@
 """Report of a suite: measured figures, results of other systems and published figures in one document."""
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
+from typing import NamedTuple
 
 from dudmap.app.pipeline.environment import machine, versions
 from dudmap.config import Config
 from dudmap.errors import ConfigError, DudmapError
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.measure import Job, Row, measure_all
-from dudmap.lab.benchmark.published import Published, published
-from dudmap.lab.benchmark.score import score_mesh, score_trajectory
+from dudmap.lab.benchmark.measure import Job, Row, measure_all, score_mesh, score_trajectory
 from dudmap.lab.benchmark.suites import Suite
 from dudmap.lab.benchmark.table import COLUMNS, grid, markdown, save, shown
+from dudmap.lab.data import tables
+
+
+class Published(NamedTuple):
+    """One published figure.
+
+    Attributes:
+        sequence: Name of the recording: that of its folder in the data set.
+        system: Name of the system.
+        metric: Key of the figure in our tables.
+        value: Value in the unit of our tables: metres, m/s, deg/s.
+        source: Publication.
+    """
+
+    sequence: str
+    system: str
+    metric: str
+    value: float
+    source: str
+
+
+def published(sequences: Collection[str] | None = None) -> list[Published]:
+    """Published figures (``published.toml``) of all or of the given recordings, in the order of the data file."""
+    content = tables("benchmark/published.toml")
+    sources = content["sources"]
+    return [
+        Published(sequence, row["system"], table["metric"], round(value * table["factor"], 7), sources[row["source"]])
+        for table in content["table"]
+        for row in table["rows"]
+        for sequence, value in zip(table["sequences"], row["values"], strict=True)
+        if not math.isnan(value) and (sequences is None or sequence in sequences)
+    ]
 
 
 def run_suite(

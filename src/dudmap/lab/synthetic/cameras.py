@@ -10,7 +10,7 @@ import numpy as np
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.data import tables
+from dudmap.lab.data import tables
 from dudmap.lab.synthetic.faults import SensorFaults
 
 
@@ -38,7 +38,7 @@ class CameraModel:
 
 CAMERAS: dict[str, CameraModel] = {
     name: CameraModel(**row | {"faults": SensorFaults(**row["faults"])})
-    for name, row in tables("sensors.toml")["cameras"].items()
+    for name, row in tables("synthetic/sensors.toml")["cameras"].items()
 }
 """Cameras by name."""
 

@@ -146,12 +146,14 @@ class SyntheticSequence:
             if mover.present(t)
         ]
 
-    def static_twin(self) -> "SyntheticSequence":
-        """Recording with the same camera path and sensor noise, but without movers."""
+    def static_twin(self, since: float = -np.inf) -> "SyntheticSequence":
+        """Recording with the same camera path and sensor noise, but without movers, or without them from a time on."""
+        movers = [replace(m, present=lambda t, m=m: t < since and m.present(t)) for m in self._movers]
+        kept, parameters = (movers, self.parameters) if since > -np.inf else ([], self.parameters | {"movers": []})
         return SyntheticSequence(
-            self.scene, [], self.ground_truth, self.camera,
+            self.scene, kept, self.ground_truth, self.camera,
             noise=self._noise, seed=self._seed, fps=self._fps, motion_blur=self._motion_blur,
-            exposure_change=self._exposure_change, faults=self.faults, parameters=self.parameters | {"movers": []},
+            exposure_change=self._exposure_change, faults=self.faults, parameters=parameters,
         )  # fmt: skip
 
     def mover_numbers(self, index: int) -> NDArray[np.int16]:

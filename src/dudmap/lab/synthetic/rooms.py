@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 
 from dudmap.errors import ConfigError
+from dudmap.lab.data import tables
 from dudmap.lab.synthetic import furniture
-from dudmap.lab.synthetic.data import tables
 from dudmap.lab.synthetic.scene import (
     Light,
     Material,
@@ -36,7 +36,7 @@ MAKERS: dict[str, Any] = {
 """Functions that make a solid, or a list of them, from the values of a row."""
 
 
-SCENES = tuple(tables("scenes.toml"))
+SCENES = tuple(tables("synthetic/scenes.toml"))
 """Names of the scenes."""
 
 
@@ -48,7 +48,7 @@ def build_scene(name: str) -> Scene:
     """
     if name not in SCENES:
         raise ConfigError(f"unknown scene {name!r}; known scenes: {', '.join(SCENES)}")
-    table = dict(tables("scenes.toml")[name])
+    table = dict(tables("synthetic/scenes.toml")[name])
     if "painted" in table:
         scene = build_scene(table["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]

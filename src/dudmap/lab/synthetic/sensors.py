@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.data import tables
+from dudmap.lab.data import tables
 from dudmap.lab.synthetic.kernels import depth_noise as kernels
 from dudmap.lab.synthetic.render import Rendering, over_rows
 
@@ -102,7 +102,7 @@ def _model(row: dict[str, Any]) -> SensorModel | TimeOfFlightModel | None:
     return None if not row else TimeOfFlightModel(**row) if "noise" in row else SensorModel(**row)
 
 
-SENSORS = {name: _model(row) for name, row in tables("sensors.toml")["noise"].items()}
+SENSORS = {name: _model(row) for name, row in tables("synthetic/sensors.toml")["noise"].items()}
 """Noise models by name; None is an ideal sensor. ``sensors.toml`` has the values and their sources."""
 
 

@@ -7,9 +7,9 @@ from typing import Any
 
 
 @cache
-def tables(name: str) -> dict[str, Any]:
+def tables(path: str) -> dict[str, Any]:
     """Tables of a TOML file of this package, with tuples in place of its lists; do not change them."""
-    return _fixed(tomllib.loads(files("dudmap.lab.synthetic").joinpath(name).read_text(encoding="utf-8")))
+    return _fixed(tomllib.loads(files("dudmap.lab").joinpath(path).read_text(encoding="utf-8")))
 
 
 def _fixed(value: Any) -> Any:  # noqa: ANN401 - any value of a TOML file
