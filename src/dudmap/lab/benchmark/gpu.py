@@ -15,8 +15,8 @@ from dudmap.core.backends.device import obstacle, resolve
 from dudmap.errors import ConfigError, DeviceError, DudmapError, MapError
 from dudmap.io.sequences import Sequence, open_sequence
 from dudmap.lab.benchmark.interleaved import median_ms, run_open3d, save_frames
+from dudmap.lab.benchmark.speed import WARM_UP
 from dudmap.lab.benchmark.table import grid
-from dudmap.lab.benchmark.timing import WARM_UP
 from dudmap.lab.synthetic import sequence as synthetic_sequence
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
 
@@ -63,9 +63,10 @@ def numbers(voxels: str, sizes: str) -> tuple[list[float], list[tuple[int, int]]
         ConfigError: A list cannot be understood.
     """
     try:
-        steps = [float(voxel) / 100 for voxel in voxels.split(",")]
         pairs = [size.split("x") for size in sizes.split(",") if size]
-        return steps, [(int(width), int(height)) for width, height in pairs]
+        return [float(voxel) / 100 for voxel in voxels.split(",")], [
+            (int(width), int(height)) for width, height in pairs
+        ]
     except ValueError:
         raise ConfigError(
             f"cannot understand --voxels {voxels!r} and --sizes {sizes!r}; expected centimetres, such as 2,1, and "
@@ -101,39 +102,42 @@ def _measured(name: str, recording: Sequence, frames: int, voxel: float, device:
     from dudmap.core.slam import Slam
 
     assignments = [f"volume.voxel_size={voxel}", f"device={device}", "sensor.self_calibration=false"]
-    slam = Slam(recording.camera, Config().override(assignments))
+    slam, on_gpu = Slam(recording.camera, Config().override(assignments)), device.startswith("cuda")
     times, stages, kernels = [], [], []
     for index in range(min(frames, len(recording))):
         frame = recording[index]
-        if device.startswith("cuda") and index % KERNELS_EVERY == 0:
+        if on_gpu and index % KERNELS_EVERY == 0:
             kernels.append(_kernel_times(lambda frame=frame: slam.process(frame)))
             continue
-        start = time.perf_counter()
-        result = slam.process(frame)
-        times.append(1000 * (time.perf_counter() - start))
+        ms, result = _timed(lambda frame=frame: slam.process(frame))
+        times.append(ms)
         stages.append(result.timings)
     pose = slam.trajectory.Ts_world_camera[-1]
     slam.volume.extract_mesh(1)
     mesh_ms, mesh = _timed(lambda: slam.volume.extract_mesh(1))
     slam.volume.raycast(pose)
     view_ms, _ = _timed(lambda: slam.volume.raycast(pose))
+    device_mb = float("nan")
+    if on_gpu:
+        import warp as wp  # pyright: ignore[reportMissingImports]
+
+        device_mb = wp.get_mempool_used_mem_high(device) / 1e6
     warm = slice(WARM_UP if len(times) > 2 * WARM_UP else 0, None)
     return DeviceRun(
         name, voxel, device, statistics.median(times[warm]), _medians(stages[warm]), mesh_ms, view_ms, len(mesh.faces),
-        slam.volume.num_bytes / 1e6, _peak_megabytes(device),
+        slam.volume.num_bytes / 1e6, device_mb,
         _medians(kernels[-len(kernels) // 2 :]),  # the first frames load the kernels
     )  # fmt: skip
 
 
-def _timed(action: Any) -> tuple[float, Any]:  # noqa: ANN401
+def _timed(action: Callable[[], Any]) -> tuple[float, Any]:
     start = time.perf_counter()
     result = action()
     return 1000 * (time.perf_counter() - start), result
 
 
 def _medians(rows: list[dict[str, float]]) -> dict[str, float]:
-    keys = list(dict.fromkeys(key for row in rows for key in row))
-    return {key: statistics.median(row.get(key, 0.0) for row in rows) for key in keys}
+    return {key: statistics.median(row.get(key, 0.0) for row in rows) for one in rows for key in one}
 
 
 def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
@@ -176,33 +180,21 @@ def measure_open3d(
     return rows
 
 
-def _peak_megabytes(device: str) -> float:
-    if not device.startswith("cuda"):
-        return float("nan")
-    import warp as wp  # pyright: ignore[reportMissingImports]
-
-    return wp.get_mempool_used_mem_high(device) / 1e6
-
-
 def table(rows: list[DeviceRun]) -> str:
     """Markdown: times and memory of each run, then the kernels of those on a GPU."""
-    stages = list(dict.fromkeys(stage for row in rows for stage in row.stages))
+    stages, body = list(dict.fromkeys(stage for row in rows for stage in row.stages)), []
+    for row in rows:
+        times = [row.frame_ms, *(row.stages.get(stage, np.nan) for stage in stages), row.mesh_ms, row.view_ms]
+        cells = ["" if np.isnan(x) else f"{x:.1f}" for x in (*times, row.map_mb, row.device_mb)]
+        body.append([row.what, f"{100 * row.voxel:g}", row.device, *cells])
     head = ["recording", "voxel, cm", "device", "frame", *stages, "mesh", "view", "map, MB", "device, MB"]
-    text = grid(head, [_line(row, stages) for row in rows])
-    reason = obstacle()
+    text, reason = grid(head, body), obstacle()
     if not any(row.device.startswith("cuda") for row in rows):
         text += f"\nNothing was measured on a GPU{': ' + reason if reason else ', which was not asked for'}.\n"
     for row in rows:
-        if row.error:
-            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: {row.error}\n"
+        what = f"{row.what}, {100 * row.voxel:g} cm, {row.device}"
+        text += f"\n{what}: {row.error}\n" if row.error else ""
         if row.kernels:
-            text += f"\n{row.what}, {100 * row.voxel:g} cm, {row.device}: kernels per frame\n\n"
             lines = [[name, f"{ms:.3f}"] for name, ms in sorted(row.kernels.items(), key=lambda item: -item[1])]
-            text += grid(["kernel", "ms"], lines)
+            text += f"\n{what}: kernels per frame\n\n{grid(['kernel', 'ms'], lines)}"
     return text
-
-
-def _line(row: DeviceRun, stages: list[str]) -> list[str]:
-    times = [row.frame_ms, *(row.stages.get(stage, float("nan")) for stage in stages), row.mesh_ms, row.view_ms]
-    figures = [*times, row.map_mb, row.device_mb]
-    return [row.what, f"{100 * row.voxel:g}", row.device, *("" if np.isnan(x) else f"{x:.1f}" for x in figures)]

@@ -1,4 +1,4 @@
-"""Comparison of the time per frame with Open3D's dense SLAM: same frames, alternating runs on the same machine."""
+"""Open3D's dense SLAM beside ours: same frames, alternating runs on the same machine."""
 
 import importlib.util
 import json
@@ -15,16 +15,16 @@ from numpy.typing import NDArray
 from dudmap.config import Config
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import DatasetError, DudmapError
+from dudmap.evaluation.trajectory import accuracy
 from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.measure import Row, in_own_process
+from dudmap.lab.benchmark.speed import WARM_UP
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence
 
 ROUNDS = 3
 """Number of alternating runs of each system, so that a varying load affects both."""
-WARM_UP = 10
-"""Number of frames at the start of a run that are not timed."""
 
 
 class Comparison(NamedTuple):
@@ -56,13 +56,11 @@ def find_open3d(python: Path | None) -> str | None:
     try:
         done = subprocess.run([python, "-c", "import open3d"], capture_output=True, text=True, check=False)
     except OSError as error:
-        raise DudmapError(
-            f"cannot run {python}: {error.strerror or error}; expected a Python that has open3d"
-        ) from error
+        reason = error.strerror or error
+        raise DudmapError(f"cannot run {python}: {reason}; expected a Python that has open3d") from error
     if done.returncode:
-        raise DudmapError(
-            f"{python} cannot import open3d: {_last_line(done.stderr)}; install it there, or leave it out"
-        )
+        reason = _last_line(done.stderr)
+        raise DudmapError(f"{python} cannot import open3d: {reason}; install it there, or leave it out")
     return str(python)
 
 
@@ -75,40 +73,42 @@ def compare_with_open3d(python: str, entry: Entry, frames: int, rounds: int = RO
     Raises:
         DudmapError: A run failed.
     """
+    ours: list[Row] = []
+    theirs: list[Row] = []
     with tempfile.TemporaryDirectory(prefix="dudmap-") as temporary:
         folder = Path(temporary)
         truth, stamps = save_frames(entry.open(), frames, folder)
-        ours: list[Row] = []
-        theirs: list[Row] = []
         for _ in range(rounds):
-            ours.append(_succeeded(in_own_process(_run_ours, folder)))
+            ours.append(in_own_process(_run_ours, folder))
+            if "error" in ours[-1]:
+                raise DudmapError(f"our run of the comparison failed: {ours[-1]['error']}")
             theirs.append(run_open3d(python, folder, Config().volume.voxel_size))
-    return Comparison(
-        median_ms(ours), median_ms(theirs),
-        _ate(ours[-1], stamps, truth), _ate(theirs[-1], stamps, truth), len(stamps), str(theirs[-1]["version"]),
-    )  # fmt: skip
+    ates: list[Any] = []
+    for row in (ours[-1], theirs[-1]):
+        poses: list[Any] = [(t, np.array(T)) for t, T in zip(stamps, row["poses"], strict=True) if T is not None]
+        known = truth is not None and len(poses) > 0
+        ates.append(accuracy(Trajectory.from_poses(poses), truth, ("ate_rmse_m",))["ate_rmse_m"] if known else None)
+    return Comparison(median_ms(ours), median_ms(theirs), *ates, len(stamps), str(theirs[-1]["version"]))
 
 
 def save_frames(sequence: "Sequence", frames: int, folder: Path) -> tuple[Trajectory | None, NDArray[np.float64]]:
     """Write the arrays that open3d_slam.py reads; returns the ground truth and the timestamps (n,)."""
-    camera = sequence.camera
-    count = min(frames, len(sequence))
-    chosen = []
+    camera, count = sequence.camera, min(frames, len(sequence))
+    if count < 2:
+        raise DatasetError(f"{sequence.name} has {count} frames; a comparison needs two or more")
     depth = np.lib.format.open_memmap(folder / "depth.npy", "w+", np.uint16, (count, *camera.shape))
     color = np.lib.format.open_memmap(folder / "color.npy", "w+", np.uint8, (count, *camera.shape, 3))
+    stamps = np.empty(count)
     for index in range(count):
         frame = sequence[index]
         depth[index] = np.clip(np.round(frame.depth * camera.depth_scale), 0, 65535).astype(np.uint16)
-        color[index] = frame.color
-        chosen.append(frame.timestamp)
-    if count < 2:
-        raise DatasetError(f"{sequence.name} has {count} frames; a comparison needs two or more")
+        color[index], stamps[index] = frame.color, frame.timestamp
     depth.flush()
     color.flush()
     values = {key: getattr(camera, key) for key in ("fx", "fy", "cx", "cy", "width", "height", "depth_scale")}
     (folder / "camera.json").write_text(json.dumps(values), encoding="utf-8")
-    np.save(folder / "timestamps.npy", np.array(chosen))
-    return sequence.ground_truth, np.array(chosen)
+    np.save(folder / "timestamps.npy", stamps)
+    return sequence.ground_truth, stamps
 
 
 def _run_ours(folder: Path) -> Row:
@@ -148,27 +148,9 @@ def run_open3d(python: str, folder: Path, voxel_size: float, device: str = "CPU:
     return json.loads(done.stdout.strip().splitlines()[-1])
 
 
-def _succeeded(row: Row) -> Row:
-    if "error" in row:
-        raise DudmapError(f"our run of the comparison failed: {row['error']}")
-    return row
-
-
 def median_ms(rows: list[Row]) -> float:
     """Median of the times per frame of runs, without the first frames of each, milliseconds."""
     return float(np.median([row["ms"][WARM_UP:] or row["ms"] for row in rows]))
-
-
-def _ate(row: Row, stamps: NDArray[np.float64], truth: Trajectory | None) -> float | None:
-    from dudmap.evaluation.trajectory import ate
-
-    if truth is None:
-        return None
-    poses: list[Any] = [(stamp, np.array(T)) for stamp, T in zip(stamps, row["poses"], strict=True) if T is not None]
-    try:
-        return float(ate(Trajectory.from_poses(poses), truth).rmse)
-    except DatasetError:
-        return None
 
 
 def _last_line(text: str) -> str:

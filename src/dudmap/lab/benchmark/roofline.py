@@ -12,8 +12,8 @@ from numba import njit
 from dudmap.config import Config
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.slam import Slam
+from dudmap.lab.benchmark.speed import WARM_UP
 from dudmap.lab.benchmark.table import grid
-from dudmap.lab.benchmark.timing import WARM_UP
 from dudmap.lab.synthetic import sequence
 
 FLOPS_PER_PIXEL, FLOPS_PER_VOXEL, FLOPS_PER_TAP = 300, 150, 22
