@@ -14,7 +14,7 @@ import pytest
 from dudmap.app.pipeline import environment
 from dudmap.app.viewing.page_access import port_problem
 from dudmap.core.backends import threads
-from dudmap.lab.study.executor import LocalExecutor, usable_cores
+from dudmap.lab.study.worker import LocalExecutor, usable_cores
 
 SOURCES = sorted((Path(__file__).parent.parent / "src" / "dudmap").rglob("*.py"))
 POSIX_ONLY = {"fcntl", "grp", "posix", "pty", "pwd", "resource", "termios"}

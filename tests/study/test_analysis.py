@@ -6,11 +6,9 @@ import pytest
 
 from dudmap.config import Config
 from dudmap.lab.study.analysis import pareto_front
-from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, points_of
-from dudmap.lab.study.factors import make_factors
-from dudmap.lab.study.indices import emulated_indices, morris_indices, sobol_indices
-from dudmap.lab.study.judgement import carried_by, confirm, predict_optimum
-from dudmap.lab.study.response_surface import fit_surface, lack_of_fit
+from dudmap.lab.study.designs import DESIGNS, DesignOptions, count_of, make_factors, points_of
+from dudmap.lab.study.effects import emulated_indices, morris_indices, sobol_indices
+from dudmap.lab.study.response_surface import carried_by, confirm, fit_surface, lack_of_fit, predict_optimum
 from dudmap.lab.study.responses import Scale
 
 RANGES = {"tracker.huber": {"range": [0.005, 0.025]}, "volume.voxel_size": {"range": [0.01, 0.04], "scale": "log"},

@@ -8,8 +8,7 @@ import pytest
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.lab.study.designs import DesignOptions, points_of
-from dudmap.lab.study.factors import configured, make_factors
+from dudmap.lab.study.designs import DesignOptions, configured, make_factors, points_of
 from dudmap.lab.study.plan import make_plan
 from dudmap.lab.study.report import Report
 from dudmap.lab.study.screening import bounds_of, describe_screening, screen, summary

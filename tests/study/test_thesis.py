@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from dudmap.lab.study.effects import anova, interactions, main_effects
-from dudmap.lab.study.judgement import carried_by, predict_optimum
-from dudmap.lab.study.response_surface import lack_of_fit
+from dudmap.lab.study.response_surface import carried_by, lack_of_fit, predict_optimum
 from dudmap.lab.study.responses import Scale
 from dudmap.lab.study.thesis import DAMPING, HUBER, VOXEL, WEIGHT, published_report, published_table, thesis_plan
 

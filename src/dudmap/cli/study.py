@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from dudmap.lab.study.conduct import Progress
-    from dudmap.lab.study.executor import Executor
+    from dudmap.lab.study.worker import Executor
 
 
 app = typer.Typer(
@@ -127,7 +127,7 @@ def _executor(jobs: int, cluster: str) -> "Executor":
         from dudmap.lab.study.cluster import RayExecutor
 
         return RayExecutor(cluster, jobs or None)
-    from dudmap.lab.study.executor import LocalExecutor, usable_cores
+    from dudmap.lab.study.worker import LocalExecutor, usable_cores
 
     return LocalExecutor(jobs or usable_cores())
 

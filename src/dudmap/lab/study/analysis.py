@@ -4,12 +4,19 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from dudmap.lab.study import figures, indices, screening
-from dudmap.lab.study.effects import anova, interactions, main_effects
-from dudmap.lab.study.factors import Table, coded_points
-from dudmap.lab.study.judgement import Prediction, predict_optimum
+from dudmap.lab.study import report as figures
+from dudmap.lab.study import screening
+from dudmap.lab.study.designs import Table, coded_points
+from dudmap.lab.study.effects import (
+    anova,
+    emulated_indices,
+    interactions,
+    main_effects,
+    morris_indices,
+    sobol_indices,
+)  # fmt: skip
 from dudmap.lab.study.report import Report
-from dudmap.lab.study.response_surface import lack_of_fit, values_text
+from dudmap.lab.study.response_surface import Prediction, lack_of_fit, predict_optimum, values_text
 from dudmap.lab.study.responses import RESPONSES
 
 if TYPE_CHECKING:
@@ -65,7 +72,7 @@ def describe_indices(report: Report, plan: "Plan", table: Table, data: Table, na
     """Add the sensitivity indices of a sampled design."""
     kind, seed, factors, found = plan.options.kind, plan.options.seed, plan.factors, None
     if kind in ("latin-hypercube", "sobol"):
-        found, text = indices.emulated_indices(data, factors, name, seed)
+        found, text = emulated_indices(data, factors, name, seed)
         report.text(text)
     elif kind in ("saltelli", "morris"):
         means = data.groupby("point")[name].mean()
@@ -75,11 +82,11 @@ def describe_indices(report: Report, plan: "Plan", table: Table, data: Table, na
         elif kind == "morris":
             points = table.groupby("point")[[factor.key for factor in factors]].first().sort_index()
             report.text("Elementary effects of Morris, from one end of a factor to the other:")
-            report.table(indices.morris_indices(factors, coded_points(factors, points), values))
+            report.table(morris_indices(factors, coded_points(factors, points), values))
         elif np.ptp(values) == 0:
             report.text("There are no indices: the response does not vary.")
         else:
-            found = indices.sobol_indices(factors, values, seed)
+            found = sobol_indices(factors, values, seed)
     if found is not None:
         report.table(found)
         report.figure(figures.indices_figure(found), "Sobol indices with 95 % intervals.")

@@ -6,8 +6,7 @@ from typing import Any
 
 from dudmap.errors import ConfigError
 from dudmap.extras import extra, install
-from dudmap.lab.study.executor import WorkerDied, set_threads
-from dudmap.lab.study.worker import Job, Outcome, perform
+from dudmap.lab.study.worker import Job, Outcome, WorkerDied, perform, set_threads
 
 CPUS_PER_RUN = 1
 """Cores that a run reserves, and its number of threads."""

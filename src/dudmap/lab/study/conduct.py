@@ -9,11 +9,9 @@ from pathlib import Path
 from queue import SimpleQueue
 from typing import Any
 
-from dudmap.lab.study.executor import Executor, WorkerDied
-from dudmap.lab.study.factors import Table
+from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import Run
-from dudmap.lab.study.store import StudyFolder
-from dudmap.lab.study.worker import Do, Job
+from dudmap.lab.study.worker import Do, Executor, Job, StudyFolder, WorkerDied
 
 ATTEMPTS = 3
 """Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""

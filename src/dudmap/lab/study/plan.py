@@ -14,8 +14,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from dudmap.config import Config
 from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.study.designs import DesignOptions, Point, count_of, points_of
-from dudmap.lab.study.factors import Factor, configured, make_factors
+from dudmap.lab.study.designs import DesignOptions, Factor, Point, configured, count_of, make_factors, points_of
 from dudmap.lab.study.remote import RemoteEntry, is_url, name_of
 from dudmap.lab.study.responses import RESPONSES, Scale, check_truth, known_responses
 

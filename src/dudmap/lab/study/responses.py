@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING, Literal, NamedTuple
 import numpy as np
 
 from dudmap.errors import ConfigError, DatasetError
-from dudmap.lab.study.factors import Table
+from dudmap.lab.study.designs import Table
 
 if TYPE_CHECKING:
     from dudmap.io.sequences import Sequence

@@ -8,8 +8,8 @@ import numpy as np
 
 from dudmap.config import Config, keys
 from dudmap.errors import ConfigError
-from dudmap.lab.study import figures
-from dudmap.lab.study.factors import Factor, Table, is_number
+from dudmap.lab.study import report as figures
+from dudmap.lab.study.designs import Factor, Table, is_number
 
 if TYPE_CHECKING:
     from dudmap.lab.study.report import Report

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 from dudmap.errors import ConfigError
 from dudmap.lab.study.conduct import Progress, conduct, table_of
-from dudmap.lab.study.executor import Executor
-from dudmap.lab.study.factors import Table
+from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import MAX_RUNS, Plan, Run
+from dudmap.lab.study.worker import Executor
 
 if TYPE_CHECKING:
-    from dudmap.lab.study.judgement import Confirmation, Prediction
+    from dudmap.lab.study.response_surface import Confirmation, Prediction
 
 NOTHING = "There is nothing to confirm."
 
@@ -43,7 +43,7 @@ def run_study(
     Raises:
         DudmapError: The study is refused before anything is run (``Plan.check``), or no run has a response.
     """
-    from dudmap.lab.study.judgement import predict_optimum
+    from dudmap.lab.study.response_surface import predict_optimum
 
     try:
         plan.check(max_runs)
@@ -70,7 +70,7 @@ def confirm_each(plan: Plan, table: Table, out: Path, do: Callable[[Sequence[Run
     """
     import pandas as pd
 
-    from dudmap.lab.study.judgement import predict_optimum
+    from dudmap.lab.study.response_surface import predict_optimum
 
     scale, rows = plan.scale(plan.responses[0]), []
     for recording in plan.recordings:
@@ -107,7 +107,7 @@ def _confirm(
     """Run the optimum and the best point of the design on the same recordings."""
     import pandas as pd
 
-    from dudmap.lab.study.judgement import confirm
+    from dudmap.lab.study.response_surface import confirm
 
     scale = plan.scale(plan.responses[0])
     at_optimum, at_best = plan.confirmation_runs(predicted.point), plan.confirmation_runs(predicted.best_point)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from dudmap.errors import ConfigError
-from dudmap.lab.study.factors import Table
+from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import Plan, make_plan
 
 HUBER, DAMPING, VOXEL, WEIGHT = "tracker.huber", "tracker.damping", "volume.voxel_size", "tracker.color_weight"
@@ -69,7 +69,7 @@ def published_report(out: Path) -> str:
 
     The confirmation is the thesis' own: 0.089 m at its optimum, 0.080 m at the best point of the design.
     """
-    from dudmap.lab.study.judgement import confirm, predict_optimum
+    from dudmap.lab.study.response_surface import confirm, predict_optimum
     from dudmap.lab.study.study import write_report
 
     plan, table = thesis_plan(), published_table()

@@ -17,13 +17,11 @@ from numpy.typing import NDArray
 
 from dudmap.errors import ConfigError
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.study.conduct import Progress, conduct
-from dudmap.lab.study.designs import Point
-from dudmap.lab.study.executor import Executor
-from dudmap.lab.study.factors import Factor, Table, configured
+from dudmap.lab.study.conduct import Progress, StudyFolder, conduct
+from dudmap.lab.study.designs import Factor, Point, Table, configured
 from dudmap.lab.study.plan import MAX_RUNS, Plan, Run, place_of
 from dudmap.lab.study.responses import RESPONSES, check_truth
-from dudmap.lab.study.store import StudyFolder
+from dudmap.lab.study.worker import Executor
 
 if TYPE_CHECKING:
     import optuna
