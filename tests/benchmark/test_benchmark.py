@@ -15,7 +15,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps, values
+from dudmap.lab.benchmark.limits import cells_table, limits_table, save_heat_maps, values
 from dudmap.lab.benchmark.report import published
 from dudmap.lab.benchmark.suites import ABLATION, SUITES, find_suite, systems
 from dudmap.lab.benchmark.table import markdown

@@ -6,7 +6,7 @@ from dudmap.lab.benchmark import color_columns
 from dudmap.lab.benchmark.color_columns import color_table, measure_recording
 from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.suites import SENSORS, sensor_entries
-from dudmap.lab.synthetic.cameras import CAMERAS
+from dudmap.lab.synthetic.sensors import CAMERAS
 
 TINY = {"scene": "box", "movers": (), "frames": 2, "camera": (64, 48), "noise": "none"}
 

@@ -108,7 +108,7 @@ def _instead_of(read_text, name, text):
 def test_a_python_without_open3d_is_refused(tmp_path):
     import sys
 
-    from dudmap.lab.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.gpu import find_open3d
 
     with pytest.raises(DudmapError, match="cannot run"):
         find_open3d(tmp_path / "nothing")

@@ -123,9 +123,9 @@ FAKED = {
         ["benchmark", "limits", "--out", "limits"],
         {
             "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.lab.benchmark.heatmaps.save_heat_maps": lambda *_: None,
-            "dudmap.lab.benchmark.heatmaps.limits_table": lambda *_: "",
-            "dudmap.lab.benchmark.heatmaps.cells_table": lambda *_: "",
+            "dudmap.lab.benchmark.limits.save_heat_maps": lambda *_: None,
+            "dudmap.lab.benchmark.limits.limits_table": lambda *_: "",
+            "dudmap.lab.benchmark.limits.cells_table": lambda *_: "",
         },
     ),
     "benchmark gpu": (
@@ -151,7 +151,7 @@ FAKED = {
         ["benchmark", "soak"],
         {"dudmap.lab.benchmark.soak.measure_soak": lambda *_: [], "dudmap.lab.benchmark.soak.grown": lambda _: []},
     ),
-    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.calls.count_calls": lambda *_: []}),
+    "benchmark calls": (["benchmark", "calls"], {"dudmap.lab.benchmark.roofline.count_calls": lambda *_: []}),
     "benchmark bias": (
         ["benchmark", "bias", "--seeds", 1],
         {
@@ -162,8 +162,8 @@ FAKED = {
     "benchmark first-second": (
         ["benchmark", "first-second", "--seeds", 1],
         {
-            "dudmap.lab.benchmark.first_second.measure_first_second": lambda *_: [],
-            "dudmap.lab.benchmark.first_second.first_second_table": lambda _: "",
+            "dudmap.lab.benchmark.bias.measure_first_second": lambda *_: [],
+            "dudmap.lab.benchmark.bias.first_second_table": lambda _: "",
             "dudmap.lab.synthetic.sequence": lambda *_, **__: None,
         },
     ),

@@ -9,13 +9,18 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 from dudmap.lab import synthetic
 from dudmap.lab.synthetic import SensorFaults
-from dudmap.lab.synthetic.cameras import CAMERAS
-from dudmap.lab.synthetic.color_camera import LARGEST_GAIN, TARGET_LEVEL, exposure_gains
-from dudmap.lab.synthetic.depth_faults import WAVE_NUMBER, with_flying_pixels, with_multipath
+from dudmap.lab.synthetic.color_camera import (
+    LARGEST_GAIN,
+    TARGET_LEVEL,
+    WAVE_NUMBER,
+    exposure_gains,
+    with_flying_pixels,
+    with_multipath,
+)
 from dudmap.lab.synthetic.faults import LIMITS, parse_faults
 from dudmap.lab.synthetic.folder import write_folder
 from dudmap.lab.synthetic.render import Rendering
-from dudmap.lab.synthetic.sensors import SENSORS, Sensor
+from dudmap.lab.synthetic.sensors import CAMERAS, SENSORS, Sensor
 
 SMALL = Camera(131.25, 131.25, 79.5, 59.5, 160, 120)
 UNREGISTERED = SensorFaults(

@@ -181,7 +181,7 @@ def first_second(
 ) -> None:
     """Measure rotation and translation errors over the first 30 frames of exact synthetic worlds."""
     from dudmap.lab import synthetic
-    from dudmap.lab.benchmark.first_second import FRAMES, first_second_table, measure_first_second
+    from dudmap.lab.benchmark.bias import FRAMES, first_second_table, measure_first_second
 
     config = o.read_config(None, None, assignments)
     worlds = [(scene, seed) for scene in ("room", "corridor", "box") for seed in range(seeds)]
@@ -207,8 +207,8 @@ def calls(
 ) -> None:
     """Count the kernel launches, barriers, Python calls and source files of an ordinary frame."""
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.calls import count_calls, summary
     from dudmap.lab.benchmark.entries import Entry
+    from dudmap.lab.benchmark.roofline import count_calls, summary
 
     room = Entry("room-person", parameters={"frames": max_frames, "start_dynamic": False})
     source = room.open() if recording is None else open_sequence(recording)
@@ -265,8 +265,7 @@ def wrong_input(
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
     from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.stream_faults import default_room
-    from dudmap.lab.benchmark.wrong_input import LARGE, SPOILT, measure_wrong_input, spoilt_table
+    from dudmap.lab.benchmark.stream_faults import LARGE, SPOILT, default_room, measure_wrong_input, spoilt_table
 
     config, runs = Config(), []
     if recording is not None:
@@ -326,8 +325,17 @@ def limits(
     Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
     """
     from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.heatmaps import cells_table, limits_table, save_heat_maps
-    from dudmap.lab.benchmark.limits import FRAMES, QUICK_FRAMES, QUICK_SWEEPS, SWEEPS, grid_cells, measure_cells
+    from dudmap.lab.benchmark.limits import (
+        FRAMES,
+        QUICK_FRAMES,
+        QUICK_SWEEPS,
+        SWEEPS,
+        cells_table,
+        grid_cells,
+        limits_table,
+        measure_cells,
+        save_heat_maps,
+    )
     from dudmap.lab.benchmark.suites import systems as find_systems
     from dudmap.lab.benchmark.table import save
 

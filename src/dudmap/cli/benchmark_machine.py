@@ -40,7 +40,7 @@ def gpu(
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark import gpu as measurements
-    from dudmap.lab.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.gpu import find_open3d
 
     rows, python = [], find_open3d(open3d)
     steps, shapes = measurements.numbers(voxels, sizes)
@@ -82,7 +82,7 @@ def speed(
 ) -> None:
     """Measure time and memory on this machine, which should be idle otherwise."""
     from dudmap.app.pipeline.environment import machine, versions
-    from dudmap.lab.benchmark.interleaved import find_open3d
+    from dudmap.lab.benchmark.gpu import find_open3d
     from dudmap.lab.benchmark.speed import markdown, speed_figures
 
     frames, long_frames = (20, 60) if quick else (300, 2000)

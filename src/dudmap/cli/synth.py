@@ -83,10 +83,10 @@ def synth(
     surface_observed.ply, scene.json and sensor_truth.json.
     """
     from dudmap.lab import synthetic
-    from dudmap.lab.synthetic.cameras import find_camera
     from dudmap.lab.synthetic.faults import parse_faults
     from dudmap.lab.synthetic.folder import write_folder
     from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+    from dudmap.lab.synthetic.sensors import find_camera
 
     model = find_camera(sensor) if sensor is not None else None
     width, height = o.image_size(size)

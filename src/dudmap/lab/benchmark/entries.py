@@ -46,9 +46,9 @@ class Entry:
 
             return open_sequence(self.path)
         from dudmap.lab.synthetic import sequence
-        from dudmap.lab.synthetic.cameras import find_camera
         from dudmap.lab.synthetic.faults import SensorFaults
         from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
+        from dudmap.lab.synthetic.sensors import find_camera
 
         size = self.parameters.get("camera", (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height))
         sensor = self.parameters.get("sensor")

@@ -1,20 +1,32 @@
-"""What a frame must cost: bytes and operations of the default pipeline, and what this machine can move and compute."""
+"""What a frame costs: calls and files, and bytes and operations beside what this machine can move and compute."""
 
+import gc
+import sys
 import time
 from collections import Counter
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
+from pathlib import Path
+from statistics import median
+from types import FrameType
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numba import njit
+from numba.core.dispatcher import Dispatcher
 
 from dudmap.config import Config
+from dudmap.core import slam as slam_module
+from dudmap.core.backends import threads
+from dudmap.core.backends.cpu import teams
 from dudmap.core.backends.threads import num_threads
 from dudmap.core.slam import Slam
 from dudmap.lab.benchmark.speed import WARM_UP
 from dudmap.lab.benchmark.table import grid
 from dudmap.lab.synthetic import sequence
+
+if TYPE_CHECKING:
+    from dudmap.io.sequences import Sequence
 
 FLOPS_PER_PIXEL, FLOPS_PER_VOXEL, FLOPS_PER_TAP = 300, 150, 22
 """One linearisation, fusion of one voxel, and one pair of taps of the bilateral filter: counted in the unvectorised
@@ -140,3 +152,65 @@ def roofline(frames: int, voxel: float) -> tuple[dict[str, Any], str]:
     text = grid(["threads", "triad, GB/s", "multiply-add, Gflop/s"], lines, words=1) + "\n" + grid(head, body, words=1)
     content = {str(threads): {"bytes_per_s": a, "flops": b} for threads, (a, b) in found.items()}
     return {"measured": measured, "rates": content}, text
+
+
+CORE = str(Path(slam_module.__file__).parent)
+"""Folder of the algorithm."""
+COUNTED_FROM = 40
+"""Frames before those that are counted: the first second has a map that knows little."""
+
+
+def count_calls(sequence: "Sequence", config: Config, frames: int) -> list[dict[str, int]]:
+    """Counts for each frame after the first ``COUNTED_FROM``, in the thread that calls ``Slam.process``.
+
+    Args:
+        sequence: The recording.
+        config: All parameters; self-calibration, which runs beside the frames, is switched off.
+        frames: Number of frames to process.
+
+    Returns:
+        ``launches``: calls of compiled kernels; ``barriers``: calls whose work other threads share, and which wait for
+        it; ``calls``: calls of Python and C functions outside of kernels; ``files``: files of ``core`` that a frame
+        enters.
+    """
+    config = config.override(["sensor.self_calibration=false"])
+    slam = Slam(sequence.camera, config, calibration=sequence.calibration)
+    counts = []
+    for index in range(min(frames, len(sequence))):
+        view = slam.prepare(sequence[index])
+        if index < COUNTED_FROM:
+            slam.process(view)
+        else:
+            counts.append(_counted(slam.process, view))
+    return counts
+
+
+def summary(counts: list[dict[str, int]]) -> dict[str, float]:
+    """Median of each count over the frames."""
+    return {name: float(median(one[name] for one in counts)) for name in (counts[0] if counts else ())}
+
+
+def _counted(function: Callable[[Any], object], argument: object) -> dict[str, int]:
+    """The counts of one call."""
+    kernels = {found.py_func.__code__ for found in gc.get_objects() if isinstance(found, Dispatcher)}
+    sharing = {teams.run_team.__code__, threads.run_bands.__code__}
+    launches = barriers = calls = 0
+    files: set[str] = set()
+
+    def count(frame: FrameType, event: str, argument: object) -> None:
+        nonlocal launches, barriers, calls
+        code = frame.f_code
+        if event == "call" and code in kernels:
+            launches += 1
+        elif event in ("call", "c_call"):
+            calls += 1
+            barriers += event == "call" and code in sharing
+            if code.co_filename.startswith(CORE):
+                files.add(code.co_filename)
+
+    sys.setprofile(count)
+    try:
+        function(argument)
+    finally:
+        sys.setprofile(None)
+    return {"launches": launches, "barriers": barriers, "calls": calls, "files": len(files)}

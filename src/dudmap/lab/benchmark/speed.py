@@ -99,7 +99,7 @@ def speed_figures(
 
 
 def _open3d_figures(python: str, recording: Path | None, frames: int) -> list[SpeedFigure]:
-    from dudmap.lab.benchmark.interleaved import compare_with_open3d
+    from dudmap.lab.benchmark.gpu import compare_with_open3d
 
     static_room = Entry("room-static", parameters={"movers": (), "frames": frames})
     entry = static_room if recording is None else Entry(recording.resolve().name, recording)

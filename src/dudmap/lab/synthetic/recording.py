@@ -14,8 +14,7 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import FrameError
-from dudmap.lab.synthetic.color_camera import ColorCamera, compressed, exposure_gains, white_balance
-from dudmap.lab.synthetic.depth_faults import DepthFaults
+from dudmap.lab.synthetic.color_camera import ColorCamera, DepthFaults, compressed, exposure_gains, white_balance
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover
 from dudmap.lab.synthetic.render import Renderer, Rendering

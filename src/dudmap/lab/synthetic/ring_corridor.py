@@ -5,8 +5,8 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
-from dudmap.lab.synthetic.furniture import CARDBOARD, WOOD, plant, poster, shelf, table
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
+from dudmap.lab.synthetic.rooms import CARDBOARD, WOOD, plant, poster, shelf, table
 from dudmap.lab.synthetic.scene import Light, Material, Primitive, Scene, box, cylinder, look_at, pose
 
 WIDTH, HEIGHT = 2.4, 2.5

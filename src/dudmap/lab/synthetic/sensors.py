@@ -1,4 +1,4 @@
-"""Noise models of depth and colour sensors: triangulation (pattern or stereo) and time of flight."""
+"""Sensors: noise models of depth and colour, and five RGB-D cameras as people own them."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -8,8 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
 from dudmap.lab.data import tables
+from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.kernels import depth_noise as kernels
 from dudmap.lab.synthetic.render import Rendering, over_rows
 
@@ -173,3 +175,46 @@ def _noise(correlation: float) -> tuple[NDArray[np.float32], NDArray[np.float32]
     gain = np.exp(-2 * (np.pi * correlation) ** 2 * (frequency[:, None] ** 2 + frequency[None, :] ** 2))
     field = np.fft.ifft2(np.fft.fft2(rng.standard_normal((NOISE_SIZE, NOISE_SIZE))) * gain).real
     return (field / field.std()).astype(np.float32), rng.standard_normal(65536).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class CameraModel:
+    """One camera, described as its driver delivers it: colour registered to depth.
+
+    Only what registration leaves over is a fault of place; add ``color_translation`` and the like for unregistered
+    streams.
+
+    Attributes:
+        noise: Name of its noise model (``sensors.SENSORS``).
+        field_of_view: Horizontal field of view of a 4:3 depth image, degrees.
+        motion_blur: Exposure time of the colour as a share of the frame interval.
+        faults: Its faults.
+    """
+
+    noise: str
+    field_of_view: float
+    motion_blur: float
+    faults: SensorFaults
+
+    def camera(self, width: int, height: int) -> Camera:
+        """Intrinsics of an image of this camera's view, with square pixels."""
+        focal = width / 2 / np.tan(np.radians(self.field_of_view / 2))
+        return Camera(focal, focal, (width - 1) / 2, (height - 1) / 2, width, height, depth_scale=5000.0)
+
+
+CAMERAS: dict[str, CameraModel] = {
+    name: CameraModel(**row | {"faults": SensorFaults(**row["faults"])})
+    for name, row in tables("synthetic/sensors.toml")["cameras"].items()
+}
+"""Cameras by name."""
+
+
+def find_camera(name: str) -> CameraModel:
+    """Camera of the given name.
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+    if name not in CAMERAS:
+        raise ConfigError(f"unknown sensor {name!r}; known sensors: {', '.join(CAMERAS)}")
+    return CAMERAS[name]

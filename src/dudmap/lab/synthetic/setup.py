@@ -1,6 +1,7 @@
-"""Set-up of a synthetic recording from names of scenes, movers, paths and sensors."""
+"""Set-up of a synthetic recording from names of scenes, movers, paths, situations and sensors."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -10,14 +11,92 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.cameras import find_camera
 from dudmap.lab.synthetic.crowd import crowd_of
 from dudmap.lab.synthetic.faults import SensorFaults
-from dudmap.lab.synthetic.movers import Staging, build_movers
+from dudmap.lab.synthetic.motion import smooth_step
+from dudmap.lab.synthetic.movers import Staging, SyntheticMover, build_movers, rigid
 from dudmap.lab.synthetic.paths import FOLLOW, PATHS, camera_poses
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.lab.synthetic.rooms import build_scene
-from dudmap.lab.synthetic.situations import Situation, carried_elsewhere, cover, find_situation
+from dudmap.lab.synthetic.scene import Material, Scene, box, pose
+from dudmap.lab.synthetic.sensors import find_camera
+
+Array = NDArray[np.float64]
+CAP_DISTANCE = 0.16
+"""Distance of the cover from the camera, metres."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """Modification of an ordinary sequence.
+
+    Attributes:
+        movers: Default movers.
+        camera_path: Default camera path.
+        start_dynamic: Whether movers are in view in the first frame.
+        covered: Intervals, as shares of the duration, in which the camera is covered.
+        elsewhere: Intervals, as shares of the duration, in which the camera looks at another part of the scene.
+    """
+
+    movers: tuple[str, ...]
+    camera_path: str = "handheld"
+    start_dynamic: bool = False
+    covered: tuple[tuple[float, float], ...] = ()
+    elsewhere: tuple[tuple[float, float], ...] = field(default=())
+
+
+SITUATIONS: dict[str, Situation] = {
+    "people_at_start": Situation(("people",), start_dynamic=True),
+    "follow": Situation(("wanderer",), camera_path="follow", start_dynamic=True),
+    "blocked": Situation(("person",), covered=((0.40, 0.55),)),
+    "kidnapped": Situation((), covered=((0.33, 0.38), (0.60, 0.65)), elsewhere=((0.36, 0.63),)),
+    "stops": Situation(("stopping_cart",)),
+    "starts": Situation(("starting_cart",)),
+    "put_down": Situation(("carried_box",)),
+    "taken_away": Situation(("removed_box",)),
+}
+
+
+def find_situation(name: str) -> Situation:
+    """Situation of the given name.
+
+    Raises:
+        ConfigError: The name is unknown.
+    """
+    if name not in SITUATIONS:
+        raise ConfigError(f"unknown situation {name!r}; known situations: {', '.join(SITUATIONS)}")
+    return SITUATIONS[name]
+
+
+def carried_elsewhere(Ts: Array, scene: Scene, times: Array, spans: tuple[tuple[float, float], ...]) -> Array:
+    """Poses (N, 4, 4) rotated by 150 degrees about the vertical at home in the intervals (shares of the duration)."""
+    around = pose(scene.home[:3, 3], yaw=150.0) @ se3.inverse(pose(scene.home[:3, 3]))
+    out = Ts.copy()
+    for begin, end in spans:
+        away = (times >= begin * times[-1]) & (times < end * times[-1])
+        out[away] = around @ out[away]
+    return out
+
+
+def cover(
+    times: Array, T_world_camera: Callable[[float], Array], spans: tuple[tuple[float, float], ...]
+) -> SyntheticMover:
+    """Dark sheet in front of the camera, closer than the sensor range, in the intervals (shares of the duration)."""
+    sheet = box((0, 0, 0), (0.5, 0.4, 0.01), Material("denim", (2.0, 2.0), tint=(0.35, 0.3, 0.3)))
+    duration = float(times[-1])
+
+    def aside(t: float) -> float:
+        """Position of the sheet: 1 out of view, 0 covering the view."""
+        closed = [
+            smooth_step((t - begin * duration) / 0.15 + 1.0) - smooth_step((t - end * duration) / 0.15)
+            for begin, end in spans
+        ]
+        return 1.0 - max(closed)
+
+    def reference(t: float) -> Array:
+        return T_world_camera(t) @ pose((0.6 * aside(t), 0.0, CAP_DISTANCE))
+
+    return rigid("cover", [sheet], reference, lambda t: aside(t) < 1.0)
 
 
 def sequence(
