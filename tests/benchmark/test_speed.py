@@ -89,7 +89,7 @@ def test_both_systems_get_the_same_frames_in_turn(monkeypatch):
     import sys
     from pathlib import Path
 
-    from dudmap.lab.benchmark import interleaved
+    from dudmap.lab.benchmark import gpu as interleaved
     from dudmap.lab.benchmark.entries import Entry
 
     monkeypatch.setattr(Path, "read_text", _instead_of(Path.read_text, "open3d_slam.py", STAND_IN))

@@ -27,11 +27,8 @@ def measure_columns(
 ) -> list[Row]:
     """Measure every recording with the settings of every column; one row per recording and column.
 
-    Args:
-        entries: The recordings; a synthetic one is rendered once for all columns.
-        config: Configuration that the settings are applied to.
-        workers: Number of processes at a time.
-        done: Called with every row when its recording is complete.
+    A synthetic recording is rendered once for all columns. ``done`` is called with every row when its recording is
+    complete.
     """
 
     def rows_of(found: Row) -> list[Row]:

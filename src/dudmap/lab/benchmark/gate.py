@@ -39,15 +39,7 @@ def gate_entries(fixtures: Path) -> list[Entry]:
 
 @dataclass(frozen=True)
 class Check:
-    """Comparison of one figure with its recorded value.
-
-    Attributes:
-        sequence: Name of the recording.
-        figure: Key of the figure.
-        recorded: Recorded value.
-        bound: Worst value that passes.
-        measured: Measured value, None if there is none.
-    """
+    """One figure: recorded value, worst value that passes, and measured value, None if there is none."""
 
     sequence: str
     figure: str

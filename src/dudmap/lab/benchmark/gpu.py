@@ -36,14 +36,7 @@ ROUNDS = 3
 
 
 class Comparison(NamedTuple):
-    """Result of the comparison.
-
-    Attributes:
-        ours_ms, theirs_ms: Median time per frame over all rounds, milliseconds.
-        ours_ate, theirs_ate: ATE RMSE of the last round, metres; None without a ground truth.
-        frames: Number of frames.
-        version: Version of Open3D.
-    """
+    """Median times per frame (ms), ATE RMSE of the last round (m; None without truth), frames, version of Open3D."""
 
     ours_ms: float
     theirs_ms: float
@@ -139,11 +132,7 @@ def _run_ours(folder: Path) -> Row:
 def run_open3d(python: str, folder: Path, voxel_size: float, device: str = "CPU:0") -> Row:
     """Open3D's dense SLAM on the frames that ``save_frames`` wrote: version, ms per frame, poses.
 
-    Args:
-        python: Interpreter with open3d.
-        folder: Folder of the frames.
-        voxel_size: Metres.
-        device: Device in Open3D, such as "CUDA:0".
+    Voxels are in metres; ``device`` is Open3D's word, such as "CUDA:0".
 
     Raises:
         DudmapError: The run failed.
@@ -303,16 +292,7 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 def measure_open3d(
     python: str, name: str, recording: Sequence, frames: int, voxels: Iterable[float], device: str
 ) -> list[DeviceRun]:
-    """Time per frame of Open3D's dense SLAM (``t.pipelines.slam``) with each voxel size, in a program of its own.
-
-    Args:
-        python: Interpreter with open3d.
-        name: Of the recording.
-        recording: The recording.
-        frames: Number of frames.
-        voxels: Voxel sizes, metres.
-        device: Device in Open3D: "CUDA:0" or "CPU:0".
-    """
+    """Time per frame of Open3D's dense SLAM with each voxel size (m) on "CUDA:0" or "CPU:0", in a program of its own."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="dudmap-") as folder:
         save_frames(recording, frames, Path(folder))

@@ -62,15 +62,7 @@ class Condition:
 
 
 class Sweep(NamedTuple):
-    """One grid of conditions.
-
-    Attributes:
-        name: Short name, also of the files.
-        x: Label of the horizontal axis.
-        varied: Attribute of ``Condition`` that varies along it.
-        xs: Values along the horizontal axis.
-        coverages: Values along the vertical axis: dynamic shares of the image.
-    """
+    """One grid of conditions: coverages against the values ``xs`` of the attribute ``varied``, with the label ``x``."""
 
     name: str
     x: str
@@ -123,13 +115,8 @@ def measure_cells(
 ) -> list[Row]:
     """One row per cell and system.
 
-    Args:
-        cells: Cells of all grids.
-        systems: Configurations by name.
-        out: Folder of the file measured-<fingerprint>.jsonl; conditions of the same code and systems that it holds are
-            not measured again.
-        workers: Number of processes at a time.
-        done: Called whenever a condition was measured by all systems.
+    A file measured-<fingerprint>.jsonl in ``out`` keeps the figures: a condition that it has for the same code and
+    systems is not measured again. ``done`` is called whenever a condition was measured by all systems.
     """
     out.mkdir(parents=True, exist_ok=True)
     text = code_hash() + "".join(f"{name}{config.to_toml()}" for name, config in systems.items())

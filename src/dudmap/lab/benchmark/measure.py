@@ -35,14 +35,7 @@ FEWER_SAMPLES = 40_000
 
 
 class Job(NamedTuple):
-    """One measurement of a suite.
-
-    Attributes:
-        entry: The recording.
-        system: Name of the system.
-        config: Parameters of the system.
-        out: Folder that keeps the run; None keeps nothing.
-    """
+    """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run."""
 
     entry: Entry
     system: str
@@ -129,14 +122,11 @@ def score_mesh(
     seen: "Mesh | Surface",
     samples: int = SAMPLES,
 ) -> Row:
-    """Accuracy, completeness and ghosts of a mesh.
+    """Accuracy, completeness and ghosts of a mesh in the world frame of the estimated trajectory.
 
     The mesh is aligned by the first pose only, so that a bent or shifted map is penalised.
 
     Args:
-        mesh: Estimated mesh in the world frame of ``estimate``.
-        estimate: Estimated trajectory.
-        truth: True trajectory.
         whole: True static surface in the world frame of ``truth``, for accuracy and ghosts.
         seen: Part of it that the camera saw, for completeness.
         samples: Number of points sampled on each surface.

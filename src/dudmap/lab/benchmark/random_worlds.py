@@ -93,16 +93,10 @@ def measure_worlds(
     workers: int = 1,
     done: Callable[[Row], None] = lambda row: None,
 ) -> list[Row]:
-    """One row per world, in the order of their numbers; each is written to a file as soon as it is measured.
+    """One row per world, in the order of their numbers; ``done`` is called with each that was measured now.
 
-    Args:
-        seed: Seed of the worlds.
-        numbers: Their numbers.
-        config: Configuration of the system.
-        out: Folder of the file, seed-<seed>-<fingerprint>.jsonl; worlds of the same code and configuration that it
-            holds are not measured again.
-        workers: Number of processes at a time.
-        done: Called with every row measured now.
+    Each is written to seed-<seed>-<fingerprint>.jsonl in ``out`` as soon as it is measured; worlds of the same code and
+    configuration that the file holds are not measured again.
     """
     out.mkdir(parents=True, exist_ok=True)
     fingerprint = hashlib.sha256(f"{code_hash()}{config.to_toml()}".encode()).hexdigest()[:8]

@@ -16,15 +16,7 @@ from dudmap.lab.data import tables
 
 
 class Published(NamedTuple):
-    """One published figure.
-
-    Attributes:
-        sequence: Name of the recording: that of its folder in the data set.
-        system: Name of the system.
-        metric: Key of the figure in our tables.
-        value: Value in the unit of our tables: metres, m/s, deg/s.
-        source: Publication.
-    """
+    """One published figure: recording, system, key of our tables, value in their unit (m, m/s, deg/s), publication."""
 
     sequence: str
     system: str
@@ -57,13 +49,8 @@ def run_suite(
 ) -> str:
     """Measure a suite, write <suite>.md, .csv and .json into ``out`` and return the Markdown.
 
-    Args:
-        suite: The recordings.
-        systems: Configurations by name.
-        others: Folders with results of other systems, by name: FOLDER/<sequence>/trajectory.txt and mesh.ply.
-        out: Folder for the tables, and for the runs in runs/<system>/<sequence>.
-        workers: Number of processes at a time.
-        done: Called with every row as soon as it is complete.
+    Runs are kept in ``out``/runs/<system>/<sequence>. ``others`` are folders with results of other systems by name:
+    FOLDER/<sequence>/trajectory.txt and mesh.ply.
     """
     jobs = [
         Job(entry, name, config, out / "runs" / name / entry.name)

@@ -128,12 +128,7 @@ def stages(measured: dict[str, float], slam: Slam) -> list[tuple[str, float, flo
 def roofline(frames: int, voxel: float) -> tuple[dict[str, Any], str]:
     """What this machine can do and what each stage took, beside the least time that its bytes and operations allow.
 
-    Args:
-        frames: Number of frames of a synthetic room with a person.
-        voxel: Voxel size, metres.
-
-    Returns:
-        The figures, and two Markdown tables.
+    The recording is a synthetic room with a person; voxels in metres. Returns the figures, and two Markdown tables.
     """
     found = {threads: rates(threads) for threads in sorted({1, num_threads()})}
     moved, computed = found[num_threads()]
@@ -163,15 +158,12 @@ COUNTED_FROM = 40
 def count_calls(sequence: "Sequence", config: Config, frames: int) -> list[dict[str, int]]:
     """Counts for each frame after the first ``COUNTED_FROM``, in the thread that calls ``Slam.process``.
 
-    Args:
-        sequence: The recording.
-        config: All parameters; self-calibration, which runs beside the frames, is switched off.
-        frames: Number of frames to process.
+    Self-calibration, which runs beside the frames, is switched off.
 
     Returns:
-        ``launches``: calls of compiled kernels; ``barriers``: calls whose work other threads share, and which wait for
-        it; ``calls``: calls of Python and C functions outside of kernels; ``files``: files of ``core`` that a frame
-        enters.
+        ``launches``: calls of compiled kernels; ``barriers``: calls whose work other threads share, and which wait
+            for it; ``calls``: calls of Python and C functions outside of kernels; ``files``: files of ``core`` that
+            a frame enters.
     """
     config = config.override(["sensor.self_calibration=false"])
     slam = Slam(sequence.camera, config, calibration=sequence.calibration)

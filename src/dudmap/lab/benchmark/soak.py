@@ -81,17 +81,13 @@ class Tenths(RunObserver):
 
 
 def measure_soak(frames: int, size: tuple[int, int], seed: int, done: Callable[[Row], None]) -> list[Row]:
-    """Process a room with people, the camera to and fro on an arc once in 20 s, with noise that never repeats.
+    """Process a room with people at 15 Hz, the camera to and fro on an arc once in 20 s; the noise never repeats.
 
-    Args:
-        frames: Number of frames, at 15 Hz.
-        size: Width and height of the images, pixels.
-        seed: Seed of the recording.
-        done: Called with the figures of every tenth of the run as soon as it ends.
+    ``done`` is called with every row as soon as its tenth of the run ends.
 
     Returns:
-        One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map, size
-        of the run folder, frames lost so far, and the largest error of a pose.
+        One row per tenth: processor time and time per frame (medians), memory of the process, blocks of the map,
+            size of the run folder, frames lost so far, and the largest error of a pose.
     """
     recording = Rendered(
         synthetic.sequence(

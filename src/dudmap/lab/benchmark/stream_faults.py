@@ -86,13 +86,7 @@ def default_room(frames: int, width: int, seed: int, scene: str = "room") -> Seq
 def measure_stream_faults(
     recording: Sequence, config: Config, faults: list[str] | None = None, frames: int | None = None
 ) -> Iterator[tuple[FaultRun, FaultRun]]:
-    """Run the system over a recording once without a fault and once with each.
-
-    Args:
-        recording: With true poses.
-        config: All parameters.
-        faults: Names of the faults; None or none takes all.
-        frames: Use only so many frames of the recording.
+    """Run the system over a recording once without a fault and once with each of those named (none: all).
 
     Yields:
         A run as soon as it ends, and the one without a fault, which is the first.

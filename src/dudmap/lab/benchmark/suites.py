@@ -32,13 +32,7 @@ QUICK = ("room-static", "room-person", "room-people-at-start", "two-people")
 
 @dataclass(frozen=True)
 class Suite:
-    """Recordings of a suite.
-
-    Attributes:
-        name: Name of the suite.
-        entries: Recordings that were found.
-        missing: Recordings that were not found.
-    """
+    """Recordings of a suite that were found, and those that are missing."""
 
     name: str
     entries: list[Entry]
@@ -50,11 +44,10 @@ class Suite:
 
 
 def find_suite(name: str, data: Path | None, *, quick: bool = False) -> Suite:
-    """Find the recordings of a suite.
+    """Find the recordings of one of ``SUITES``.
 
     Args:
-        name: One of ``SUITES``.
-        data: Folder that is searched, two levels deep, for the recordings; synthetic worlds need none.
+        data: Folder that is searched, two levels deep; synthetic worlds need none.
         quick: Only one to three synthetic worlds, and at most 60 frames of every recording.
 
     Raises:

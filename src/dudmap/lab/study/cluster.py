@@ -15,9 +15,7 @@ CPUS_PER_RUN = 1
 class RayExecutor:
     """Tasks of a Ray cluster. All nodes must see the study folder, and recordings without URL, under the same paths.
 
-    Args:
-        address: ``auto``, or ``ray://HOST:PORT``.
-        workers: Number of runs at a time; None takes the cores of the cluster.
+    The address is ``auto`` or ``ray://HOST:PORT``; without a number of workers they take all cores of the cluster.
 
     Raises:
         MissingExtraError: Ray is not installed.

@@ -24,9 +24,8 @@ class Progress:
     """State of a study.
 
     Attributes:
-        total: Number of different runs.
-        done: Number of runs that have a result, those of earlier starts included.
-        begun: Number of runs that had one at the start.
+        total, done, begun: Number of different runs, of those that have a result, and of those that had one at the
+            start.
         deaths: Number of workers that died.
         spent: Time of all runs so far, those of earlier starts included, seconds.
         started: ``time.monotonic`` at the start.
@@ -74,15 +73,9 @@ def conduct(
     do: Do | None = None,
     report: Callable[[Progress], None] = lambda progress: None,
 ) -> Progress:
-    """Do all runs that have no result yet.
+    """Do all runs that have no result yet, equal ones once; ``report`` is called after every run.
 
-    Args:
-        runs: The runs; equal ones are done once.
-        root: Study folder.
-        executor: Where they are done.
-        keep: Keep whole run folders.
-        do: See ``Job``.
-        report: Called after every run.
+    ``keep`` keeps whole run folders, ``do`` replaces the system (see ``Job``).
     """
     folder = StudyFolder(root)
     folder.create()

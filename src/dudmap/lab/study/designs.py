@@ -83,15 +83,11 @@ def configured(base: Config, values: Mapping[str, Value]) -> Config:
 
 
 def make_factor(key: str, given: object, base: Config) -> Factor:
-    """Factor of one line of a design file.
-
-    Args:
-        key: Configuration key.
-        given: A list of levels, or a table with ``levels`` or ``range`` and, optionally, ``scale``.
-        base: Configuration of the other keys, with which every level must be valid.
+    """Factor of one line of a design file: a list of levels, or a table with ``levels`` or ``range``, and ``scale``.
 
     Raises:
-        ConfigError: The key is unknown, the table malformed, or a level outside the range of the parameter.
+        ConfigError: The key is unknown, the table malformed, or a level is not valid beside the other keys of
+            ``base``.
     """
     table = {"levels": given} if isinstance(given, list) else given
     if not isinstance(table, dict) or len({"levels", "range"} & set(table)) != 1:

@@ -102,10 +102,7 @@ EMULATED = 1024
 def sobol_indices(factors: Sequence[Factor], values: NDArray[np.float64], seed: int = 0) -> Table:
     """First- and second-order and total Sobol indices with their confidence intervals (SALib).
 
-    Args:
-        factors: K factors.
-        values: (N (2 K + 2),) response of all rows of a Saltelli design, in its order.
-        seed: Seed of the bootstrap of the intervals.
+    ``values`` (N (2 K + 2),) are the response of all rows of a Saltelli design of K factors, in its order.
     """
     import pandas as pd
     from SALib.analyze.sobol import analyze
@@ -159,10 +156,7 @@ def emulated_indices(table: Table, factors: Sequence[Factor], response: str, see
 def morris_indices(factors: Sequence[Factor], coded: NDArray[np.float64], values: NDArray[np.float64]) -> Table:
     """Mean absolute elementary effect mu* with its interval, mean mu and standard deviation sigma (SALib).
 
-    Args:
-        factors: K factors.
-        coded: (N (K + 1), K) coded values of a Morris design, in its order.
-        values: (N (K + 1),) response.
+    ``coded`` (N (K + 1), K) is a Morris design of K factors and ``values`` (N (K + 1),) the response, in its order.
     """
     import pandas as pd
     from SALib.analyze.morris import analyze

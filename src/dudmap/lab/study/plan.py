@@ -109,9 +109,7 @@ class Run:
     Attributes:
         point: Number of the point in the design; -1 for a confirmation run.
         values: Values of the factors by key.
-        entry: The recording.
-        sequence: Name of the recording without its replicate.
-        replicate: Number of the replicate of a synthetic recording.
+        entry, sequence, replicate: The recording, its name without its replicate, and the number of that.
         config: All parameters.
         calibrate: Whether the colour camera is calibrated first, as ``dudmap run`` does.
         surfaces: Whether the mesh is scored.
@@ -143,18 +141,13 @@ class Plan:
     """A study as a design file describes it; see ``docs/study.md`` for the file.
 
     Attributes:
-        name: Name of the study.
         base: Configuration of the keys that are no factors.
-        factors: The factors.
-        options: The design.
-        entries: Recordings with the name of each without its replicate, and the number of the replicate.
+        entries: Recordings: the name of each without its replicate, the number of the replicate, and the recording.
         responses: Names of the responses; the first is optimised, the others are reported beside it.
         log: Names of the responses that are analysed as logarithms.
-        calibrate: Whether every run calibrates the colour camera first, as ``dudmap run`` does.
         confirm: Number of confirmation runs per recording at the predicted optimum; 0 omits them.
         each: Whether every recording also has a model and a confirmation of its own.
         code: Hash of the code.
-        tune: Options of ``dudmap study tune``.
         judges: Recordings, as ``entries``, on which ``dudmap study tune`` judges.
     """
 

@@ -106,15 +106,9 @@ class Surface:
 
 
 def fit_surface(data: Table, factors: Sequence[Factor], scale: Scale) -> Surface | str:
-    """Fit the full quadratic model by least squares; recordings are blocks whose effects sum to zero.
+    """Fit the full quadratic model to runs of ``Scale.usable`` by least squares, or say why there is none.
 
-    Args:
-        data: Runs, as ``Scale.usable`` gives them.
-        factors: All factors.
-        scale: The response.
-
-    Returns:
-        The model, or a sentence that says why there is none.
+    Recordings are blocks whose effects sum to zero.
     """
     import statsmodels.api as sm
     from sklearn.preprocessing import OneHotEncoder, PolynomialFeatures
@@ -154,13 +148,7 @@ def values_text(values: dict[str, Any]) -> str:
 
 @dataclass(frozen=True)
 class Optimum:
-    """Best prediction within the bounds of the factors.
-
-    Attributes:
-        coded: (K,) coded values.
-        values: Values by key.
-        predicted: Predicted response.
-    """
+    """Best prediction within the bounds: coded values (K,), values by key, and predicted response."""
 
     coded: tuple[float, ...]
     values: dict[str, float]
@@ -230,13 +218,7 @@ class Prediction:
 
 
 def predict_optimum(data: Table, factors: Sequence[Factor], scale: Scale) -> Prediction | str:
-    """Quadratic model of a response and its optimum, or a sentence that says why there is none.
-
-    Args:
-        data: Runs, as ``Scale.usable`` gives them.
-        factors: All factors.
-        scale: The response.
-    """
+    """Quadratic model of runs of ``Scale.usable`` and its optimum, or a sentence that says why there is none."""
     surface = fit_surface(data, factors, scale)
     if isinstance(surface, str):
         return surface
@@ -315,12 +297,10 @@ class Confirmation:
 
     Attributes:
         scale: The response; all values are as it is analysed.
-        predicted: Prediction of the model.
-        low, high: Interval in which the mean of the confirmation runs should fall.
+        predicted, low, high: Prediction of the model, and the interval in which the mean of ``count`` runs should
+            fall.
         design_mean: Mean of all runs of the design: what one would predict without a model.
-        measured: Mean of the confirmation runs.
-        best_point: Mean of the runs at the best point of the design on the same recordings.
-        count: Number of confirmation runs.
+        measured, best_point: Means of the runs at the optimum and at the best point of the design.
     """
 
     scale: Scale
@@ -361,13 +341,9 @@ class Confirmation:
 
 
 def confirm(surface: Surface, best: Optimum, measured: Sequence[float], best_point: Sequence[float]) -> Confirmation:
-    """Compare confirmation runs with the prediction and with the best point of the design.
+    """Compare runs at the optimum (M,), as many on every recording, with the prediction and with the best point.
 
-    Args:
-        surface: The model.
-        best: Its optimum.
-        measured: (M,) response of the runs at the optimum, the same number on every recording.
-        best_point: (M,) response of runs at the best point of the design, on the same recordings.
+    ``best_point`` (M,) is the response of runs at the best point of the design, on the same recordings.
     """
     predicted, low, high = surface.interval(np.array(best.coded), len(measured))
     mean, other, usual = (float(np.mean(values)) for values in (measured, best_point, surface.observed))

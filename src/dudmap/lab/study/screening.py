@@ -25,12 +25,8 @@ def numeric_factors(given: object, base: Config, chosen: Collection[str] = ()) -
 
     Both ends are kept inside the bounds of the key; where a bound excludes its own value, the end lies halfway between
     value and bound. A whole number changes by 1 at least. Of a list of numbers all elements change together, and the
-    factor has two levels. A key with the value 0 has no ratio and is left out.
-
-    Args:
-        given: Table ``all_numeric`` of a design file: ``ratio``, and keys to leave out (``without``).
-        base: Configuration whose values are varied.
-        chosen: Keys that the design file gives itself, which are left out.
+    factor has two levels. A key with the value 0 has no ratio and is left out, as are the keys ``chosen`` by the design
+    file and those that its table (``ratio``, ``without``) names.
 
     Raises:
         ConfigError: The table is malformed.

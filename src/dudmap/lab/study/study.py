@@ -29,13 +29,7 @@ def run_study(
 ) -> str:
     """Do all runs that are missing, confirm the optimum, and write runs.csv, confirmation.csv and the report.
 
-    Args:
-        plan: The study.
-        out: Its folder.
-        executor: Where the runs are done; it is closed.
-        max_runs: Largest number of runs.
-        keep: Keep whole run folders.
-        report: Called after every run.
+    The executor is closed. ``keep`` keeps whole run folders; ``report`` is called after every run.
 
     Returns:
         The outcome in words.

@@ -29,12 +29,7 @@ PUBLISHED_CONFIRMATION = 89.0
 
 
 def thesis_plan(table: str = "6.1", recordings: Sequence[Path] = (), frames: int | None = None) -> Plan:
-    """Plan of one table of the thesis.
-
-    Args:
-        table: ``6.1``, ``6.2`` or ``6.3``.
-        recordings: Recordings; none takes ``ROOM``.
-        frames: Use only the first frames.
+    """Plan of table 6.1, 6.2 or 6.3 of the thesis, on ``ROOM`` unless recordings are named.
 
     Raises:
         ConfigError: There is no such table.

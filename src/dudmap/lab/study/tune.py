@@ -47,9 +47,9 @@ class Verdict:
     """What one configuration of the training front is worth on the second set.
 
     Attributes:
-        values: Values of the factors.
         training: Geometric mean, over the training recordings, of each response relative to the base configuration.
-        judged: The same over the second set; NaN if a run failed or lost more frames than with the base configuration.
+        judged: The same over the second set; NaN if a run failed or lost more frames than with the base
+            configuration.
         p: Probability of ratios like those of the first response on the second set if there were no improvement.
     """
 

@@ -128,14 +128,7 @@ Do = Callable[[Run, Path | None], dict[str, Any]]
 
 
 class Job(NamedTuple):
-    """A run and the study folder that takes its result.
-
-    Attributes:
-        run: The run.
-        root: The study folder.
-        keep: Whether the whole run folder (trajectory, mesh, map) is kept beside the figures.
-        do: What is done; None runs the system.
-    """
+    """A run and the study folder that takes its result, whole if ``keep``; ``do`` None runs the system."""
 
     run: Run
     root: Path
@@ -244,12 +237,8 @@ class Executor(Protocol):
 class LocalExecutor:
     """Processes of this machine, each of which outlives its jobs so that start and kernels are paid once.
 
-    Every worker has a process pool of its own: the death of one ends its current job only.
-
-    Args:
-        workers: Number of processes.
-        threads: Threads of each (DUDMAP_THREADS); by default the cores are shared equally.
-        kernels: Whether the first worker compiles the kernels before any other starts.
+    Every worker has a process pool of its own: the death of one ends its current job only. The cores are shared equally
+    unless ``threads`` says how many each has; with ``kernels`` the first worker compiles them before any other starts.
     """
 
     def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:

@@ -25,16 +25,9 @@ WHITE_BALANCE_PERIOD = 8.0
 
 
 class ColorCamera:
-    """Colour camera beside a depth camera.
+    """Colour camera beside a depth camera, with true intrinsics ``camera``.
 
-    Args:
-        faults: Its place, delay, readout, lens, white balance and vignetting.
-        depth_camera: Intrinsics of the depth camera.
-        exposure_time: Duration of the exposure of a row, seconds; 0 for no motion blur.
-        frame_interval: Time between two frames, seconds.
-
-    Attributes:
-        camera: True intrinsics.
+    The exposure of a row takes ``exposure_time`` (0: no motion blur); times in seconds.
     """
 
     def __init__(self, faults: SensorFaults, depth_camera: Camera, exposure_time: float, frame_interval: float) -> None:
@@ -91,15 +84,10 @@ class ColorCamera:
 
 
 def exposure_gains(levels: NDArray[np.float64], times: NDArray[np.float64], lag: float) -> NDArray[np.float64]:
-    """Exposure factors (N,) of an automatic exposure with a lag.
+    """Exposure factors (N,) of an automatic exposure with a lag in seconds, of mean grey values (N,) at factor 1.
 
     A control loop of first order on the logarithm of the exposure: each frame moves by 1 - exp(-dt / lag) towards the
     factor that would have brought the frame before to ``TARGET_LEVEL``. The first frame is settled.
-
-    Args:
-        levels: (N,) mean grey values at factor 1.
-        times: (N,) seconds.
-        lag: Time constant in seconds, positive.
     """
     wanted = np.clip(np.log(TARGET_LEVEL / np.maximum(levels, 1.0)), -np.log(LARGEST_GAIN), np.log(LARGEST_GAIN))
     gains = np.empty(len(times))
@@ -116,14 +104,7 @@ def white_balance(faults: SensorFaults, t: float) -> NDArray[np.float32]:
 
 
 class Lens:
-    """Lens that distorts an ideal image of a somewhat larger view.
-
-    Args:
-        camera: Intrinsics and distortion of the image to be made.
-
-    Attributes:
-        margin: Number of pixels by which the ideal image is larger on every side.
-    """
+    """Lens that distorts an ideal image of a view that is larger by ``margin`` pixels on every side."""
 
     def __init__(self, camera: Camera) -> None:
         rows, columns = np.indices(camera.shape, dtype=np.float64)
@@ -165,13 +146,7 @@ EDGE = (0.04, 0.02)
 
 
 class DepthFaults:
-    """Systematic errors of one sensor, drawn from a seed.
-
-    Args:
-        faults: Their sizes.
-        camera: Intrinsics of the depth camera.
-        seed: Seed of the patterns.
-    """
+    """Systematic errors of the depth of one sensor, whose patterns are drawn from a seed."""
 
     def __init__(self, faults: SensorFaults, camera: Camera, seed: int) -> None:
         self._faults, self._camera, self._seed = faults, camera, seed

@@ -94,13 +94,9 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
 def crowd_of(
     coverage: float, staging: Staging, times: NDArray[np.float64], Ts_world_camera: NDArray[np.float64]
 ) -> Crowd:
-    """Crowd that covers ``coverage`` of the image on average, once all of it is in view; found by bisection.
+    """Crowd that covers the share ``coverage`` of the image on average, once all of it is in view; by bisection.
 
-    Args:
-        coverage: Share of the image.
-        staging: Scene, random numbers, speed, duration, and whether the crowd is in view in the first frame.
-        times: (N,) timestamps of the frames, seconds.
-        Ts_world_camera: (N, 4, 4) camera poses of the frames.
+    The frames have timestamps (N,) in seconds and camera poses (N, 4, 4).
 
     Raises:
         ConfigError: The share is not between 0.02 and 0.95, or no crowd in this scene covers it.

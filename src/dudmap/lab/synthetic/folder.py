@@ -26,20 +26,14 @@ def write_folder(
     surface: bool = True,
     progress: Callable[[int], None] | None = None,
 ) -> Path:
-    """Render all frames into a folder.
+    """Render all frames into a folder, which is created if needed.
 
     The folder receives rgb/, depth/ (16 bit, ``camera.depth_scale`` units per metre), masks/ (255 = dynamic), their
     lists rgb.txt, depth.txt, mask.txt and associations.txt, groundtruth.txt, intrinsics.txt, coverage.txt (dynamic
-    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults
-    of the sensor), surface.ply (the static surface) and surface_observed.ply (the part
-    of it that the camera saw). If writing is interrupted, the lists contain the complete frames.
-
-    Args:
-        sequence: The recording.
-        out: The folder; created if needed.
-        overwrite: Accept a folder that is not empty.
-        surface: Write the two meshes.
-        progress: Called with the number of finished frames.
+    share of the image), movers.jsonl, scene.json, sensor_truth.json (the faults of the sensor), surface.ply (the static
+    surface) and surface_observed.ply (the part of it that the camera saw). If writing is interrupted, the lists contain
+    the complete frames. ``overwrite`` accepts a folder that is not empty; ``progress`` is called with the number of
+    finished frames.
 
     Raises:
         DatasetError: The folder is not empty, or cannot be written.

@@ -25,11 +25,11 @@ def smoothed(values: NDArray[np.float64], seconds: float) -> NDArray[np.float64]
 
 
 class FloorPath:
-    """Path over the floor through waypoints at given times, with rounded corners and gradual starts and stops.
+    """Path over the floor through points (K, 2) in metres at given times (K,) in seconds, with rounded corners.
+
+    It starts and stops gradually, and rests before the first time and after the last.
 
     Args:
-        times: (K,) increasing times of the waypoints, seconds; the path rests before the first and after the last.
-        points: (K, 2) floor positions, metres.
         smooth: Standard deviation of the smoothing, seconds.
         yaw: Heading before the first motion, radians; None takes the direction of the first motion.
         gaps: Intervals (from, to) in which the object is absent, seconds.

@@ -61,8 +61,6 @@ class Staging:
     """Conditions under which movers are built.
 
     Attributes:
-        scene: Scene in which they move.
-        rng: Random number generator.
         speed: Requested speed, m/s; None for the natural speed of each mover.
         duration: Duration of the recording, seconds.
         start_dynamic: Whether they are in view and moving in the first frame.

@@ -28,14 +28,9 @@ DEFAULT_CAMERA = Camera(fx=525.0, fy=525.0, cx=319.5, cy=239.5, width=640, heigh
 
 
 class MoverState(NamedTuple):
-    """State of a mover in one frame.
+    """State of a mover in one frame: identity from 1 on, pose (4, 4), velocity (3,) in m/s (world frame), kind.
 
-    Attributes:
-        id: Identity, from 1 on, the same in every frame.
-        T_world_mover: (4, 4) pose.
-        velocity: (3,) m/s, world frame.
-        name: Kind of object.
-        moving: Whether it counts as dynamic in this frame.
+    ``moving`` says whether it counts as dynamic in this frame.
     """
 
     id: int

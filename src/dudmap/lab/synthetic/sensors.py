@@ -109,11 +109,7 @@ SENSORS = {name: _model(row) for name, row in tables("synthetic/sensors.toml")["
 
 
 class Sensor:
-    """Simulated sensor that adds noise to ideal images; equal seeds and frame numbers give equal errors.
-
-    Args:
-        name: One of ``SENSORS``.
-        seed: Seed of the noise.
+    """Sensor, one of ``SENSORS``, that adds noise to ideal images; equal seeds and frame numbers give equal errors.
 
     Raises:
         ConfigError: The name is unknown.

@@ -28,13 +28,7 @@ INVALID_SHARE = 0.3
 
 
 class Delivery(NamedTuple):
-    """One frame as it arrives.
-
-    Attributes:
-        number: Its number in the recording.
-        timestamp: Stamp that it carries, seconds.
-        alter: What happens to its images; None leaves them.
-    """
+    """One frame as it arrives: number in the recording, stamp that it carries (s), and what happens to its images."""
 
     number: int
     timestamp: float
@@ -47,26 +41,14 @@ Schedule = Callable[[NDArray[np.float64]], list[Delivery]]
 
 @dataclass(frozen=True)
 class StreamFault:
-    """A fault.
-
-    Attributes:
-        description: What happens, for tables.
-        schedule: Deliveries of a recording from its stamps.
-    """
+    """A fault: what happens, for tables, and the deliveries of a recording from its stamps."""
 
     description: str
     schedule: Schedule
 
 
 class FaultyStream:
-    """A recording as it arrives over a faulty stream; its stamps need not increase.
-
-    Args:
-        recording: The recording.
-        fault: Name of the fault, one of ``FAULTS``.
-
-    Attributes:
-        deliveries: What arrives, in order of arrival.
+    """A recording as it arrives, in ``deliveries``, with one of ``FAULTS``; its stamps need not increase.
 
     Raises:
         ConfigError: There is no such fault.

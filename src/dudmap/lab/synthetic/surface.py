@@ -207,14 +207,10 @@ def count_views(
     depth_range: tuple[float, float],
     grazing: float,
 ) -> NDArray[np.int32]:
-    """Number of views (V,) in which each vertex is seen.
+    """Number of views (V,) in which each vertex of a mesh in the world frame is seen.
 
-    Args:
-        mesh: Surface in the world frame.
-        camera: Intrinsics.
-        views: Pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres.
-        depth_range: Smallest and largest depth that counts, metres.
-        grazing: Cosine of the angle of incidence below which a surface does not count as seen.
+    Views are pairs of T_world_camera (4, 4) and the ideal depth image (H, W) in metres. Depths within ``depth_range``
+    count, and surfaces whose angle of incidence has at least the cosine ``grazing``.
     """
     counts = np.zeros(len(mesh.vertices), dtype=np.int32)
     intrinsics = np.array([camera.fx, camera.fy, camera.cx, camera.cy])
