@@ -292,7 +292,7 @@ def _kernel_times(action: Callable[[], object]) -> dict[str, float]:
 def measure_open3d(
     python: str, name: str, recording: Sequence, frames: int, voxels: Iterable[float], device: str
 ) -> list[DeviceRun]:
-    """Time per frame of Open3D's dense SLAM with each voxel size (m) on "CUDA:0" or "CPU:0", in a program of its own."""
+    """Time per frame of Open3D's dense SLAM with each voxel size (m), on "CUDA:0" or "CPU:0"."""
     rows = []
     with tempfile.TemporaryDirectory(prefix="dudmap-") as folder:
         save_frames(recording, frames, Path(folder))

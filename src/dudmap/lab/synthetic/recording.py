@@ -14,13 +14,14 @@ from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.mesh import Mesh
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import FrameError
+from dudmap.io.exporting.mesh_editing import with_faces
 from dudmap.lab.synthetic.color_camera import ColorCamera, DepthFaults, compressed, exposure_gains, white_balance
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.movers import MOVING_SPEED, SyntheticMover
 from dudmap.lab.synthetic.render import Renderer, Rendering
 from dudmap.lab.synthetic.scene import Scene
 from dudmap.lab.synthetic.sensors import Sensor, SensorModel, TimeOfFlightModel
-from dudmap.lab.synthetic.surface import count_views, tessellate, with_faces
+from dudmap.lab.synthetic.surface import count_views, tessellate
 
 NEAREST, FARTHEST = 0.3, 6.0
 """Range of an ideal sensor, for the observed part of the surface, metres."""
