@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
 from dudmap.errors import ConfigError
-from dudmap.lab.synthetic.movers import Staging, SyntheticMover
+from dudmap.lab.synthetic.movers import Staging, SyntheticMover, placed
 from dudmap.lab.synthetic.person import Figure
 from dudmap.lab.synthetic.render import Renderer
 from dudmap.lab.synthetic.scene import pose
@@ -84,9 +84,7 @@ def _coverage(crowd: Crowd, times: NDArray[np.float64], Ts_world_camera: NDArray
     renderer = Renderer(scene, scene.primitives + [p for mover in movers for p in mover.primitives])
     shares = []
     for t, T in zip(times, Ts_world_camera, strict=True):
-        Ts = np.concatenate([m.parts(t) @ np.array([p.T_body_primitive for p in m.primitives]) for m in movers])
-        present = np.concatenate([np.full(len(m.primitives), m.present(t)) for m in movers])
-        image = renderer.render(camera, T, Ts, present, with_color=False)
+        image = renderer.render(camera, T, *placed(movers, t), with_color=False)
         shares.append(float((image.primitive >= len(scene.primitives)).mean()))
     return float(np.mean(shares))
 

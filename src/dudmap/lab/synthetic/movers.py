@@ -55,6 +55,17 @@ class SyntheticMover:
         return float(np.linalg.norm(where[1] - where[0], axis=2).max() / span)
 
 
+def placed(movers: list[SyntheticMover], t: float) -> tuple[Matrix, NDArray[np.bool_]]:
+    """Poses (P, 4, 4) of all solids of movers at a time in seconds, and which of them exist then (P,)."""
+    Ts, present = [np.empty((0, 4, 4))], []
+    for mover in movers:
+        count, exists = len(mover.primitives), mover.present(t)
+        local = np.array([primitive.T_body_primitive for primitive in mover.primitives])
+        Ts.append(mover.parts(t) @ local if exists else np.tile(np.eye(4), (count, 1, 1)))
+        present += [exists] * count
+    return np.concatenate(Ts), np.array(present, dtype=bool)
+
+
 @dataclass(frozen=True)
 class Staging:
     """Conditions under which movers are built.

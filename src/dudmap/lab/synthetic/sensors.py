@@ -18,37 +18,46 @@ from dudmap.lab.synthetic.render import Rendering, over_rows
 NOISE_SIZE = 1024
 
 
-@dataclass(frozen=True)
-class SensorModel:
+@dataclass(frozen=True, kw_only=True)
+class NoiseModel:
+    """What all noise models have.
+
+    Attributes:
+        lateral: Standard deviation of the lateral noise, pixels.
+        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
+        grazing: Cosine of the angle of incidence below which readings are lost.
+        edge_loss: Share of readings lost at a depth edge: on its far side, by time of flight on both.
+        speckle: Share of readings lost at random.
+        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
+        color_noise: Standard deviation of the colour noise, grey values.
+    """
+
+    lateral: float
+    nearest: float
+    fade: float
+    farthest: float
+    grazing: float
+    edge_loss: float
+    speckle: float
+    correlation: float
+    color_noise: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class SensorModel(NoiseModel):
     """Sensor with noise in the disparity ``d = fx b / z``, so that sigma_z = sigma z^2 / (fx b) (thesis eq. 3.91).
 
     Attributes:
         baseline: Distance from the camera to the projector or second camera on its right, metres.
         depth_noise: Standard deviation of the depth at 1 m including the quantisation by ``step``, metres.
         step: Quantisation step of the disparity, pixels.
-        lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
         fatten: Width by which near surfaces are dilated (foreground fattening of window matching), pixels.
-        grazing: Cosine of the angle of incidence below which readings are lost.
-        edge_loss: Share of readings lost on the far side of a depth edge.
-        speckle: Share of readings lost at random.
-        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
-        color_noise: Standard deviation of the colour noise, grey values.
     """
 
     baseline: float
     depth_noise: float
     step: float
-    lateral: float
-    nearest: float
-    fade: float
-    farthest: float
     fatten: int
-    grazing: float
-    edge_loss: float
-    speckle: float
-    correlation: float
-    color_noise: float
 
     def row(self, focal: float) -> NDArray[np.float64]:
         """Parameters in the order of the kernel, for a focal length in pixels.
@@ -61,8 +70,8 @@ class SensorModel:
         return np.array([*numbers, self.fatten, self.grazing, self.edge_loss, self.speckle])
 
 
-@dataclass(frozen=True)
-class TimeOfFlightModel:
+@dataclass(frozen=True, kw_only=True)
+class TimeOfFlightModel(NoiseModel):
     """Sensor that measures the range itself, so that its noise does not follow z^2.
 
     The standard deviation of the depth is noise[0] + noise[1] z + noise[2] z^2 plus slant z^1.5 (theta / (pi/2 -
@@ -71,27 +80,11 @@ class TimeOfFlightModel:
     Attributes:
         noise: Coefficients of 1, z and z^2, metres.
         slant: Coefficient of the term that grows with the angle of incidence, metres.
-        lateral: Standard deviation of the lateral noise, pixels.
-        nearest, fade, farthest: Range, metres; the share of missing readings grows between fade and farthest.
-        grazing: Cosine of the angle of incidence below which readings are lost.
-        edge_loss: Share of readings lost on both sides of a depth edge.
-        speckle: Share of readings lost at random.
-        correlation: Standard deviation of the Gaussian that correlates neighbouring errors, pixels.
-        color_noise: Standard deviation of the colour noise, grey values.
         native_width: Width in pixels at which the sensor measures; a wider image is interpolated from it. 0: any.
     """
 
     noise: tuple[float, float, float]
     slant: float
-    lateral: float
-    nearest: float
-    fade: float
-    farthest: float
-    grazing: float
-    edge_loss: float
-    speckle: float
-    correlation: float
-    color_noise: float
     native_width: int = 0
 
     def row(self) -> NDArray[np.float64]:

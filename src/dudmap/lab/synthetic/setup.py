@@ -15,7 +15,7 @@ from dudmap.lab.synthetic.crowd import crowd_of
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.motion import smooth_step
 from dudmap.lab.synthetic.movers import Staging, SyntheticMover, build_movers, rigid
-from dudmap.lab.synthetic.paths import FOLLOW, PATHS, camera_poses
+from dudmap.lab.synthetic.paths import FOLLOW, camera_poses
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.lab.synthetic.rooms import build_scene
 from dudmap.lab.synthetic.scene import Material, Scene, box, pose
@@ -164,9 +164,7 @@ def sequence(
         if movers is not None and set(names) - {"person", "people"}:
             raise ConfigError(f"coverage stands for people, but the movers are {', '.join(names)}; drop one of the two")
         names = ("crowd",)
-        alone = (
-            PATHS["still"](world, staging.rng, times) if path == FOLLOW else camera_poses(path, world, times, seed, [])
-        )
+        alone = camera_poses("still" if path == FOLLOW else path, world, times, seed, [])
         actors = crowd_of(coverage, staging, times, alone).movers()
     else:
         names = names if coverage is None else ()
@@ -181,24 +179,14 @@ def sequence(
             return ground_truth.interpolate(min(max(t, float(times[0])), float(times[-1])))
 
         actors.append(cover(times, camera_at, special.covered))
+    covered, elsewhere = ([[share * float(times[-1]) for share in span] for span in spans]
+                          for spans in (special.covered, special.elsewhere))  # fmt: skip
     parameters: dict[str, object] = {
-        "scene": scene,
-        "movers": list(names),
-        "camera_path": str(path),
-        "frames": frames,
-        "fps": fps,
-        "sensor_name": sensor,
-        "noise": noise,
-        "speed": speed,
-        "coverage": coverage,
-        "start_dynamic": at_once,
-        "situation": situation,
-        "covered_s": [[share * float(times[-1]) for share in span] for span in special.covered],
-        "elsewhere_s": [[share * float(times[-1]) for share in span] for span in special.elsewhere],
-        "seed": seed,
-        "motion_blur": motion_blur,
-        "exposure_change": exposure_change,
-    }
+        "scene": scene, "movers": list(names), "camera_path": str(path), "frames": frames, "fps": fps,
+        "sensor_name": sensor, "noise": noise, "speed": speed, "coverage": coverage, "start_dynamic": at_once,
+        "situation": situation, "covered_s": covered, "elsewhere_s": elsewhere, "seed": seed,
+        "motion_blur": motion_blur, "exposure_change": exposure_change,
+    }  # fmt: skip
     return SyntheticSequence(
         world, actors, ground_truth, camera,
         noise=noise, seed=seed, fps=fps, motion_blur=motion_blur, exposure_change=exposure_change, faults=faults,
