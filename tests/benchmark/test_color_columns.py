@@ -1,9 +1,9 @@
 import pytest
 
 from dudmap.config import Config
-from dudmap.errors import ConfigError, DatasetError
-from dudmap.lab.benchmark import color_columns
-from dudmap.lab.benchmark.color_columns import color_table, measure_recording
+from dudmap.errors import ConfigError
+from dudmap.lab.benchmark import measure
+from dudmap.lab.benchmark.color_columns import color_table, measure_columns
 from dudmap.lab.benchmark.entries import Entry
 from dudmap.lab.benchmark.suites import SENSORS, sensor_entries
 from dudmap.lab.synthetic.sensors import CAMERAS
@@ -32,24 +32,19 @@ def test_failed_column_is_named_and_passes_nothing():
     assert "- a, without colour: no frame was tracked" in text
 
 
-def test_columns_are_measured_on_the_same_frames_and_only_the_default_calibrates(monkeypatch):
-    measured = []
+def test_only_the_default_calibrates_and_a_failed_column_is_a_row(monkeypatch):
+    def measure_job(function, job):
+        if job.config.tracker.color_weight == 0:
+            return {"error": "no frame was tracked"}
+        return {"sigma": job.config.sensor.color_time_sigma, "calibrated": job.calibrate}
 
-    def measure(sequence, config, surfaces, max_frames=None, calibrate=False):
-        measured.append((id(sequence), calibrate))
-        if config.tracker.color_weight == 0:
-            raise DatasetError("no frame was tracked")
-        return {"ate_rmse_m": config.sensor.color_time_sigma}
-
-    monkeypatch.setattr(color_columns, "measure_sequence", measure)
-    answer = measure_recording((Entry("tiny", parameters=TINY), Config()))
-    assert len({sequence for sequence, _ in measured}) == 1
-    assert dict(zip(answer, (calibrate for _, calibrate in measured), strict=True)) == {
-        "with colour": False, "without colour": False, "default": True,
-    }  # fmt: skip
-    assert answer["without colour"] == {"error": "no frame was tracked"}
-    assert answer["with colour"]["ate_rmse_m"] == 0
-    assert answer["default"]["ate_rmse_m"] == Config().sensor.color_time_sigma
+    monkeypatch.setattr(measure, "in_own_process", measure_job)
+    found = {row["system"]: row for row in measure_columns([Entry("tiny", parameters=TINY)], Config())}
+    assert found["with colour"]["sigma"] == 0
+    assert not found["with colour"]["calibrated"]
+    assert found["without colour"]["error"] == "no frame was tracked"
+    assert found["default"]["sigma"] == Config().sensor.color_time_sigma
+    assert found["default"]["calibrated"]
 
 
 def test_suite_takes_one_room_with_every_sensor():

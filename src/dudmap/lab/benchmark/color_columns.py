@@ -6,9 +6,8 @@ The default must not be worse than the better of the two by more than ``TOLERANC
 from collections.abc import Callable, Iterable, Sequence
 
 from dudmap.config import Config
-from dudmap.errors import DudmapError
-from dudmap.lab.benchmark.entries import Entry, Excerpt
-from dudmap.lab.benchmark.measure import Row, measure_each, measure_sequence
+from dudmap.lab.benchmark.entries import Entry
+from dudmap.lab.benchmark.measure import Job, Row, measure_all
 from dudmap.lab.benchmark.table import grid
 
 SETTINGS: dict[str, tuple[str, ...]] = {
@@ -25,42 +24,10 @@ TOLERANCE = 0.05
 def measure_columns(
     entries: Iterable[Entry], config: Config, workers: int = 1, done: Callable[[Row], None] = lambda row: None
 ) -> list[Row]:
-    """Measure every recording with the settings of every column; one row per recording and column.
-
-    A synthetic recording is rendered once for all columns. ``done`` is called with every row when its recording is
-    complete.
-    """
-
-    def rows_of(found: Row) -> list[Row]:
-        failed = {"error": found.get("error")}
-        return [{"sequence": found["sequence"], "system": name} | found.get(name, failed) for name in SETTINGS]
-
-    jobs = [({"sequence": entry.name}, (entry, config)) for entry in entries]
-
-    def measured(found: Row) -> None:
-        for row in rows_of(found):
-            done(row)
-
-    return [row for found in measure_each(measure_recording, jobs, workers, measured) for row in rows_of(found)]
-
-
-def measure_recording(job: tuple[Entry, Config]) -> Row:
-    """Figures of one recording by the name of the column."""
-    from dudmap.lab.synthetic.recording import SyntheticSequence
-
-    entry, config = job
-    sequence, rows = entry.open(), {}
-    if isinstance(sequence, SyntheticSequence):
-        sequence = Excerpt(sequence).load()
-    for name, settings in SETTINGS.items():
-        calibrate, frames = name == "default", entry.max_frames
-        try:
-            rows[name] = measure_sequence(
-                sequence, config.override(settings), None, max_frames=frames, calibrate=calibrate
-            )
-        except DudmapError as error:
-            rows[name] = {"error": str(error)}
-    return rows
+    """Measure every recording with the settings of every column; one row per recording and column."""
+    configs = {name: config.override(settings) for name, settings in SETTINGS.items()}
+    jobs = [Job(entry, name, configs[name], calibrate=name == "default") for entry in entries for name in configs]
+    return measure_all(jobs, workers, done)
 
 
 def color_table(rows: Sequence[Row]) -> str:

@@ -35,12 +35,17 @@ FEWER_SAMPLES = 40_000
 
 
 class Job(NamedTuple):
-    """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run."""
+    """One measurement of a suite: recording, name and parameters of the system, and the folder that keeps the run.
+
+    Without a folder the mesh is not scored. ``calibrate`` says whether the calibration of the colour camera is
+    estimated first, as ``dudmap run`` does.
+    """
 
     entry: Entry
     system: str
     config: Config
     out: Path | None = None
+    calibrate: bool = True
 
 
 def measure(job: Job) -> Row:
@@ -50,9 +55,9 @@ def measure(job: Job) -> Row:
         DudmapError: The recording cannot be used, or no frame could be tracked.
     """
     sequence, passes = job.entry.open(), PASSES.get(job.system, 1)
-    surfaces = job.entry.surfaces(sequence)
-    frames = job.entry.max_frames
-    return measure_sequence(sequence, job.config, surfaces, job.out, frames, passes=passes, calibrate=True)
+    surfaces = job.entry.surfaces(sequence) if job.out is not None else None
+    frames, calibrate = job.entry.max_frames, job.calibrate
+    return measure_sequence(sequence, job.config, surfaces, job.out, frames, passes=passes, calibrate=calibrate)
 
 
 def measure_sequence(
