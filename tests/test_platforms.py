@@ -77,7 +77,7 @@ def test_closing_workers_that_are_gone_is_no_error(monkeypatch):
 
     monkeypatch.setattr(os, "kill", kill)
     executor = LocalExecutor(1)
-    executor._pids.add(1)
+    executor._pids[None] = 1
     executor.close()
 
 

@@ -3,15 +3,14 @@
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Sequence
-from concurrent.futures import Future
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from queue import SimpleQueue
-from typing import Any
+from threading import Event, Lock
 
 from dudmap.lab.study.designs import Table
 from dudmap.lab.study.plan import Run
-from dudmap.lab.study.worker import Do, Executor, Job, StudyFolder, WorkerDied
+from dudmap.lab.study.worker import Do, Executor, Job, StudyFolder
 
 ATTEMPTS = 3
 """Times a run is begun whose worker dies, after which it is left out; a later start of the study tries again."""
@@ -87,34 +86,41 @@ def conduct(
         len(unique), len(known), len(known), spent=sum(known), started=time.monotonic(), cores=executor.cores
     )
     deaths: Counter[str] = Counter()
-    running: dict[Future[Any], str] = {}
-    ended: SimpleQueue[Future[Any]] = SimpleQueue()  # waiting for a thousand futures anew after each would take longer
-    while missing or running:
-        while missing and len(running) < executor.workers:
-            key = missing.popleft()
-            future = executor.submit(Job(unique[key], root, keep, do))
-            running[future] = key
-            future.add_done_callback(ended.put)
-        future = ended.get()
-        key = running.pop(future)
-        try:
-            outcome = future.result()
-        except WorkerDied:
-            folder.note("died", key)
-            deaths[key] += 1
-            state.deaths += 1
-            if deaths[key] < ATTEMPTS:
+    stopped, lock = Event(), Lock()
+
+    def work() -> None:
+        while missing and not stopped.is_set():
+            try:
+                key = missing.popleft()
+            except IndexError:  # another thread took it
+                return
+            outcome = executor.perform(Job(unique[key], root, keep, do))
+            if outcome == "claimed":  # by another start of the study, or a worker that has yet to notice its end
                 missing.append(key)
-            continue
-        if outcome == "claimed":  # by another start of the study, or a worker that has yet to notice its end
-            missing.append(key)
-            time.sleep(POLL)
-            continue
-        result = folder.result(key)
-        assert result is not None
-        state.done += 1
-        state.spent += result["seconds"]
-        report(state)
+                time.sleep(POLL)
+                continue
+            with lock:
+                if outcome == "died":
+                    folder.note("died", key)
+                    deaths[key] += 1
+                    state.deaths += 1
+                    if deaths[key] < ATTEMPTS:
+                        missing.append(key)
+                    continue
+                result = folder.result(key)
+                assert result is not None
+                state.done += 1
+                state.spent += result["seconds"]
+                report(state)
+
+    with ThreadPoolExecutor(executor.workers, thread_name_prefix="study") as pool:
+        try:
+            for thread in [pool.submit(work) for _ in range(executor.workers)]:
+                thread.result()
+        except BaseException:  # Ctrl-C, or a defect: the workers end at once
+            stopped.set()
+            executor.close()
+            raise
     return state
 
 

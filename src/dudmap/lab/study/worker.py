@@ -11,7 +11,7 @@ import threading
 import time
 import traceback
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from functools import lru_cache
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     from dudmap.evaluation.surface import Surface
     from dudmap.io.sequences import Sequence
 
-Outcome = Literal["finished", "known", "claimed"]
-"""What came of a job: its run was done now, or before, or another process is doing it."""
+Outcome = Literal["finished", "known", "claimed", "died"]
+"""What came of a job: its run was done now, or before, or another process is doing it, or its worker died."""
 
 CACHED_BYTES = 300e6
 """Frames of a recording that a worker keeps read or rendered between runs, bytes at most."""
@@ -210,23 +210,19 @@ def reset_peak_memory() -> None:
         switch.write_text("5", encoding="utf-8")  # proc(5): reset the peak resident set size
 
 
-class WorkerDied(Exception):  # noqa: N818 - what happened to a worker, no mistake of the user
-    """The process or node that did a job ended before the job did."""
-
-
 class Executor(Protocol):
     """Does jobs. An engine for clusters needs no more than this.
 
     Attributes:
-        workers: Number of jobs that are done at a time.
+        workers: Number of jobs that are done at a time, each asked for by a thread of its own.
         cores: Cores that a job uses.
     """
 
     workers: int
     cores: int
 
-    def submit(self, job: Job) -> "Future[Outcome]":
-        """Start a job as soon as a worker is free; the future raises ``WorkerDied`` if its worker ends before it."""
+    def perform(self, job: Job) -> Outcome:
+        """Do a job in another process."""
         ...
 
     def close(self) -> None:
@@ -237,58 +233,47 @@ class Executor(Protocol):
 class LocalExecutor:
     """Processes of this machine, each of which outlives its jobs so that start and kernels are paid once.
 
-    Every worker has a process pool of its own: the death of one ends its current job only. The cores are shared equally
+    Every worker is a process pool of its own: the death of one ends its current job only. The cores are shared equally
     unless ``threads`` says how many each has; with ``kernels`` the first worker compiles them before any other starts.
     """
 
     def __init__(self, workers: int, threads: int | None = None, kernels: bool = True) -> None:
         self.workers = workers
         self.cores = threads or max(1, usable_cores() // workers)
-        self._feeders = ThreadPoolExecutor(workers, thread_name_prefix="study")
-        self._own = threading.local()
-        self._pids: set[int] = set()
+        self._pids: dict[ProcessPoolExecutor, int] = {}
+        self._idle: list[ProcessPoolExecutor] = []
         self._lock = threading.Lock()
         self._loaded = not kernels
         self._closed = False
 
-    def submit(self, job: Job) -> "Future[Outcome]":
+    def perform(self, job: Job) -> Outcome:
         """See ``Executor``."""
-        return self._feeders.submit(self._do, job)
-
-    def _do(self, job: Job) -> Outcome:
-        pool = self._pool()
+        pool = self._idle.pop() if self._idle else self._started()
         try:
-            return pool.submit(perform, job).result()
-        except BrokenProcessPool:
-            self._pids.discard(self._own.pid)
-            pool.shutdown(wait=False)
-            self._own.pool = None
-            raise WorkerDied from None
-
-    def _pool(self) -> ProcessPoolExecutor:
-        """Process of the calling thread."""
-        if getattr(self._own, "pool", None) is None:
-            context = multiprocessing.get_context("spawn")
-            pool = ProcessPoolExecutor(1, context, initializer=start_worker, initargs=(self.cores,))
-            try:
-                pid = pool.submit(os.getpid).result()
+            if pool not in self._pids:
+                self._pids[pool] = pool.submit(os.getpid).result()
                 with self._lock:
                     if not self._loaded:  # the first process compiles; two would write the same cache at a time
                         pool.submit(load_kernels).result()
                         self._loaded = True
-            except BrokenProcessPool:
-                raise WorkerDied from None
-            self._own.pool, self._own.pid = pool, pid
-            self._pids.add(pid)
             if self._closed:
                 self.close()
-        return self._own.pool
+            outcome = pool.submit(perform, job).result()
+        except BrokenProcessPool:
+            self._pids.pop(pool, None)
+            pool.shutdown(wait=False)
+            return "died"
+        self._idle.append(pool)
+        return outcome
+
+    def _started(self) -> ProcessPoolExecutor:
+        context = multiprocessing.get_context("spawn")
+        return ProcessPoolExecutor(1, context, initializer=start_worker, initargs=(self.cores,))
 
     def close(self) -> None:
         """See ``Executor``."""
         self._closed = True
-        self._feeders.shutdown(wait=False, cancel_futures=True)
-        for pid in list(self._pids):
+        for pid in list(self._pids.values()):
             try:
                 os.kill(pid, signal.SIGTERM)
             except OSError:  # it ended by itself: ProcessLookupError, on Windows another one
