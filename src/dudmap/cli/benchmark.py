@@ -1,7 +1,6 @@
 """``dudmap benchmark``: suites of recordings, the accuracy gate, the limit of dynamics, speed, and GPUs."""
 
 import json
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -265,7 +264,14 @@ def wrong_input(
     """Spoil a recording in several ways; fail if one of them brings no warning, or the recording itself does."""
     from dudmap.config import Config
     from dudmap.io.sequences import open_sequence
-    from dudmap.lab.benchmark.stream_faults import LARGE, SPOILT, default_room, measure_wrong_input, spoilt_table
+    from dudmap.lab.benchmark.stream_faults import (
+        LARGE,
+        SPOILT,
+        default_room,
+        fails,
+        measure_wrong_input,
+        spoilt_table,
+    )  # fmt: skip
 
     config, runs = Config(), []
     if recording is not None:
@@ -274,8 +280,8 @@ def wrong_input(
         at_desk = [name for name in SPOILT if name != LARGE]
         runs += measure_wrong_input(default_room(max_frames, width, 0, "desk"), config, at_desk, max_frames)
         runs += measure_wrong_input(default_room(max_frames, width, 0), config, [LARGE], max_frames)
-    failed = [run.name for run in runs if run.fails]
-    answer({"runs": [run._asdict() for run in runs], "failed": failed}, spoilt_table(runs), as_json=as_json)
+    failed = [run["name"] for run in runs if fails(run)]
+    answer({"runs": runs, "failed": failed}, spoilt_table(runs), as_json=as_json)
     if failed:
         say(f"dudmap: {len(failed)} of {len(runs)} recordings are warned of wrongly: {', '.join(failed)}", err=True)
         raise typer.Exit(1)
@@ -303,8 +309,8 @@ def gate(
         return
     assert old is not None
     checks = gates.compare(rows, old)
-    failed = sum(not check.passed for check in checks)
-    tree = {"failed": failed, "checks": [asdict(check) | {"passed": check.passed} for check in checks]}
+    failed = sum(not check["passed"] for check in checks)
+    tree = {"failed": failed, "checks": checks}
     answer(tree, gates.verdict(checks), as_json=as_json)
     if failed:
         say(f"dudmap: {failed} of {len(checks)} figures are worse than recorded in {figures}", err=True)

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,7 @@ from dudmap.errors import ConfigError, FrameError
 from dudmap.evaluation.trajectory import accuracy
 from dudmap.io.sequences import Sequence
 from dudmap.lab.benchmark.entries import Excerpt
+from dudmap.lab.benchmark.measure import Row
 from dudmap.lab.benchmark.table import grid
 from dudmap.lab.synthetic.stream_faults import FAULTS, FaultyStream, black, scaled
 
@@ -144,24 +145,19 @@ def _true_poses(stream: FaultyStream) -> list[NDArray[np.float64]]:
 
 def table_head(name: str, frames: int) -> str:
     """Caption and head of the Markdown table."""
-    return (
-        f"{name}, {frames} frames:\n\n"
-        "| fault | what happens | outcome | frames | rejected | lost | RMSE, mm | largest, mm | wrong: silent, flagged "
-        "| frames to recovery |\n"
-        "|---|---|---|---|---|---|---|---|---|---|"
-    )
+    head = ["fault", "what happens", "outcome", "frames", "rejected", "lost", "RMSE, mm", "largest, mm",
+            "wrong: silent, flagged", "frames to recovery"]  # fmt: skip
+    return f"{name}, {frames} frames:\n\n{grid(head, [], words=10).rstrip()}"
 
 
 def fault_row(run: FaultRun, clean: FaultRun) -> str:
     """Line of the table: errors are those of the poses said to be tracked."""
     kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(run.rejected.items())) or "0"
-    errors = 1000 * run.errors[np.isfinite(run.errors)]
-    recovery, (silent, flagged) = run.frames_to_recovery(), run.wrong(clean)
-    return (
-        f"| {run.fault} | {FAULTS[run.fault].description} | {run.outcome(clean)} | {len(run.errors)} | {kinds} "
-        f"| {run.lost} | {np.sqrt(np.mean(errors**2)):.1f} | {errors.max():.1f} | {silent}, {flagged} "
-        f"| {'never' if recovery is None else recovery} |"
-    )
+    errors, recovery = 1000 * run.errors[np.isfinite(run.errors)], run.frames_to_recovery()
+    cells = [run.fault, FAULTS[run.fault].description, run.outcome(clean), len(run.errors), kinds, run.lost,
+             f"{np.sqrt(np.mean(errors**2)):.1f}", f"{errors.max():.1f}", "{}, {}".format(*run.wrong(clean)),
+             "never" if recovery is None else recovery]  # fmt: skip
+    return f"| {' | '.join(map(str, cells))} |"
 
 
 def _turned(frame: Frame, rows: int, columns: int) -> Frame:
@@ -204,32 +200,12 @@ class SpoiltSequence(Excerpt):
         return SPOILT[self.name](super().__getitem__(index))
 
 
-class SpoiltRun(NamedTuple):
-    """What is said of a spoilt recording, and what a run makes of it.
-
-    Attributes:
-        name: Key of ``SPOILT``.
-        warnings: Sentences of ``inspect``.
-        frames, tracked, doubtful: Number of frames, of those with a pose, and of those called ``uncertain`` or
-            ``blind``.
-        ate: RMSE of the ATE, metres; None with too few poses.
-    """
-
-    name: str
-    warnings: list[str]
-    frames: int
-    tracked: int
-    doubtful: int
-    ate: float | str | None
-
-    @property
-    def fails(self) -> bool:
-        """Whether nothing is said of wrong input, or something of right input."""
-        return bool(self.warnings) == (self.name == RIGHT)
-
-
-def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str], frames: int) -> Iterator[SpoiltRun]:
+def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str], frames: int) -> Iterator[Row]:
     """Inspect and process a recording spoilt in the ways that are named, keys of ``SPOILT``.
+
+    Yields:
+        ``name`` of the way, ``warnings`` (sentences of ``inspect``), number of ``frames``, of those ``tracked`` and of
+        those called ``doubtful`` (uncertain or blind), and ``ate``, its RMSE in metres; None with too few poses.
 
     Raises:
         ConfigError: The recording has no true poses.
@@ -243,14 +219,20 @@ def measure_wrong_input(recording: Sequence, config: Config, names: Iterable[str
         tracked = sum(result.T_world_camera is not None for result in results)
         doubtful = sum(bool(result.uncertain) or result.blind for result in results)
         ate = accuracy(slam.trajectory, recording.ground_truth, ("ate_rmse_m",))["ate_rmse_m"]
-        yield SpoiltRun(name, inspect(sequence).warnings, len(results), tracked, doubtful, ate)
+        yield {"name": name, "warnings": inspect(sequence).warnings, "frames": len(results), "tracked": tracked,
+               "doubtful": doubtful, "ate": ate}  # fmt: skip
 
 
-def spoilt_table(runs: list[SpoiltRun]) -> str:
-    """Markdown table, one line per run."""
-    rows = []
-    for run in runs:
-        figures = [f"{run.tracked} of {run.frames}", str(run.doubtful)]
-        ate = f"{1000 * run.ate:.1f}" if isinstance(run.ate, float) else "-"
-        rows.append([run.name, "; ".join(run.warnings) or "nothing", *figures, ate])
-    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, mm"], rows, words=2)
+def fails(row: Row) -> bool:
+    """Whether nothing is said of wrong input, or something of right input."""
+    return bool(row["warnings"]) == (row["name"] == RIGHT)
+
+
+def spoilt_table(rows: list[Row]) -> str:
+    """Markdown table, one line per way."""
+    lines = []
+    for row in rows:
+        figures = [f"{row['tracked']} of {row['frames']}", str(row["doubtful"])]
+        ate = f"{1000 * row['ate']:.1f}" if isinstance(row["ate"], float) else "-"
+        lines.append([row["name"], "; ".join(row["warnings"]) or "nothing", *figures, ate])
+    return grid(["spoilt", "what is said", "tracked", "doubtful", "ATE RMSE, mm"], lines)

@@ -7,7 +7,7 @@ results only, and results are kept: a search that was stopped proposes the same 
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -40,28 +40,6 @@ BATCH = 4
 """Configurations proposed at a time. A constant, so that the proposals do not depend on the number of workers."""
 MOST_JUDGED = 5
 """Configurations of the training front that are judged; each one more weakens the test of all."""
-
-
-@dataclass(frozen=True, eq=False)
-class Verdict:
-    """What one configuration of the training front is worth on the second set.
-
-    Attributes:
-        training: Geometric mean, over the training recordings, of each response relative to the base configuration.
-        judged: The same over the second set; NaN if a run failed or lost more frames than with the base
-            configuration.
-        p: Probability of ratios like those of the first response on the second set if there were no improvement.
-    """
-
-    values: Point
-    training: tuple[float, ...]
-    judged: tuple[float, ...]
-    p: float
-
-    @property
-    def holds(self) -> bool:
-        """Whether the improvement holds on the second set."""
-        return self.p < SIGNIFICANT and self.judged[0] < 1
 
 
 def check_tune(plan: Plan, max_runs: int = MAX_RUNS) -> None:
@@ -155,21 +133,30 @@ def _promising(points: list[Point], plan: Plan, measure: Measure, early: list[fl
     return kept
 
 
-def judged(plan: Plan, measure: Measure) -> list[Verdict]:
-    """Search, and judge the training front on the second set."""
+def judged(plan: Plan, measure: Measure) -> list[tuple[Point, dict[str, Any]]]:
+    """Search, and judge the training front on the second set.
+
+    Returns:
+        Values of the factors, and a row of the table: these, the geometric mean over the recordings of both sets of
+        each response relative to the base configuration (NaN if a run failed or lost more frames than with that), the
+        probability p of such ratios of the first response if there were no improvement, and whether it holds.
+    """
     from statsmodels.stats.multitest import multipletests
 
-    front = training_front(plan, measure)
+    front, rows = training_front(plan, measure), []
     if not front:
         return []
     found = measure([point for point, _ in front], replace(plan, entries=plan.judges))
     raw = [1.0 if measured is None else improvement_p(measured[:, 0]) for measured in found]
     corrected: Any = multipletests(raw, method="holm")[1]
-    nothing = (float("nan"),) * len(plan.responses)
-    return [
-        Verdict(point, training, nothing if measured is None else tuple(geometric_mean(measured)), float(p))
-        for (point, training), measured, p in zip(front, found, corrected, strict=True)
-    ]
+    for (point, training), measured, p in zip(front, found, corrected, strict=True):
+        second = np.full(len(plan.responses), np.nan) if measured is None else geometric_mean(measured)
+        row: dict[str, Any] = {key.rpartition(".")[2]: value for key, value in point.items()}
+        for name, ratio, other in zip(plan.responses, training, second, strict=True):
+            row |= {f"{name}, training": ratio, f"{name}, second set": float(other)}
+        holds = "yes" if p < SIGNIFICANT and second[0] < 1 else "no"
+        rows.append((point, row | {"p": float(p), "holds": holds}))
+    return rows
 
 
 def improvement_p(ratios: Numbers) -> float:
@@ -223,36 +210,25 @@ def run_tune(
     Raises:
         DudmapError: The search is refused before anything is run (``check_tune``).
     """
+    import pandas as pd
+
     check_tune(plan, max_runs)
     recommended = out / "recommended.toml"
     recommended.unlink(missing_ok=True)
     try:
         do = partial(conduct, root=out, executor=executor, report=report)
-        verdicts = judged(plan, partial(ratios, out=out, do=do))
+        rows = judged(plan, partial(ratios, out=out, do=do))
     finally:
         executor.close()
-    table = verdict_table(verdicts, plan.responses)
+    table = pd.DataFrame([row for _, row in rows])
     table.to_csv(out / "tune.csv", index=False)
-    good = [verdict for verdict in verdicts if verdict.holds]
+    good = [point for point, row in rows if row["holds"] == "yes"]
     if good:
-        configured(plan.base, good[0].values).save(recommended)
+        configured(plan.base, good[0]).save(recommended)
     return describe(table, good, plan)
 
 
-def verdict_table(verdicts: Sequence[Verdict], names: Sequence[str]) -> Table:
-    """One row per judged configuration: its values, and each response relative to the base configuration."""
-    import pandas as pd
-
-    rows = []
-    for verdict in verdicts:
-        row: dict[str, Any] = {key.rpartition(".")[2]: value for key, value in verdict.values.items()}
-        for name, training, second in zip(names, verdict.training, verdict.judged, strict=True):
-            row |= {f"{name}, training": training, f"{name}, second set": second}
-        rows.append(row | {"p": verdict.p, "holds": "yes" if verdict.holds else "no"})
-    return pd.DataFrame(rows)
-
-
-def describe(table: Table, good: Sequence[Verdict], plan: Plan) -> str:
+def describe(table: Table, good: Sequence[Point], plan: Plan) -> str:
     """Outcome of a search in words."""
     from dudmap.lab.benchmark.table import grid
     from dudmap.lab.study.report import shown
@@ -266,7 +242,6 @@ def describe(table: Table, good: Sequence[Verdict], plan: Plan) -> str:
         return text + "No configuration is recommended: none did as well as the base configuration in training."
     text += grid([*table.columns], [[shown(value) for value in row] for row in table.itertuples(index=False)], 0)
     if not good:
-        return (
-            text + f"\nNo configuration is recommended: no improvement of {plan.responses[0]} holds on the second set."
-        )
-    return text + f"\nRecommended (recommended.toml): {values_text(good[0].values)}."
+        first = plan.responses[0]
+        return text + f"\nNo configuration is recommended: no improvement of {first} holds on the second set."
+    return text + f"\nRecommended (recommended.toml): {values_text(good[0])}."
