@@ -1,5 +1,5 @@
 import json
-from dataclasses import fields
+from dataclasses import fields, replace
 
 import numpy as np
 import pytest
@@ -144,10 +144,11 @@ def test_truth_is_written_beside_the_recording(tmp_path):
 
 
 def test_faults_by_name():
-    assert parse_faults(["color_delay=0.025", "color_translation=0.025, 0,0"]) == SensorFaults(
-        color_delay=0.025, color_translation=(0.025, 0.0, 0.0)
-    )
-    assert parse_faults(["color_delay=0.01"], UNREGISTERED).color_focal_ratio == 0.95
+    found = parse_faults(["color_delay=0.025", "color_translation=0.025, 0,0"])
+    assert found == {"color_delay": 0.025, "color_translation": (0.025, 0.0, 0.0)}
+    named = synthetic.sequence(sensor="kinect_v2", faults=found, camera=(160, 120), frames=2)
+    assert named.faults == replace(CAMERAS["kinect_v2"].faults, **found)
+    assert named.camera == CAMERAS["kinect_v2"].camera(160, 120)
     assert set(LIMITS) == {field.name for field in fields(SensorFaults)}
 
 
@@ -163,7 +164,7 @@ def test_faults_by_name():
 )
 def test_bad_faults_are_one_sentence(assignment, sentence):
     with pytest.raises(ConfigError) as error:
-        parse_faults([assignment])
+        SensorFaults(**parse_faults([assignment]))
     assert sentence in str(error.value)
 
 

@@ -1,7 +1,7 @@
 """Recordings of a benchmark: descriptions that another process can open, and frames that are read once."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -46,16 +46,8 @@ class Entry:
 
             return open_sequence(self.path)
         from dudmap.lab.synthetic import sequence
-        from dudmap.lab.synthetic.faults import SensorFaults
-        from dudmap.lab.synthetic.recording import DEFAULT_CAMERA
-        from dudmap.lab.synthetic.sensors import find_camera
 
-        size = self.parameters.get("camera", (DEFAULT_CAMERA.width, DEFAULT_CAMERA.height))
-        sensor = self.parameters.get("sensor")
-        camera = find_camera(sensor).camera(*size) if sensor else DEFAULT_CAMERA.resized(*size)
-        usual = find_camera(sensor).faults if sensor else SensorFaults()
-        faults = replace(usual, **self.parameters.get("faults", {}))
-        return sequence(**{**self.parameters, "camera": camera, "faults": faults})
+        return sequence(**self.parameters)
 
     def surfaces(self, sequence: "Sequence") -> "tuple[Mesh, Mesh] | None":
         """True static surface and its observed part, in the frame of the ground truth, if known."""

@@ -161,22 +161,22 @@ LIMITS: dict[str, tuple[float, float]] = {fault.name: fault.metadata["limits"] f
 """Smallest and largest accepted value of every fault."""
 
 
-def parse_faults(assignments: Sequence[str], base: SensorFaults | None = None) -> SensorFaults:
-    """Faults of ``NAME=VALUE`` pairs, on top of ``base``; a value of several numbers is comma-separated.
+def parse_faults(assignments: Sequence[str]) -> dict[str, Any]:
+    """Faults of ``NAME=VALUE`` pairs by name; a value of several numbers is comma-separated.
 
     Raises:
-        ConfigError: A pair cannot be understood, or a value is out of range.
+        ConfigError: A pair cannot be understood.
     """
-    base = base or SensorFaults()
     values: dict[str, Any] = {}
     for assignment in assignments:
         name, _, text = assignment.partition("=")
         name = name.strip()
         if name not in LIMITS:
             raise ConfigError(f"unknown fault {name!r}; known faults: {', '.join(LIMITS)}")
-        several = isinstance(getattr(base, name), tuple) or "," in text
         try:
-            values[name] = tuple(float(part) for part in text.split(",")) if several else float(text)
+            numbers = tuple(float(part) for part in text.split(","))
         except ValueError:
             raise ConfigError(f"cannot understand the fault {assignment!r}; expected NAME=NUMBER[,NUMBER...]") from None
-    return replace(base, **values)
+        several = isinstance(getattr(SensorFaults(), name), tuple) or len(numbers) > 1
+        values[name] = numbers if several else numbers[0]
+    return values

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry import se3
-from dudmap.errors import ConfigError
+from dudmap.lab.data import find
 from dudmap.lab.synthetic.motion import FloorPath, crossing, smooth_step
 from dudmap.lab.synthetic.person import Figure
 from dudmap.lab.synthetic.scene import Material, Primitive, Scene, box, capsule, cylinder, ellipsoid, pose
@@ -311,7 +311,5 @@ def build_movers(names: tuple[str, ...], staging: Staging) -> list[SyntheticMove
     Raises:
         ConfigError: A name is unknown.
     """
-    for name in names:
-        if name not in MOVERS:
-            raise ConfigError(f"unknown mover {name!r}; known movers: {', '.join(MOVERS)}")
-    return [mover for name in names for mover in MOVERS[name](staging)]
+    makers = [find(name, MOVERS, "mover") for name in names]
+    return [mover for make in makers for mover in make(staging)]

@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from dudmap.errors import ConfigError
-from dudmap.lab.data import tables
+from dudmap.lab.data import find, tables
 from dudmap.lab.synthetic.scene import (
     Light,
     Material,
@@ -114,8 +113,8 @@ MAKERS: dict[str, Any] = {
 """Functions that make a solid, or a list of them, from the values of a row."""
 
 
-SCENES = tuple(tables("synthetic/scenes.toml"))
-"""Names of the scenes."""
+SCENES = tables("synthetic/scenes.toml")
+"""Rows of the scenes by name."""
 
 
 def build_scene(name: str) -> Scene:
@@ -124,9 +123,7 @@ def build_scene(name: str) -> Scene:
     Raises:
         ConfigError: There is no scene of this name.
     """
-    if name not in SCENES:
-        raise ConfigError(f"unknown scene {name!r}; known scenes: {', '.join(SCENES)}")
-    row = dict(tables("synthetic/scenes.toml")[name])
+    row = dict(find(name, SCENES, "scene"))
     if "painted" in row:
         scene = build_scene(row["painted"])
         plain = [replace(p.material, texture="plain", variation=0.0, glow=0.0) for p in scene.primitives]

@@ -9,8 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dudmap.core.geometry.camera import Camera
-from dudmap.errors import ConfigError
-from dudmap.lab.data import tables
+from dudmap.lab.data import find, tables
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.kernels import depth_noise as kernels
 from dudmap.lab.synthetic.render import Rendering, over_rows
@@ -109,9 +108,7 @@ class Sensor:
     """
 
     def __init__(self, name: str, seed: int) -> None:
-        if name not in SENSORS:
-            raise ConfigError(f"unknown noise model {name!r}; known models: {', '.join(SENSORS)}")
-        self.model = SENSORS[name]
+        self.model = find(name, SENSORS, "noise model")
         self._seed = seed
 
     def measure(self, rendering: Rendering, focal: float, index: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
@@ -196,14 +193,3 @@ CAMERAS: dict[str, CameraModel] = {
     for name, row in tables("synthetic/sensors.toml")["cameras"].items()
 }
 """Cameras by name."""
-
-
-def find_camera(name: str) -> CameraModel:
-    """Camera of the given name.
-
-    Raises:
-        ConfigError: The name is unknown.
-    """
-    if name not in CAMERAS:
-        raise ConfigError(f"unknown sensor {name!r}; known sensors: {', '.join(CAMERAS)}")
-    return CAMERAS[name]

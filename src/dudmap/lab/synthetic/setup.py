@@ -1,8 +1,9 @@
 """Set-up of a synthetic recording from names of scenes, movers, paths, situations and sensors."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +12,7 @@ from dudmap.core.geometry import se3
 from dudmap.core.geometry.camera import Camera
 from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError
+from dudmap.lab.data import find
 from dudmap.lab.synthetic.crowd import crowd_of
 from dudmap.lab.synthetic.faults import SensorFaults
 from dudmap.lab.synthetic.motion import smooth_step
@@ -19,7 +21,7 @@ from dudmap.lab.synthetic.paths import FOLLOW, camera_poses
 from dudmap.lab.synthetic.recording import DEFAULT_CAMERA, SyntheticSequence
 from dudmap.lab.synthetic.rooms import build_scene
 from dudmap.lab.synthetic.scene import Material, Scene, box, pose
-from dudmap.lab.synthetic.sensors import find_camera
+from dudmap.lab.synthetic.sensors import CAMERAS
 
 Array = NDArray[np.float64]
 CAP_DISTANCE = 0.16
@@ -42,7 +44,7 @@ class Situation:
     camera_path: str = "handheld"
     start_dynamic: bool = False
     covered: tuple[tuple[float, float], ...] = ()
-    elsewhere: tuple[tuple[float, float], ...] = field(default=())
+    elsewhere: tuple[tuple[float, float], ...] = ()
 
 
 SITUATIONS: dict[str, Situation] = {
@@ -55,17 +57,6 @@ SITUATIONS: dict[str, Situation] = {
     "put_down": Situation(("carried_box",)),
     "taken_away": Situation(("removed_box",)),
 }
-
-
-def find_situation(name: str) -> Situation:
-    """Situation of the given name.
-
-    Raises:
-        ConfigError: The name is unknown.
-    """
-    if name not in SITUATIONS:
-        raise ConfigError(f"unknown situation {name!r}; known situations: {', '.join(SITUATIONS)}")
-    return SITUATIONS[name]
 
 
 def carried_elsewhere(Ts: Array, scene: Scene, times: Array, spans: tuple[tuple[float, float], ...]) -> Array:
@@ -111,11 +102,11 @@ def sequence(
     start_dynamic: bool = False,
     situation: str | None = None,
     seed: int = 0,
-    camera: Camera | None = None,
+    camera: Camera | tuple[int, int] | None = None,
     motion_blur: float | None = None,
     exposure_change: float = 0.0,
     sensor: str | None = None,
-    faults: SensorFaults | None = None,
+    faults: SensorFaults | Mapping[str, Any] | None = None,
 ) -> SyntheticSequence:
     """Set up a synthetic recording; its frames are rendered on access.
 
@@ -133,28 +124,32 @@ def sequence(
         start_dynamic: Whether the movers are in view from the first frame on.
         situation: Name of a difficult situation (``names()["situations"]``).
         seed: Seed of path, appearance and noise; equal seeds give equal frames.
-        camera: Intrinsics; None for 640x480 with 525 px focal length, or with the view of the sensor.
+        camera: Intrinsics, or width and height in pixels of an image with 525 px focal length at 640x480, or with the
+            view of the sensor; None for 640x480.
         motion_blur: Exposure time as a share of the frame interval; None for 0, or that of the sensor.
         exposure_change: Relative amplitude of a slow oscillation of the exposure.
         sensor: Name of a camera (``names()["sensors"]``), which sets noise, motion blur, faults and view.
-        faults: What the sensor does and its files do not say; None for no faults, or those of the sensor.
+        faults: What the sensor does and its files do not say, or what of it differs from the named sensor, or from one
+            without faults.
 
     Raises:
         ConfigError: An argument is invalid; the message names the known values.
     """
     _check("frames", frames, 1, 1_000_000)
     _check("fps", fps, 0.5, 1000)
-    model = find_camera(sensor) if sensor is not None else None
+    model = find(sensor, CAMERAS, "sensor") if sensor is not None else None
     noise = noise or (model.noise if model else "kinect")
     motion_blur = motion_blur if motion_blur is not None else model.motion_blur if model else 0.0
-    faults = faults or (model.faults if model else SensorFaults())
-    camera = camera or (model.camera(640, 480) if model else DEFAULT_CAMERA)
+    if not isinstance(faults, SensorFaults):
+        faults = replace(model.faults if model else SensorFaults(), **(faults or {}))
+    if not isinstance(camera, Camera):
+        camera = (model.camera if model else DEFAULT_CAMERA.resized)(*(camera or DEFAULT_CAMERA.shape[::-1]))
     _check("motion_blur", motion_blur, 0, 1)
     _check("exposure_change", exposure_change, 0, 0.9)
     if speed is not None:
         _check("speed", speed, 0.001, 20)
     world = build_scene(scene)
-    special = find_situation(situation) if situation is not None else Situation(("person",))
+    special = find(situation, SITUATIONS, "situation") if situation is not None else Situation(("person",))
     names = special.movers if movers is None else (movers,) if isinstance(movers, str) else tuple(movers)
     path = special.camera_path if camera_path is None else camera_path
     at_once = start_dynamic or special.start_dynamic
