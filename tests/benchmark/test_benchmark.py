@@ -15,7 +15,7 @@ from dudmap.core.geometry.trajectory import Trajectory
 from dudmap.errors import ConfigError, DatasetError
 from dudmap.lab.benchmark import limits, measure, report
 from dudmap.lab.benchmark.entries import Entry
-from dudmap.lab.benchmark.limits import cells_table, limits_table, save_heat_maps, values
+from dudmap.lab.benchmark.limits import cells_table, limits_table
 from dudmap.lab.benchmark.report import published
 from dudmap.lab.benchmark.suites import ABLATION, SUITES, find_suite, systems
 from dudmap.lab.benchmark.table import markdown
@@ -209,16 +209,6 @@ def test_the_table_of_cells_marks_what_is_coped_with(rows):
     assert "| 0.1 | 10 % | **5.0** |  |" in lines
     assert "| 0.1 | 30 % | 30.0 (25 % lost) |  |" in lines
     assert len(lines) == 3 + len(SWEEP.xs) * len(SWEEP.coverages)
-
-
-def test_heat_maps_show_every_cell(rows, tmp_path):
-    import cv2
-
-    grid = values(rows, SWEEP, "dudmap", "ate_rmse_m")
-    np.testing.assert_allclose(grid, [[0.005, 0.005], [0.03, 0.006], [0.01, 0.01]])
-    assert np.isnan(values(rows, SWEEP, "none", "ate_rmse_m")).all()
-    save_heat_maps(rows, SWEEP, ["dudmap", "none"], tmp_path / "limits.png")
-    assert cv2.imread(str(tmp_path / "limits.png")).std() > 10
 
 
 def test_the_grids_hold_what_is_asked_for():

@@ -123,7 +123,6 @@ FAKED = {
         ["benchmark", "limits", "--out", "limits"],
         {
             "dudmap.lab.benchmark.limits.measure_cells": lambda *_: [],
-            "dudmap.lab.benchmark.limits.save_heat_maps": lambda *_: None,
             "dudmap.lab.benchmark.limits.limits_table": lambda *_: "",
             "dudmap.lab.benchmark.limits.cells_table": lambda *_: "",
         },

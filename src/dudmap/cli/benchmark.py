@@ -320,15 +320,15 @@ def gate(
 @app.command()
 def limits(
     systems: SystemsOption = "dudmap,none,threshold,em",
-    out: Annotated[Path, typer.Option(help="Output folder for heat maps and figures.")] = RUNS / "limits",
+    out: Annotated[Path, typer.Option(help="Output folder for limits.md, .csv and .json.")] = RUNS / "limits",
     jobs: o.JobsOption = 1,
     quick: QuickOption = False,
     as_json: o.JsonOption = False,
 ) -> None:
     """Find the limit of dynamics: coverage and speed of movers with which tracking and mapping fail.
 
-    Writes heat maps (PNG) of ATE, mask IoU, ghost area and share of lost frames, and limits.md, .csv and .json.
-    Measurements of the same code in the same folder are reused, so that an interrupted sweep continues.
+    The tables show ATE and lost frames; mask IoU and ghost area are in limits.csv and .json beside them. Measurements of
+    the same code in the same folder are reused, so that an interrupted sweep continues.
     """
     from dudmap.app.pipeline.environment import machine, versions
     from dudmap.lab.benchmark.limits import (
@@ -340,7 +340,6 @@ def limits(
         grid_cells,
         limits_table,
         measure_cells,
-        save_heat_maps,
     )
     from dudmap.lab.benchmark.suites import systems as find_systems
     from dudmap.lab.benchmark.table import save
@@ -357,8 +356,6 @@ def limits(
             progress(finished, total)
 
         rows = measure_cells(cells, wanted, out, jobs, done)
-    for sweep in sweeps:
-        save_heat_maps(rows, sweep, list(wanted), out / f"limits-{sweep.name}.png")
     text = "Largest dynamic share of the image with an ATE RMSE of at most 20 mm and no frame lost:\n"
     text += limits_table(rows, sweeps, list(wanted))
     text += "\nATE RMSE in mm and share of lost frames; bold where the system copes:\n"

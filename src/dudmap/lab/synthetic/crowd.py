@@ -34,6 +34,8 @@ class Crowd:
         self.reach = 0.75 * self.distance + 1.0 * size  # half the length of the lane
         self.count = int(np.ceil(2 * self.reach / self.spacing))
         self.lane = self.count * self.spacing
+        self.hurry = max(self.speed, ENTRY_SPEED * size)
+        self.steady_from = 0.0 if staging.start_dynamic else 0.5 + self.lane / self.hurry  # the whole lane is occupied
         self.staging = staging
         stride = 1.35 * float(np.clip(np.sqrt(self.speed / size / 1.2), 0.35, 1.2))
         rng = np.random.default_rng(staging.rng.integers(2**32))
@@ -41,18 +43,9 @@ class Crowd:
 
     def advanced(self, t: float) -> float:
         """Distance in metres that everybody has walked at time ``t``; without ``start_dynamic`` it starts at 0.5 s."""
-        if self.staging.start_dynamic:
-            return self.lane + self.speed * t
-        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
-        begin, arrived = 0.5, 0.5 + self.lane / hurry
-        if t <= arrived:
-            return hurry * (t - begin)
-        return self.lane + self.speed * (t - arrived)
-
-    def steady_from(self) -> float:
-        """Time in seconds from which the whole lane is occupied."""
-        hurry = max(self.speed, ENTRY_SPEED * self.staging.scene.mover_scale)
-        return 0.0 if self.staging.start_dynamic else 0.5 + self.lane / hurry
+        if t <= self.steady_from and not self.staging.start_dynamic:
+            return self.hurry * (t - 0.5)
+        return self.lane + self.speed * (t - self.steady_from)
 
     def movers(self) -> list[SyntheticMover]:
         """Movers of the crowd, one per person."""
@@ -106,7 +99,7 @@ def crowd_of(
     def attempt(density: float) -> tuple[Crowd, float]:
         rng = np.random.default_rng(seed)
         crowd = Crowd(Staging(staging.scene, rng, staging.speed, staging.duration, staging.start_dynamic), density)
-        steady = np.flatnonzero(times >= min(crowd.steady_from(), 0.75 * times[-1]))
+        steady = np.flatnonzero(times >= min(crowd.steady_from, 0.75 * times[-1]))
         chosen = steady[np.unique(np.linspace(0, len(steady) - 1, 8).astype(int))]
         return crowd, _coverage(crowd, times[chosen], Ts_world_camera[chosen])
 

@@ -99,16 +99,6 @@ def _turning(scene: Scene, rng: np.random.Generator, times: Array, angle: Array,
     return _shaken(_aimed(eyes, eyes + aims), _tremor(rng, times, np.radians(0.04)))
 
 
-def _pan(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Rotation about the vertical, 40 degrees to either side at 20 degrees per second on average."""
-    return _turning(scene, rng, times, np.radians(40.0) * np.sin(2 * np.pi * times / 8.0), 0.03)
-
-
-def _round(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
-    """Rotation by 405 degrees about the vertical, so that the last frames show the first view again."""
-    return _turning(scene, rng, times, np.radians(405.0) * (times / max(times[-1], 1e-9)), 0.1)
-
-
 def _orbit(scene: Scene, rng: np.random.Generator, times: Array) -> Array:
     """Motion around the target on an arc of 30 degrees to either side."""
     home, target = scene.home[:3, 3], np.asarray(scene.target)
@@ -142,10 +132,12 @@ PATHS: dict[str, Callable[[Scene, np.random.Generator, Array], Array]] = {
     "slow": lambda scene, rng, times: handheld(scene, rng, times, 0.06, 3.0, 0.7),
     "fast": lambda scene, rng, times: handheld(scene, rng, times, 0.6, 45.0, 1.5, 2.2),
     "still": lambda scene, rng, times: np.tile(scene.home, (len(times), 1, 1)),
-    "pan": _pan,
+    # 40 degrees to either side about the vertical, at 20 degrees per second on average
+    "pan": lambda scene, rng, t: _turning(scene, rng, t, np.radians(40.0) * np.sin(2 * np.pi * t / 8.0), 0.03),
     "orbit": _orbit,
     "dolly": _dolly,
-    "round": _round,
+    # 405 degrees about the vertical, so that the last frames show the first view again
+    "round": lambda scene, rng, t: _turning(scene, rng, t, np.radians(405.0) * (t / max(t[-1], 1e-9)), 0.1),
 }
 FOLLOW = "follow"
 
